@@ -1,0 +1,99 @@
+"""The one seam between torch and Dr.Jit: from torch tensors to photographs, and the gradients back."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.integrator import backward_edges, render_photographs
+from mi_ring.mesh import FACES, POSITIONS
+
+DIFFUSE, SPECULAR, ROUGHNESS = "vertex_diffuse", "vertex_specular", "vertex_roughness"
+
+
+class Surface:
+    """The `shapenet` shape of a loaded scene, as something that torch tensors are written to.
+
+    Other shapes and top-level emitters of the scene take part in every picture but are not changed.
+    """
+
+    def __init__(self, scene, shape):
+        self.scene = scene
+        self.params = mi.traverse(scene)
+        self.prefix = next(
+            key.removesuffix(POSITIONS) for key in self.params.keys() if key == f"{shape.id()}.{POSITIONS}"
+        )
+        self.topologies: dict[int, tuple] = {}
+        self.faces = None
+
+    def set_faces(self, faces: np.ndarray) -> None:
+        """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
+        self.faces = np.ascontiguousarray(faces, np.uint32)
+        self.edges = edges_of(self.faces)
+
+    def write(self, vertices: Tensor, diffuse: Tensor, specular: Tensor, roughness: Tensor, gradients: bool = False):
+        """Write (V, 3) vertices [scene units], (V, 3), (V,), (V,) attributes into the mesh. Returns the Dr.Jit arrays."""
+        arrays = [mi.Float(t.detach().contiguous().numpy().ravel()) for t in (vertices, diffuse, specular, roughness)]
+        if gradients:
+            dr.enable_grad(arrays)
+        if self.faces is not None:
+            self.params[self.prefix + FACES] = mi.UInt32(self.faces.ravel())
+            self.faces = None
+        for name, array in zip((POSITIONS, DIFFUSE, SPECULAR, ROUGHNESS), arrays):
+            self.params[self.prefix + name] = array
+        self.params.update()
+        return arrays
+
+
+def edges_of(faces: np.ndarray):
+    """Edges of a closed mesh: ((v0, v1), (opposite0, opposite1)) as UInt32, for triangles (v0 v1 o0) and (v1 v0 o1)."""
+    f = faces.astype(np.int64)
+    start, end, opposite = f.ravel(), np.roll(f, -1, 1).ravel(), np.roll(f, -2, 1).ravel()
+    key = np.minimum(start, end) * (f.max() + 1) + np.maximum(start, end)
+    order = np.lexsort((start > end, key))
+    first, second = order[::2], order[1::2]
+    return tuple(mi.UInt32(a[i].astype(np.uint32)) for a, i in ((start, first), (end, first))), (
+        mi.UInt32(opposite[first].astype(np.uint32)),
+        mi.UInt32(opposite[second].astype(np.uint32)),
+    )
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows):
+        gradients = any(t.requires_grad for t in (vertices, diffuse, specular, roughness))
+        arrays = surface.write(vertices, diffuse, specular, roughness, gradients)
+        channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
+        dr.eval(channels)
+        width, height = photographs.size
+        shape = (len(photographs), height, width)
+        picture = [torch.from_numpy(np.array(dr.detach(c)).reshape(shape)) for c in channels]
+        ctx.save = (surface, photographs, arrays, channels, seed, shadows)
+        return torch.stack(picture[:3], dim=-1), picture[3]
+
+    @staticmethod
+    def backward(ctx, rgb_grad, alpha_grad):
+        surface, photographs, arrays, channels, seed, shadows = ctx.save
+        grads = [mi.Float(g.contiguous().numpy().ravel()) for g in (*rgb_grad.unbind(-1), alpha_grad)]
+        for channel, grad in zip(channels, grads):
+            if dr.grad_enabled(channel):
+                dr.set_grad(channel, grad)
+                dr.enqueue(dr.ADMode.Backward, channel)
+        dr.traverse(dr.ADMode.Backward, dr.ADFlag.Default)
+        backward_edges(surface.scene, photographs, arrays[0], surface.edges, grads, seed + 1, shadows)
+        out = [torch.from_numpy(np.array(dr.grad(a))) for a in arrays]
+        return out[0].reshape(-1, 3), out[1].reshape(-1, 3), out[2], out[3], None, None, None, None, None
+
+
+def render(surface, photographs, vertices, diffuse, specular, roughness, spp=4, seed=0, shadows=True):
+    """Predicted photographs of the surface, each under its own light, differentiable.
+
+    `vertices` (V, 3) [scene units], `diffuse` (V, 3), `specular` (V,), `roughness` (V,): attributes as `cooktorrance`
+    defines them. `photographs`: `integrator.Photographs`, which to render and at what size; `spp` stratified samples per
+    pixel; the same `seed` gives the same samples.
+
+    Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all four tensors are
+    those of shading and of the outline, for radiance and for coverage; where a cast shadow ends they are not complete.
+    """
+    return _Render.apply(vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows)

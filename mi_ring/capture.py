@@ -1,0 +1,255 @@
+"""A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring import mesh, photograph
+from mi_ring.errors import InputError
+from mi_ring.integrator import Photographs, check_attributes
+
+
+@dataclass
+class Capture:
+    """What a scene file gives to a fit. `images` hold the files' encoded pixels, decoded on demand by `observe`."""
+
+    path: Path
+    scene: mi.Scene
+    shape: "mesh.ShapeNetMesh"
+    sensors: list
+    images: list[np.ndarray]  # (H, W, 3) uint8, uint16 or float32 each
+    masks: list[np.ndarray | None]  # (H, W) uint8, 0 background, 255 object
+    shadows: bool
+
+    def __post_init__(self):
+        self.photographs = Photographs.of(self.sensors)
+
+    def __len__(self) -> int:
+        return len(self.sensors)
+
+    @property
+    def names(self) -> list[str]:
+        return [sensor.filename.name for sensor in self.sensors]
+
+    def sizes(self) -> dict[tuple[int, int], np.ndarray]:
+        """Indices of the photographs of each size (width, height); one launch renders photographs of one size."""
+        sizes = [sensor.size for sensor in self.sensors]
+        return {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
+
+    def observe(self, index, scale: int = 1) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Photographs `index`, box-filtered `scale` times smaller.
+
+        Returns linear radiance (n, H, W, 3), where a pixel is clipped (n, H, W, 3) bool: the scene was at least this bright,
+        and the object's coverage (n, H, W) in [0, 1] or None if one of them has no mask.
+        """
+        decoded, clipped, covered = [], [], []
+        for k in index:
+            linear, saturated = decode(self.images[k], self.sensors[k].linear, self.sensors[k].saturation)
+            decoded.append(torch.from_numpy(linear))
+            clipped.append(torch.from_numpy(saturated))
+            covered.append(self.masks[k])
+        rgb = shrink(torch.stack(decoded), scale)
+        saturated = shrink(torch.stack(clipped).float(), scale) > 0
+        if any(mask is None for mask in covered):
+            return rgb, saturated, None
+        mask = torch.from_numpy(np.stack(covered)).float()[..., None] / 255
+        return rgb, saturated, shrink(mask, scale)[..., 0]
+
+    def exposure(self) -> float:
+        """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks)."""
+        total, count = 0.0, 0
+        for k in range(len(self)):
+            rgb, _, mask = self.observe([k], 4)
+            inside = (mask[0] > 0.5) if mask is not None else rgb[0].mean(-1) > 0.02 * rgb.max()
+            total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
+        if not total > 0:
+            raise InputError(f"{self.path}: photographs: every pixel of the object is black; check the exposure and the masks")
+        return total / count
+
+    def reflectance(self, center, exposure: float) -> float:
+        """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights."""
+        lights = np.array(self.photographs.lights).reshape(-1, 8)
+        distance2 = np.where(lights[:, 3] > 0, 1.0, ((lights[:, :3] - center) ** 2).sum(1))
+        return float(exposure / np.median(lights[:, 4:7].mean(1) / distance2))
+
+    def sphere(self) -> tuple[np.ndarray, float]:
+        """The normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
+        if self.shape.center is not None and self.shape.radius is not None:
+            return self.shape.center, self.shape.radius
+        masked = [k for k, mask in enumerate(self.masks) if mask is not None]
+        center, radius = sphere_of_masks(self, masked) if masked else sphere_of_cameras(self)
+        return (
+            center if self.shape.center is None else self.shape.center,
+            radius if self.shape.radius is None else self.shape.radius,
+        )
+
+
+def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, both of `image`'s shape."""
+    if image.dtype == np.float32:
+        value = image
+    else:
+        full = np.iinfo(image.dtype).max
+        value = np.arange(full + 1, dtype=np.float32) / full
+    lookup = value if linear else srgb_to_linear(value)
+    saturated = value >= saturation
+    return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
+
+
+def srgb_to_linear(v):
+    """IEC 61966-2-1, on numpy arrays."""
+    return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def shrink(images: Tensor, scale: int) -> Tensor:
+    """(n, H, W, C) → (n, H // scale, W // scale, C), the mean over blocks."""
+    if scale == 1:
+        return images
+    return F.avg_pool2d(images.permute(0, 3, 1, 2), scale).permute(0, 2, 3, 1)
+
+
+def pixel_directions(matrix, focal, centre, pixels):
+    """Numpy twin of `photograph.camera_ray`: unit directions (n, 3) in the world of pixel coordinates (n, 2)."""
+    x, y = ((pixels - centre) / focal).T
+    d = np.stack([-x, -y, np.ones_like(x)], 1) @ matrix[:3, :3].T
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def camera_of(sensor):
+    """(to_world (4, 4), focal (2,), centre (2,)) of a photograph as numpy arrays."""
+    return np.array(sensor.matrix).reshape(4, 4), np.array(sensor.focal).ravel(), np.array(sensor.centre).ravel()
+
+
+def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
+    """The point (3,) closest in the least-squares sense to lines (n, 3) + t (n, 3)."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
+    if np.linalg.cond(matrix) > 1e6:
+        raise InputError(f"{what}: all cameras look along one line, so the object's place is unknown; "
+                         "give center and radius of the shapenet shape")  # fmt: skip
+    return np.linalg.solve(matrix, right)
+
+
+def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -> tuple[np.ndarray, float]:
+    """Centre of the masks' visual hull and the radius of the ball of the same volume [scene units]."""
+    cameras = [camera_of(capture.sensors[k]) for k in masked]
+    pixels = []
+    for k in masked:
+        rows, columns = np.nonzero(capture.masks[k] > 127)
+        if not len(rows):
+            raise InputError(f"{capture.sensors[k].mask}: mask: no object in it (no pixel above 127)")
+        pixels.append(np.stack([columns, rows], 1) + 0.5)
+    origins = np.stack([matrix[:3, 3] for matrix, _, _ in cameras])
+    axes = np.stack([pixel_directions(*c, p.mean(0, keepdims=True))[0] for c, p in zip(cameras, pixels)])
+    center = nearest_point(origins, axes, str(capture.path))
+    reach = max(
+        np.linalg.norm(np.cross(pixel_directions(*c, p), center - o), axis=1).max()
+        for c, p, o in zip(cameras, pixels, origins)
+    )
+    axis = np.linspace(-reach, reach, resolution)
+    grid = center + np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    votes = np.zeros(len(grid))
+    for k, (matrix, focal, centre) in zip(masked, cameras):
+        local = (grid - matrix[:3, 3]) @ matrix[:3, :3]
+        mask = capture.masks[k]
+        column, row = (np.floor(centre - focal * local[:, :2] / local[:, 2:])).astype(int).T
+        height, width = mask.shape
+        seen = (local[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        outside = mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] <= 127
+        votes += seen & outside
+    hull = grid[votes <= 0.02 * len(masked)]
+    if not len(hull):
+        raise InputError(f"{capture.path}: masks: no point in space lies inside all masks; check to_world, fx, fy, cx, cy")
+    volume = len(hull) * (2 * reach / (resolution - 1)) ** 3
+    return hull.mean(0), float((3 * volume / (4 * np.pi)) ** (1 / 3))
+
+
+def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
+    """The point that all cameras look at, and half the radius of the ball there that every photograph holds."""
+    cameras = [camera_of(sensor) for sensor in capture.sensors]
+    origins = np.stack([matrix[:3, 3] for matrix, _, _ in cameras])
+    center = nearest_point(origins, np.stack([matrix[:3, 2] for matrix, _, _ in cameras]), str(capture.path))
+    half_angle = min(np.arctan(min(s.size) / 2 / f.max()) for s, (_, f, _) in zip(capture.sensors, cameras))
+    return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())
+
+
+def load(path: str | Path) -> Capture:
+    """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the XML file of a scene")
+    try:
+        scene = mi.load_file(str(path), optimize=False)
+    except RuntimeError as error:
+        raise InputError(f"{path}: {reason(error)}") from error
+    sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
+    if not sensors:
+        raise InputError(f'{path}: sensor: found no <sensor type="photograph">; a fit needs one per photograph')
+    shapes = [s for s in scene.shapes() if isinstance(s, mesh.ShapeNetMesh)]
+    if len(shapes) != 1:
+        raise InputError(f'{path}: shape: found {len(shapes)} <shape type="shapenet">; a fit needs exactly one')
+    try:
+        for shape in scene.shapes():
+            check_attributes(shape)
+        images = [read_image(s, path) for s in sensors]
+        masks = [read_mask(s, path) for s in sensors]
+        shadows = getattr(scene.integrator(), "shadows", True)
+        return Capture(path, scene, shapes[0], sensors, images, masks, shadows)
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(f"{path}: {error}") from error
+
+
+def reason(error: RuntimeError) -> str:
+    """What Mitsuba's parser has to say, in one line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    last = lines[-1].removeprefix("ValueError: ").removeprefix("mi_ring.errors.InputError: ")
+    place = lines[0].split("] ", 1)[-1].rstrip(": ")
+    return last if len(lines) > 1 else place
+
+
+def read_bitmap(path: Path, field: str, scene: Path) -> mi.Bitmap:
+    if not path.is_file():
+        raise InputError(f"{scene}: {field}: no such file: {path}")
+    try:
+        return mi.Bitmap(str(path))
+    except RuntimeError as error:
+        raise InputError(f"{path}: {field}: cannot be read as an image ({str(error).splitlines()[0]})") from error
+
+
+def read_image(sensor, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, 3) of a photograph: uint8, uint16 or float32."""
+    field = f'photograph "{sensor.id()}", filename'
+    bitmap = read_bitmap(sensor.filename, field, scene)
+    check_size(sensor.filename, field, tuple(bitmap.size()), sensor.size)
+    pixels = np.array(bitmap, copy=True)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.dtype == np.float32 and not np.isfinite(pixels).all():
+        raise InputError(f"{sensor.filename}: {field}: contains NaN or infinite pixels")
+    sensor.linear = sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
+    return pixels[:, :, :3] if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
+
+
+def read_mask(sensor, scene: Path) -> np.ndarray | None:
+    """Mask (H, W) uint8 of a photograph, None if it has none."""
+    if sensor.mask is None:
+        return None
+    field = f'photograph "{sensor.id()}", mask'
+    bitmap = read_bitmap(sensor.mask, field, scene)
+    check_size(sensor.mask, field, tuple(bitmap.size()), sensor.size)
+    pixels = np.array(bitmap, copy=True)
+    if pixels.dtype != np.uint8:
+        pixels = (pixels.astype(np.float32) * (255 / 65535 if pixels.dtype == np.uint16 else 255)).astype(np.uint8)
+    return pixels if pixels.ndim == 2 else pixels[:, :, 0]
+
+
+def check_size(path: Path, field: str, found: tuple, expected: tuple) -> None:
+    if tuple(map(int, found)) != tuple(map(int, expected)):
+        raise InputError(f"{path}: {field}: is {found[0]} x {found[1]} pixels, the film says {expected[0]} x {expected[1]}")

@@ -1,0 +1,52 @@
+"""The terms of the loss, small pure functions. All are means, so that their weights do not depend on sizes."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str = "l2") -> Tensor:
+    """L_rgb: how far predicted photographs (n, H, W, 3) are from the observed ones, in units of `exposure`.
+
+    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed, so a brighter prediction is no error.
+    `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so that
+    dim surfaces seen at a slant count as much as bright ones.
+    """
+    if kind == "log":
+        predicted, observed = ((x / exposure * 4).clamp(min=-0.5).log1p() for x in (predicted, observed))
+    else:
+        predicted, observed = predicted / exposure, observed / exposure
+    error = predicted - observed
+    error = torch.where(clipped, error.clamp(max=0), error)
+    return error.square().mean() if kind == "l2" else error.abs().mean()
+
+
+def mask_loss(coverage: Tensor, mask: Tensor, sigma: float) -> Tensor:
+    """Squared difference of coverage and mask (n, H, W), blurred by a Gaussian of `sigma` [px].
+
+    The blur lets an outline feel a mask that it does not touch yet.
+    """
+    return blur(coverage - mask, sigma).square().mean()
+
+
+def blur(images: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur of (n, H, W) images, zero outside."""
+    if sigma < 0.3:
+        return images
+    radius = int(3 * sigma + 0.5)
+    x = torch.arange(-radius, radius + 1, dtype=images.dtype)
+    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
+    kernel = (kernel / kernel.sum())[None, None]
+    images = F.conv2d(images[:, None], kernel[:, :, None, :], padding=(0, radius))
+    return F.conv2d(images, kernel[:, :, :, None], padding=(radius, 0))[:, 0]
+
+
+def velocity_loss(velocity, x: Tensor, laplacian_scale: float, step: float = 0.02) -> Tensor:
+    """L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) of the flow's paths, α = `laplacian_scale`.
+
+    The Laplacian over ℝ³ is the seven-point stencil of width `step`, small against the period of the highest frequency.
+    """
+    offsets = step * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
+    v = velocity(torch.cat([x[None], x + offsets[:, None]]))
+    laplacian = (v[1:] - v[0]).sum(0) / step**2
+    return (v[0] - laplacian_scale * laplacian).square().sum(-1).mean()

@@ -1,0 +1,99 @@
+"""The `shapenet` shape: the reconstructed surface as a mesh (Mitsuba plugin)."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+import trimesh
+
+from mi_ring.bsdf import ATTRIBUTES, check_attributes
+from mi_ring.domain import Domain, Sphere
+from mi_ring.ring import Ring
+
+# Mitsuba's names of mesh parameters; 3.10 renames them.
+POSITIONS, FACES = "vertex_positions", "faces"
+
+
+class ShapeNetMesh(mi.Mesh):
+    """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
+
+    ================ ========= ===============================================================================
+    parameter        type      meaning
+    ================ ========= ===============================================================================
+    ``weights``      string    a saved fit (``ring.pt``); without it the shape is the undeformed domain
+    ``subdivisions`` integer   level of the icosphere: 10 · 4ⁿ + 2 vertices. Default: 5
+    ``domain``       string    optional mesh file (scene units), closed: the canonical surface instead of the
+                               sphere. Not together with ``weights``, which carry their own
+    ``center``       point     centre of the normalising sphere [scene units]; with ``weights`` theirs.
+                               Default: the origin; a fit estimates it from masks or cameras
+    ``radius``       float     its radius [scene units]; likewise. Default: 1
+    ``to_world``     transform applied on top of everything. Default: none
+    ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it to
+                               false to place a fit into a scene of your own. Default: true
+    (nested)         bsdf      usually ``cooktorrance``, which reads the attributes below
+    ================ ========= ===============================================================================
+
+    The mesh carries smooth normals and the attributes ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
+    ``vertex_roughness`` (1); without ``weights`` they are 0.5, 0 and 0.5. A nested BSDF that asks for another attribute, or
+    for one with another number of channels, is an error. What it does not do: texture coordinates.
+
+    .. code-block:: xml
+
+        <shape type="shapenet" id="object">
+          <string name="weights" value="ring.pt"/><integer name="subdivisions" value="6"/>
+          <bsdf type="cooktorrance"/>
+        </shape>
+    """
+
+    def __init__(self, props):
+        resolver = mi.file_resolver()
+        self.subdivisions = props.get("subdivisions", 5)
+        if not 0 <= self.subdivisions <= 8:
+            raise ValueError(f'shapenet "{props.id()}": subdivisions is {self.subdivisions}, must be 0 to 8')
+        given = {key: props[key] for key in ("center", "radius", "domain", "weights") if key in props}
+        for key in ("center", "radius", "domain"):
+            if key in given and "weights" in given:
+                raise ValueError(f'shapenet "{props.id()}": weights carry their own {key}; give only one of the two')
+        to_world = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
+        if props.get("flash", True):
+            # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
+            props["flash"] = mi.load_dict({"type": "flash"})
+
+        #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
+        self.center = np.array(given["center"]).ravel() if "center" in given else None
+        self.radius = given.get("radius")
+        self.domain = Sphere()
+        center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
+        if "domain" in given:
+            mesh = trimesh.load(str(resolver.resolve(given["domain"])), force="mesh")
+            if not mesh.is_watertight:
+                raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is not a closed surface')
+            self.domain = Domain((mesh.vertices - center) / radius, mesh.faces)
+        self.ring = Ring.load(str(resolver.resolve(given["weights"]))) if "weights" in given else None
+
+        material = torch.tensor([0.5, 0.5, 0.5]), torch.tensor(0.0), torch.tensor(0.5)
+        if self.ring is None:
+            s, faces = self.domain.sample(self.subdivisions)
+            vertices = torch.as_tensor(center, dtype=torch.float32) + radius * s
+            material = [m.expand(len(s), *m.shape) for m in material]
+        else:
+            s, faces = self.ring.domain.sample(self.subdivisions)
+            with torch.no_grad():
+                vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
+        matrix = torch.tensor(to_world, dtype=torch.float32)
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+
+        super().__init__(props.id(), len(vertices), len(faces), props, True, False)
+        params = mi.traverse(self)
+        params[POSITIONS] = mi.Float(vertices.numpy().ravel())
+        params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+        params.update()
+        for (name, channels), value in zip(ATTRIBUTES.items(), material):
+            self.add_attribute(name, channels, value.contiguous().numpy().ravel())
+        check_attributes(self)
+
+    def to_string(self):
+        return f"ShapeNetMesh[id={self.id()}, vertices={self.vertex_count()}, subdivisions={self.subdivisions}]"
+
+
+mi.register_shape("shapenet", ShapeNetMesh)

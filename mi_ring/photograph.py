@@ -1,0 +1,165 @@
+"""The `photograph` sensor: a calibrated photograph and the light it was taken under (Mitsuba plugin)."""
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def camera_ray(to_world, focal, centre, pixel):
+    """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
+
+    `to_world`: Matrix4f camera-to-world; `focal`, `centre`: Point2f (fx, fy), (cx, cy) [px]; `pixel`: Point2f [px],
+    x right, y down. Arguments may hold one camera or one camera per lane. Returns (origin, unit direction).
+    """
+    x, y = (pixel.x - centre.x) / focal.x, (pixel.y - centre.y) / focal.y
+    m = to_world
+    direction = mi.Vector3f(
+        -m[0, 0] * x - m[0, 1] * y + m[0, 2],
+        -m[1, 0] * x - m[1, 1] * y + m[1, 2],
+        -m[2, 0] * x - m[2, 1] * y + m[2, 2],
+    )
+    return mi.Point3f(m[0, 3], m[1, 3], m[2, 3]), dr.normalize(direction)
+
+
+def project(to_world, focal, centre, point):
+    """The inverse of `camera_ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point.
+
+    The rotation part of `to_world` must be orthonormal.
+    """
+    m = to_world
+    d = point - mi.Point3f(m[0, 3], m[1, 3], m[2, 3])
+    x, y, z = (m[0, k] * d.x + m[1, k] * d.y + m[2, k] * d.z for k in range(3))
+    return mi.Point2f(centre.x - focal.x * x / z, centre.y - focal.y * y / z), z
+
+
+class Photograph(mi.Sensor):
+    """A calibrated photograph: pinhole camera, image, optional mask, and the light it was taken under.
+
+    ================ ============ ==========================================================================
+    parameter        type         meaning
+    ================ ============ ==========================================================================
+    ``filename``     string       image file, relative to the XML; read by the fit, never by an integrator
+    ``mask``         string       optional mask file of the same size: 0 background, 255 object
+    ``fx``, ``fy``   float        focal lengths [px]
+    ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the centre of the
+                                  first pixel is (0.5, 0.5). Default: the middle of the film
+    ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale
+    ``encoding``     string       ``srgb`` or ``linear``; default ``srgb`` for 8-bit files, ``linear`` for 16-bit
+                                  PNG/TIFF and EXR
+    ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped: they only say "at
+                                  least this bright". Default 1
+    (nested)         film         its size is the image's
+    (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone. Default: a point
+                                  light of intensity 1 at the camera centre
+    ================ ============ ==========================================================================
+
+    Every integrator sees the nested light while it renders this sensor, through the `flash` emitter that a `shapenet`
+    shape carries. What it does not do: depth of field, lens distortion, motion blur; light tracing integrators
+    (``ptracer``) cannot see the nested light.
+
+    .. code-block:: xml
+
+        <sensor type="photograph" id="000">
+          <string name="filename" value="images/000.png"/>
+          <float name="fx" value="443.4"/> <float name="fy" value="443.4"/>
+          <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+          <film type="hdrfilm"><integer name="width" value="512"/><integer name="height" value="512"/></film>
+          <emitter type="point"><point name="position" x="0" y="0" z="5"/><rgb name="intensity" value="25"/></emitter>
+        </sensor>
+    """
+
+    current = None  #: the photograph being rendered; `Flash` lights the scene with its light
+
+    def __init__(self, props):
+        super().__init__(props)
+        resolver = mi.file_resolver()
+        self.filename = Path(str(resolver.resolve(props["filename"])))
+        self.mask = Path(str(resolver.resolve(props["mask"]))) if "mask" in props else None
+        self.encoding = props.get("encoding", "auto")
+        if self.encoding not in ("auto", "srgb", "linear"):
+            raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
+        self.saturation = float(props.get("saturation", 1.0))
+
+        width, height = (int(s) for s in self.film().size())
+        self.focal = mi.Point2f(props["fx"], props["fy"])
+        self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))
+        matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
+        rotation = matrix[:3, :3]
+        if not np.isfinite(matrix).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            raise ValueError(f'photograph "{props.id()}": to_world must be a rotation and a translation, without scale')
+        self.matrix = mi.Matrix4f(matrix)
+
+        lights = [value for _, value in props.objects() if isinstance(value, mi.Emitter)]
+        if len(lights) > 1:
+            raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, at most one light per photograph')
+        position = [float(v) for v in matrix[:3, 3]]
+        self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
+        dr.make_opaque(self.focal, self.centre, self.matrix)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]"""
+        width, height = self.film().size()
+        return int(width), int(height)
+
+    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        Photograph.current = self
+        size = mi.ScalarVector2f(self.film().size())
+        origin, direction = camera_ray(self.matrix, self.focal, self.centre, sample2 * size)
+        wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+        return mi.Ray3f(origin, direction, time, wavelengths), weight
+
+    def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+        ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def traverse(self, callback):
+        super().traverse(callback)
+        callback.put("to_world", self.matrix, mi.ParamFlags.Differentiable)
+        callback.put("focal", self.focal, mi.ParamFlags.Differentiable)
+        callback.put("centre", self.centre, mi.ParamFlags.Differentiable)
+        callback.put("light", self.light, mi.ParamFlags.Differentiable)
+
+    def to_string(self):
+        return f"Photograph[filename={self.filename}, size={self.size}]"
+
+
+class Flash(mi.Emitter):
+    """The light of whichever `photograph` is being rendered; black while another kind of sensor is.
+
+    Nested emitters light only their own photograph, so they are no emitters of the scene and stock integrators would see
+    none. `shapenet` therefore carries this one, which hands every question on to the light of the current photograph.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.m_flags = mi.EmitterFlags.DeltaPosition
+
+    def sample_direction(self, it, sample, active=True):
+        if Photograph.current is None:
+            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+        return Photograph.current.light.sample_direction(it, sample, active)
+
+    def eval(self, si, active=True):
+        return mi.Spectrum(0)
+
+    def pdf_direction(self, it, ds, active=True):
+        return mi.Float(0)
+
+    def eval_direction(self, it, ds, active=True):
+        return mi.Spectrum(0)
+
+    def bbox(self):
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback):
+        pass
+
+    def to_string(self):
+        return "Flash[]"
+
+
+mi.register_sensor("photograph", Photograph)
+mi.register_emitter("flash", Flash)

@@ -1,0 +1,56 @@
+"""The ring: both networks, the domain and the normalisation, which together are a reconstructed object."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from mi_ring.brdfnet import BRDFNet
+from mi_ring.domain import Domain, Sphere
+from mi_ring.errors import InputError
+from mi_ring.shapenet import ShapeNet
+
+FORMAT = 1  #: version of the file `ring.pt`
+
+
+class Ring(nn.Module):
+    """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
+
+    `center` (3,) and `radius` are in scene units.
+    """
+
+    def __init__(self, center, radius: float, scale: float = 1.0, domain: Domain | None = None):
+        super().__init__()
+        self.shape_net, self.brdf_net = ShapeNet(), BRDFNet(scale)
+        self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
+        self.register_buffer("radius", torch.tensor(float(radius)))
+        self.domain = domain or Sphere()
+
+    def surface(self, s: Tensor) -> Tensor:
+        """Surface points (V, 3) [scene units] of domain points (V, 3)."""
+        return self.center + self.radius * self.shape_net(s)
+
+    def state(self, config: dict | None = None) -> dict:
+        domain = None if isinstance(self.domain, Sphere) else {"points": self.domain.points, "faces": self.domain.faces}
+        return {"format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {}}
+
+    @classmethod
+    def from_state(cls, state: dict) -> "Ring":
+        domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
+        ring = cls(torch.zeros(3), 1.0, domain=domain)
+        ring.load_state_dict(state["networks"])
+        return ring
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Ring":
+        """Read `ring.pt`. Raises InputError if the file is missing, is no ring or is of another format version."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            version = state["format"]
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; weights must be the ring.pt of a finished fit") from None
+        except Exception as error:
+            raise InputError(f"{path}: not a saved fit ({str(error).splitlines()[0]})") from error
+        if version != FORMAT:
+            raise InputError(f"{path}: format version {version}, this mi_ring reads version {FORMAT}")
+        return cls.from_state(state)
