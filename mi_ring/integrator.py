@@ -91,7 +91,7 @@ class Photometric(ADIntegrator):
 class Photographs:
     """Cameras and lights of all photographs of a scene as Dr.Jit buffers, and which of them to render.
 
-    `size` is (width, height) [px] of every rendered photograph, `index` (UInt32) selects and orders them.
+    `index` (UInt32) selects and orders them; `size` is (width, height) [px] of every selected photograph.
     """
 
     cameras: object  # Float, 12 per photograph: the upper three rows of to_world
@@ -103,7 +103,7 @@ class Photographs:
 
     @classmethod
     def of(cls, sensors) -> "Photographs":
-        """All `photograph` sensors of a scene, at the size of the first."""
+        """All `photograph` sensors of a scene; `size` is the first one's, `select` those of equal size."""
         cameras = np.stack([np.array(s.matrix).reshape(4, 4)[:3] for s in sensors])
         intrinsics = [[*np.array(s.focal).ravel(), *np.array(s.centre).ravel()] for s in sensors]
         lights = np.stack([light_row(s) for s in sensors])
@@ -117,9 +117,9 @@ class Photographs:
             not (off | (lights[:, 3] > 0)).any(),
         )
 
-    def select(self, index, scale: int = 1) -> "Photographs":
-        """Photographs `index` (a sequence of ints), `scale` times smaller: a pixel is a block of `scale`² pixels."""
-        width, height = self.size
+    def select(self, index, size: tuple[int, int], scale: int = 1) -> "Photographs":
+        """Photographs `index` (a sequence of ints), all (width, height) = `size`, rendered `scale` times smaller."""
+        width, height = size
         return Photographs(
             self.cameras, self.intrinsics / dr.opaque(mi.Float, scale), self.lights,
             mi.UInt32(np.asarray(index, np.uint32)), (width // scale, height // scale), self.colocated,

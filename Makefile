@@ -1,0 +1,55 @@
+# `make setup` needs Python 3.10+ and make; no root. What Debian splits off or lacks (pip, LLVM) is fetched with apt-get
+# and unpacked inside $(VENV).
+VENV   ?= .venv
+PYTHON ?= python3
+# A smaller CPU-only torch does as well: make setup TORCH=<wheel or URL>
+TORCH  ?= torch==2.13.0
+SCENE  ?= scenes/pot2.xml
+ARGS   ?=
+
+RUN = $(VENV)/bin/python -m
+
+.PHONY: help setup fit test lint clean
+
+help:
+	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
+	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE)'
+	@echo 'make test [ARGS=...]         run pytest'
+	@echo 'make lint                    run ruff'
+	@echo 'make clean                   remove caches; $(VENV) stays'
+
+setup: $(VENV)/.setup-done
+
+$(VENV)/.setup-done: pyproject.toml Makefile mi_ring/llvm.py | $(VENV)/bin/pip
+	$(VENV)/bin/python -I mi_ring/llvm.py
+	$(RUN) pip install $(TORCH)
+	$(RUN) pip install -e '.[test]'
+	@touch $@
+
+# Debian and Ubuntu keep ensurepip in the package python3-venv. Without it, the wheel in python3-pip-whl is pip enough to
+# install pip; it looks for certificates where a slim container has none, so give it those it came with.
+$(VENV)/bin/pip:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+	  || { echo 'make setup: Python 3.10 or newer is needed, for example PYTHON=python3.12' >&2; exit 1; }
+	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv $(VENV); else set -e; \
+	  $(PYTHON) -m venv --without-pip $(VENV); \
+	  deb=$(VENV)/pip-deb; wheels=/usr/share/python-wheels; certificates=/etc/ssl/certs/ca-certificates.crt; \
+	  ls $$wheels/pip-*.whl >/dev/null 2>&1 || { $(PYTHON) -I mi_ring/llvm.py $$deb python3-pip-whl; wheels=$$deb$$wheels; }; \
+	  test -e $$certificates || { certificates=$$deb/certificates; cat $$deb/usr/share/ca-certificates/*/*.crt >$$certificates; }; \
+	  wheel=$$(ls $$wheels/pip-*.whl); \
+	  PIP_CERT=$${PIP_CERT:-$$certificates} $(VENV)/bin/python $$wheel/pip install --upgrade pip; \
+	  rm -rf $$deb; fi
+
+fit: setup
+	$(RUN) mi_ring.fit $(SCENE) $(ARGS)
+
+test: setup
+	$(RUN) pytest $(ARGS)
+
+lint: setup
+	@$(RUN) ruff --version >/dev/null 2>&1 || $(RUN) pip install ruff
+	$(RUN) ruff check .
+
+clean:
+	rm -rf .pytest_cache .ruff_cache build *.egg-info
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +

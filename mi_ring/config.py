@@ -1,0 +1,124 @@
+"""What the user chooses: one frozen dataclass is the command line, its docstrings the help text."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from tyro.conf import Positional
+
+from mi_ring.errors import InputError
+
+
+class Stage(NamedTuple):
+    """One stage of coarse to fine."""
+
+    level: int  # of the icosphere
+    width: int  # of the photographs, at most [px]
+    first: int  # iteration
+    last: int  # iteration after the last
+
+
+@dataclass(frozen=True)
+class Config:
+    """Reconstruct an object: photographs in, a watertight mesh with a spatially varying material out."""
+
+    scene: Positional[Path]
+    """Mitsuba XML file with the photographs."""
+    out: Path | None = None
+    """Folder of the results. Default: out/<scene name>."""
+    resume: bool = False
+    """Go on from the folder's checkpoint.pt. Give the same settings as before."""
+    preset: Literal["fast", "default", "fine", "paper"] = "default"
+    """Settings that go together; each can be overridden. paper: the paper's own, days on a CPU."""
+    seed: int = 0
+    """Of every random choice."""
+    iterations: int = 300
+    """In all, shared out among the stages."""
+    levels: tuple[int, ...] = (4, 5, 6)
+    """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
+    widths: tuple[int, ...] = (128, 256, 512)
+    """Width of the photographs in each stage, at most [px]."""
+    shares: tuple[float, ...] = (0.5, 0.4, 0.1)
+    """Share of the iterations of each stage."""
+    batch: int = 8
+    """Photographs per iteration."""
+    spp: int = 1
+    """Samples per pixel."""
+    loss: Literal["l2", "l1", "log"] = "l1"
+    """How predicted and observed radiance are compared."""
+    weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
+    """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
+    laplacian_scale: float = 0.01
+    """The paper's alpha: how much the regulariser smoothes the velocity field."""
+    blur: float = 0.06
+    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to 0."""
+    optimizer: Literal["muon", "adam"] = "muon"
+    """muon: Muon for the hidden weights, Adam for the rest. adam: Adam for all."""
+    learning_rate: float = 3e-3
+    """Of Adam."""
+    muon_rate: float = 3e-2
+    """Learning rate of Muon."""
+    decay: float = 0.1
+    """The learning rates fall exponentially to this share."""
+    precision: Literal["auto", "bfloat16", "float32"] = "auto"
+    """Of the networks' matrix products. auto: bfloat16 where the processor has instructions for it."""
+    subdivisions: int = 6
+    """Level of the mesh that is written."""
+    threads: int = 0
+    """Processor threads; 0: all."""
+    deterministic: bool = False
+    """The same result bit for bit on the same machine, on one thread."""
+
+    def __post_init__(self):
+        def require(condition: bool, name: str, what: str) -> None:
+            if not condition:
+                raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
+
+        for name in ("iterations", "batch", "spp"):
+            require(getattr(self, name) >= 1, name, "at least 1")
+        for name in ("seed", "threads", "blur", "laplacian_scale"):
+            require(getattr(self, name) >= 0, name, "0 or more")
+        for name in ("learning_rate", "muon_rate", "decay"):
+            require(getattr(self, name) > 0, name, "above 0")
+        require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
+        require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
+        for name in ("widths", "shares"):
+            value = getattr(self, name)
+            require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
+            require(all(v > 0 for v in value), name, "above 0")
+        unknown = set(self.weights) - {"rgb", "mask", "velocity"}
+        require(not unknown, "weights", "of rgb, mask and velocity")
+
+    @property
+    def folder(self) -> Path:
+        return self.out or Path("out") / self.scene.stem
+
+    def stages(self) -> list[Stage]:
+        total, done, first, stages = sum(self.shares), 0.0, 0, []
+        for level, width, share in zip(self.levels, self.widths, self.shares):
+            done += share
+            last = round(self.iterations * done / total)
+            stages.append(Stage(level, width, first, last))
+            first = last
+        return [stage for stage in stages if stage.last > stage.first]
+
+    def settings(self) -> dict:
+        """What defines the result, as plain data: all but where it goes and how many threads make it."""
+        plain = json.loads(self.to_json())
+        return {key: value for key, value in plain.items() if key not in ("scene", "out", "resume", "threads")}
+
+    def to_json(self) -> str:
+        return json.dumps(dataclasses.asdict(self), indent=2, default=str)
+
+
+PRESETS = {
+    "fast": {"iterations": 120, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5},
+    "default": {},
+    "fine": {"iterations": 1200, "shares": (0.3, 0.4, 0.3)},
+    "paper": {
+        "iterations": 6000, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "batch": 48, "spp": 4,
+        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "precision": "float32",
+    },
+}  # fmt: skip
