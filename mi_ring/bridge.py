@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.integrator import backward_edges, render_photographs
+from mi_ring.integrator import backward_edges, render_maps, render_photographs
 from mi_ring.mesh import FACES, POSITIONS
 
 DIFFUSE, SPECULAR, ROUGHNESS = "vertex_diffuse", "vertex_specular", "vertex_roughness"
@@ -46,6 +46,13 @@ class Surface:
         return arrays
 
 
+    def show(self, ring, s: Tensor, faces: np.ndarray) -> None:
+        """Write a `Ring` at domain points (V, 3) with these triangles."""
+        with torch.no_grad():
+            self.set_faces(faces)
+            self.write(ring.surface(s), *ring.brdf_net(s))
+
+
 def edges_of(faces: np.ndarray):
     """Edges of a closed mesh: ((v0, v1), (opposite0, opposite1)) as UInt32, for triangles (v0 v1 o0) and (v1 v0 o1)."""
     f = faces.astype(np.int64)
@@ -66,11 +73,8 @@ class _Render(torch.autograd.Function):
         arrays = surface.write(vertices, diffuse, specular, roughness, gradients)
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
         dr.eval(channels)
-        width, height = photographs.size
-        shape = (len(photographs), height, width)
-        picture = [torch.from_numpy(np.array(dr.detach(c)).reshape(shape)) for c in channels]
         ctx.save = (surface, photographs, arrays, channels, seed, shadows)
-        return torch.stack(picture[:3], dim=-1), picture[3]
+        return pictures(channels, photographs)
 
     @staticmethod
     def backward(ctx, rgb_grad, alpha_grad):
@@ -97,3 +101,33 @@ def render(surface, photographs, vertices, diffuse, specular, roughness, spp=4, 
     those of shading and of the outline, for radiance and for coverage; where a cast shadow ends they are not complete.
     """
     return _Render.apply(vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows)
+
+
+def draw(surface, photographs, spp=16, seed=0, shadows=True):
+    """Like `render`, of the surface as last written and without gradients."""
+    channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
+    dr.eval(channels)
+    return pictures(channels, photographs)
+
+
+def pictures(channels, photographs):
+    """The renderer's four Floats as tensors ((N, H, W, 3), (N, H, W))."""
+    width, height = photographs.size
+    shape = (len(photographs), height, width)
+    picture = [torch.from_numpy(np.array(dr.detach(c)).reshape(shape)) for c in channels]
+    return torch.stack(picture[:3], dim=-1), picture[3]
+
+
+def maps(surface, photographs) -> dict[str, np.ndarray]:
+    """What the pixels of `photographs` see of the surface as last written, zero where they see none.
+
+    `normal` (N, H, W, 3) in world space, `diffuse` (N, H, W, 3), `specular` and `roughness` (N, H, W).
+    """
+    width, height = photographs.size
+    channels = [np.array(c).reshape(len(photographs), height, width) for c in render_maps(surface.scene, photographs)]
+    return {
+        "normal": np.stack(channels[:3], -1),
+        "diffuse": np.stack(channels[3:6], -1),
+        "specular": channels[6],
+        "roughness": channels[7],
+    }

@@ -44,7 +44,7 @@ class Capture:
     def observe(self, index, scale: int = 1) -> tuple[Tensor, Tensor, Tensor | None]:
         """Photographs `index`, box-filtered `scale` times smaller.
 
-        Returns linear radiance (n, H, W, 3), where a pixel is clipped (n, H, W, 3) bool: the scene was at least this bright,
+        Returns linear radiance (n, H, W, 3), where it is clipped (n, H, W, 3) bool: the scene was at least this bright,
         and the object's coverage (n, H, W) in [0, 1] or None if one of them has no mask.
         """
         decoded, clipped, covered = [], [], []
@@ -68,7 +68,7 @@ class Capture:
             inside = (mask[0] > 0.5) if mask is not None else rgb[0].mean(-1) > 0.02 * rgb.max()
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
         if not total > 0:
-            raise InputError(f"{self.path}: photographs: every pixel of the object is black; check the exposure and the masks")
+            raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
         return total / count
 
     def reflectance(self, center, exposure: float) -> float:
@@ -78,7 +78,7 @@ class Capture:
         return float(exposure / np.median(lights[:, 4:7].mean(1) / distance2))
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """The normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
+        """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
         if self.shape.center is not None and self.shape.radius is not None:
             return self.shape.center, self.shape.radius
         masked = [k for k, mask in enumerate(self.masks) if mask is not None]
@@ -90,7 +90,7 @@ class Capture:
 
 
 def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, both of `image`'s shape."""
+    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape."""
     if image.dtype == np.float32:
         value = image
     else:
@@ -104,6 +104,12 @@ def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarr
 def srgb_to_linear(v):
     """IEC 61966-2-1, on numpy arrays."""
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(v):
+    """The inverse of `srgb_to_linear`, clipped to [0, 1]."""
+    v = np.clip(v, 0, 1)
+    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def shrink(images: Tensor, scale: int) -> Tensor:
@@ -164,7 +170,7 @@ def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -
         votes += seen & outside
     hull = grid[votes <= 0.02 * len(masked)]
     if not len(hull):
-        raise InputError(f"{capture.path}: masks: no point in space lies inside all masks; check to_world, fx, fy, cx, cy")
+        raise InputError(f"{capture.path}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
     volume = len(hull) * (2 * reach / (resolution - 1)) ** 3
     return hull.mean(0), float((3 * volume / (4 * np.pi)) ** (1 / 3))
 
@@ -178,13 +184,16 @@ def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
     return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())
 
 
-def load(path: str | Path) -> Capture:
-    """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later."""
+def load(path: str | Path, images: bool = True) -> Capture:
+    """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later.
+
+    Without `images` only cameras and lights are read: enough to render.
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the XML file of a scene")
     try:
-        scene = mi.load_file(str(path), optimize=False)
+        scene = mi.load_file(str(path), optimize=False, parallel=False)
     except RuntimeError as error:
         raise InputError(f"{path}: {reason(error)}") from error
     sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
@@ -196,10 +205,10 @@ def load(path: str | Path) -> Capture:
     try:
         for shape in scene.shapes():
             check_attributes(shape)
-        images = [read_image(s, path) for s in sensors]
-        masks = [read_mask(s, path) for s in sensors]
+        pixels = [read_image(s, path) for s in sensors] if images else []
+        masks = [read_mask(s, path) for s in sensors] if images else []
         shadows = getattr(scene.integrator(), "shadows", True)
-        return Capture(path, scene, shapes[0], sensors, images, masks, shadows)
+        return Capture(path, scene, shapes[0], sensors, pixels, masks, shadows)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{path}: {error}") from error
 
@@ -213,6 +222,7 @@ def reason(error: RuntimeError) -> str:
 
 
 def read_bitmap(path: Path, field: str, scene: Path) -> mi.Bitmap:
+    """An image file; `field` and `scene` say who asks for it."""
     if not path.is_file():
         raise InputError(f"{scene}: {field}: no such file: {path}")
     try:
@@ -251,5 +261,7 @@ def read_mask(sensor, scene: Path) -> np.ndarray | None:
 
 
 def check_size(path: Path, field: str, found: tuple, expected: tuple) -> None:
+    """Raise InputError unless an image is as large as the film of its photograph."""
     if tuple(map(int, found)) != tuple(map(int, expected)):
-        raise InputError(f"{path}: {field}: is {found[0]} x {found[1]} pixels, the film says {expected[0]} x {expected[1]}")
+        found, expected = ("{} x {}".format(*size) for size in (found, expected))
+        raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")

@@ -17,7 +17,7 @@ class Domain:
         self.faces = np.asarray(faces, np.int64)
 
     def sample(self, subdivisions: int, rotation: Tensor | None = None) -> tuple[Tensor, np.ndarray]:
-        """Points (V, 3) and faces (F, 3): at least as many faces as an icosphere of that level. `rotation` is unused."""
+        """Points (V, 3), faces (F, 3): no fewer faces than an icosphere of that level has. `rotation` is unused."""
         points, faces = self.points, self.faces
         while len(faces) < 20 * 4**subdivisions:
             points, faces = trimesh.remesh.subdivide(points, faces)

@@ -8,7 +8,7 @@ import numpy as np
 from mitsuba.ad.integrators.common import ADIntegrator
 
 from mi_ring import photograph
-from mi_ring.bsdf import check_attributes
+from mi_ring.bsdf import CookTorrance, check_attributes
 from mi_ring.photograph import camera_ray, project
 
 #: Offset to either side of a silhouette edge [px]. Radiance grows like the square root of the distance to the outline, so
@@ -211,6 +211,26 @@ def render_photographs(scene, photographs, spp, seed, shadows=True):
     channels = trace(scene, ray, view, photographs, shadows, seed)
     dr.schedule(channels)  # together: block_sum would otherwise render once per channel
     return [dr.block_sum(c, spp) / spp for c in channels]
+
+
+def render_maps(scene, photographs):
+    """Normals and material where the centre of each pixel sees a `cooktorrance` surface, zero elsewhere.
+
+    Returns Floats of N·H·W pixels: [nx, ny, nz, diffuse r, g, b, specular, roughness], normals in world space.
+    """
+    width, height = photographs.size
+    lane = dr.arange(mi.UInt32, len(photographs) * width * height)
+    view, pixel = lane // (width * height), lane % (width * height)
+    where = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
+    si = scene.ray_intersect(mi.Ray3f(*camera_ray(*photographs.camera(view), where)))
+    maps = [*si.sh_frame.n, *([mi.Float(0)] * 5)]
+    for shape in scene.shapes():
+        if isinstance(shape.bsdf(), CookTorrance):
+            here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+            diffuse, specular, roughness = shape.bsdf().parameters(si, here)
+            material = [*diffuse, specular, roughness]
+            maps[3:] = [dr.select(here, new, old) for new, old in zip(material, maps[3:])]
+    return [dr.select(si.is_valid(), m, 0) for m in maps]
 
 
 def backward_edges(scene, photographs, positions, edges, channels_grad, seed, shadows=True, samples=4):

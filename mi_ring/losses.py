@@ -6,9 +6,9 @@ from torch.nn import functional as F
 
 
 def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str = "l2") -> Tensor:
-    """L_rgb: how far predicted photographs (n, H, W, 3) are from the observed ones, in units of `exposure`.
+    """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
 
-    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed, so a brighter prediction is no error.
+    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error.
     `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so that
     dim surfaces seen at a slant count as much as bright ones.
     """

@@ -1,6 +1,5 @@
 """The `shapenet` shape: the reconstructed surface as a mesh (Mitsuba plugin)."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch

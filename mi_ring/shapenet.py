@@ -32,11 +32,17 @@ class ShapeNet(nn.Module):
             h = F.leaky_relu(layer(h))
         return self.speed * torch.tanh(self.output(h).float())
 
+    def flow(self, x: Tensor, steps: int) -> Tensor:
+        """Φ(x, steps / T): the first `steps` of the T Euler steps, (..., 3) points."""
+        return euler(self.velocity, x, 1 / self.steps, steps)
+
     def forward(self, x: Tensor) -> Tensor:
-        return euler(self.velocity, x, self.steps)
+        """Φ(x, 1)"""
+        return self.flow(x, self.steps)
 
 
-def euler(velocity, x: Tensor, steps: int) -> Tensor:
+def euler(velocity, x: Tensor, dt: float, steps: int) -> Tensor:
+    """Integrate dx/dt = velocity(x) by `steps` explicit Euler steps: the same residual block again and again."""
     for _ in range(steps):
-        x = x + velocity(x) / steps
+        x = x + dt * velocity(x)
     return x

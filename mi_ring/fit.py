@@ -1,0 +1,250 @@
+"""The fit: `python -m mi_ring.fit scenes/pot2.xml`."""
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import drjit as dr
+import torch
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from mi_ring import bridge, capture, command, losses, results
+from mi_ring.config import PRESETS, Config
+from mi_ring.errors import InputError
+from mi_ring.ring import Ring
+
+CHECKPOINT_SECONDS = 30.0
+LOG_EVERY = 5
+REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
+
+
+class Fit:
+    """A reconstruction in progress: networks, optimisers, random numbers and how far it is."""
+
+    def __init__(self, scene: capture.Capture, config: Config):
+        self.capture, self.config = scene, config
+        self.random = torch.Generator().manual_seed(config.seed)
+        torch.manual_seed(config.seed)
+        center, radius = scene.sphere()
+        self.exposure = scene.exposure()
+        self.ring = Ring(center, radius, scene.reflectance(center, self.exposure), scene.shape.domain)
+        self.surface = bridge.Surface(scene.scene, scene.shape)
+        self.optimizers = optimizers(self.ring, config)
+        self.stages = config.stages()
+        self.autocast = autocast(config.precision)
+        self.iteration, self.seconds, self.stage = 0, 0.0, None
+
+    def deform(self, s):
+        """Surface points and their reflectance at domain points (V, 3)."""
+        with self.autocast():
+            return self.ring.surface(s), *self.ring.brdf_net(s)
+
+    def choose(self):
+        """Indices of the photographs of one iteration, all of one size (width, height)."""
+        first = int(torch.randint(len(self.capture), (), generator=self.random))
+        size = self.capture.sensors[first].size
+        alike = self.capture.sizes()[size]
+        order = torch.randperm(len(alike), generator=self.random)[: self.config.batch]
+        return alike[order.numpy()], size
+
+    def regulariser(self, s):
+        """L_reg at random points of the paths of `s`, random in time."""
+        chosen = torch.randperm(len(s), generator=self.random)[:REGULARISED_POINTS]
+        steps = int(torch.randint(self.ring.shape_net.steps, (), generator=self.random))
+        net = self.ring.shape_net
+        with torch.no_grad(), self.autocast():
+            x = net.flow(s[chosen], steps)
+        return losses.velocity_loss(net.velocity, x, self.config.laplacian_scale)
+
+    def step(self) -> dict[str, float]:
+        """One iteration: sample the domain, deform, render, weigh, step. Returns the unweighted terms of the loss."""
+        config = self.config
+        started = time.perf_counter()
+        self.enter_stage()
+        progress = self.iteration / config.iterations
+        rotation = Rotation.from_quat(torch.randn(4, generator=self.random).numpy()).as_matrix()
+        s, _ = self.ring.domain.sample(self.stage.level, torch.as_tensor(rotation, dtype=torch.float32))
+
+        vertices, diffuse, specular, roughness = self.deform(s)
+
+        index, size = self.choose()
+        scale = max(1, round(size[0] / self.stage.width))
+        observed, clipped, mask = self.capture.observe(index, scale)
+        photographs = self.capture.photographs.select(index, size, scale)
+        predicted, coverage = bridge.render(
+            self.surface, photographs, vertices, diffuse, specular, roughness,
+            spp=config.spp, seed=self.iteration, shadows=self.capture.shadows,
+        )  # fmt: skip
+
+        terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
+        if mask is not None and config.weights.get("mask"):
+            sigma = config.blur * max(0.0, 1 - 1.25 * progress) * size[0] / scale
+            terms["mask"] = losses.mask_loss(coverage, mask, sigma)
+        if config.weights.get("velocity"):
+            terms["velocity"] = self.regulariser(s)
+        loss = sum(config.weights.get(name, 0.0) * term for name, term in terms.items())
+
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.ring.shape_net.parameters(), 1.0, error_if_nonfinite=True)
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * config.decay**progress
+            optimizer.step()
+        self.iteration += 1
+        self.seconds += time.perf_counter() - started
+        return {name: float(term.detach()) for name, term in terms.items()}
+
+    def enter_stage(self):
+        """Take up the stage that the iteration belongs to."""
+        stage = next(s for s in self.stages if self.iteration < s.last)
+        if stage != self.stage:
+            self.stage = stage
+            self.surface.set_faces(self.ring.domain.sample(stage.level)[1])
+
+    def state(self) -> dict:
+        return {
+            "settings": self.config.settings(),
+            "ring": self.ring.state(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "random": self.random.get_state(),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+        }
+
+    def restore(self, path: Path):
+        """Go on from a checkpoint. Raises InputError if there is none or if it was made with other settings."""
+        try:
+            state = torch.load(path, weights_only=True)
+            before = state["settings"]
+        except FileNotFoundError:
+            raise InputError(f"{path}: --resume: no such file; run without --resume to start anew") from None
+        except Exception as error:
+            raise InputError(f"{path}: --resume: not a checkpoint ({str(error).splitlines()[0]})") from error
+        for name, value in self.config.settings().items():
+            if before.get(name) != value:
+                raise InputError(f"{path}: --{name.replace('_', '-')}: was {before.get(name)} before, is {value} now; "
+                                 "give the same settings to resume, or start anew without --resume")  # fmt: skip
+        self.ring.load_state_dict(state["ring"]["networks"])
+        for optimizer, saved in zip(self.optimizers, state["optimizers"]):
+            optimizer.load_state_dict(saved)
+        self.random.set_state(state["random"])
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
+
+
+def optimizers(ring: Ring, config: Config) -> list[torch.optim.Optimizer]:
+    """Muon for the hidden weight matrices and Adam for everything else, or Adam for all."""
+    hidden = [layer.weight for net in (ring.shape_net, ring.brdf_net) for layer in net.hidden]
+    if config.optimizer == "adam":
+        hidden = []
+    rest = [p for p in ring.parameters() if not any(p is h for h in hidden)]
+    result: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=config.learning_rate)]
+    if hidden:
+        result.append(torch.optim.Muon(hidden, lr=config.muon_rate, weight_decay=0.0))
+    for optimizer in result:
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"]
+    return result
+
+
+def autocast(precision: str):
+    """A context in which the networks' matrix products have this precision."""
+    fast = torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+    if precision == "bfloat16" or (precision == "auto" and fast):
+        return lambda: torch.autocast("cpu", torch.bfloat16)
+    return contextlib.nullcontext
+
+
+def set_threads(config: Config) -> None:
+    """Parallel sums depend on the order in which threads finish: one thread is what determinism costs."""
+    threads = 1 if config.deterministic else config.threads or len(os.sched_getaffinity(0))
+    torch.set_num_threads(threads)
+    dr.set_thread_count(threads)
+
+
+@contextlib.contextmanager
+def interruptible():
+    """Yields a function that tells whether Ctrl-C was pressed. A second Ctrl-C ends the program at once."""
+    pressed = []
+
+    def press(number, frame):
+        pressed.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def train(fit: Fit, folder: Path, interrupted) -> None:
+    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints in `folder`."""
+    vertices = {stage.level: len(fit.ring.domain.sample(stage.level)[0]) for stage in fit.stages}
+    work = [vertices[stage.level] for stage in fit.stages for _ in range(stage.first, stage.last)]
+    saved = time.monotonic()
+    bar = tqdm(
+        total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,
+        bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
+    )  # fmt: skip
+    with bar, results.open_log(folder, fit.iteration) as log:
+        while fit.iteration < fit.config.iterations and not interrupted():
+            terms = fit.step()
+            stage = fit.stages.index(fit.stage) + 1
+            loss = sum(fit.config.weights.get(name, 0.0) * value for name, value in terms.items())
+            where = f"stage {stage}/{len(fit.stages)}, iteration {fit.iteration}/{fit.config.iterations}"
+            bar.set_description_str(where, refresh=False)
+            bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
+            bar.update(work[fit.iteration - 1])
+            if fit.iteration % LOG_EVERY == 0 or fit.iteration == fit.config.iterations:
+                entry = {"iteration": fit.iteration, "seconds": round(fit.seconds, 3), "loss": loss, **terms,
+                         "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": stage,
+                         "vertices": vertices[fit.stage.level]}  # fmt: skip
+                log.write(json.dumps(entry) + "\n")
+                log.flush()
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                results.save(fit.state(), folder / "checkpoint.pt")
+                saved = time.monotonic()
+    results.save(fit.state(), folder / "checkpoint.pt")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command. Returns its exit status: 0, or 130 if it was interrupted."""
+    config = parse(arguments)
+    set_threads(config)
+    scene = capture.load(config.scene)
+    fit = Fit(scene, config)
+    folder = config.folder
+    if config.resume:
+        fit.restore(folder / "checkpoint.pt")
+    results.prepare(folder, config)
+    with interruptible() as interrupted:
+        print(f"{len(scene)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
+        if not config.resume:
+            results.write_inputs(folder / "inputs.png", fit)
+        train(fit, folder, interrupted)
+        results.write(folder, fit)
+        if interrupted():
+            print(f"Stopped at iteration {fit.iteration} of {config.iterations}; go on with --resume")
+            return 130
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> Config:
+    """The configuration: the preset's settings under those given on the command line."""
+    early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
+    early.add_argument("--preset", default="default")
+    preset = early.parse_known_args([a for a in arguments if a != "--help"])[0].preset
+    return command.parse(Config, arguments, "mi_ring.fit", PRESETS.get(preset, {}))
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.fit", main)

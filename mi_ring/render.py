@@ -1,0 +1,72 @@
+"""Photographs of a fitted object: `python -m mi_ring.render RUN SCENE.xml OUT/`."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional
+
+from mi_ring import bridge, capture, command
+from mi_ring.capture import linear_to_srgb
+from mi_ring.errors import InputError
+from mi_ring.results import load_ring
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """Render every photograph of a scene with the object of a finished fit, under the same file names."""
+
+    run: Positional[Path]
+    """Results folder of a fit, or its ring.pt."""
+    scene: Positional[Path]
+    """Mitsuba XML file with the photographs to take; their image files need not exist."""
+    out: Positional[Path]
+    """Folder for the pictures: 8-bit sRGB PNG, or linear EXR where the scene names an EXR file."""
+    subdivisions: int = 6
+    """Level of the mesh: 10 · 4^level + 2 vertices."""
+    spp: int = 64
+    """Samples per pixel."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    config = command.parse(RenderConfig, arguments, "mi_ring.render")
+    if not 0 <= config.subdivisions <= 8:
+        raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
+    if config.spp < 1:
+        raise InputError(f"--spp: is {config.spp}, must be at least 1")
+    ring = load_ring(config.run)
+    scene = capture.load(config.scene, images=False)
+    doubles = {name for name in scene.names if scene.names.count(name) > 1}
+    if doubles:
+        raise InputError(f"{config.scene}: filename: {min(doubles)} occurs twice; pictures would overwrite each other")
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{config.out}: cannot be written ({error.strerror}); choose another folder") from error
+    surface = bridge.Surface(scene.scene, scene.shape)
+    surface.show(ring, *ring.domain.sample(config.subdivisions))
+    for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
+        photograph = scene.photographs.select([k], sensor.size)
+        rgb, _ = bridge.draw(surface, photograph, spp=config.spp, seed=k, shadows=scene.shadows)
+        write_picture(rgb[0].numpy(), config.out / sensor.filename.name)
+    print(f"{len(scene.sensors)} photographs in {config.out}/")
+
+
+def write_picture(linear: np.ndarray, path: Path) -> None:
+    """Write (H, W, 3) linear radiance: EXR as it is, anything else 8-bit sRGB."""
+    if path.suffix.lower() == ".exr":
+        bitmap = mi.Bitmap(linear.astype(np.float32))
+    else:
+        bitmap = mi.Bitmap((linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8))
+    partial = path.with_name(f".partial.{path.name}")
+    bitmap.write(str(partial))
+    os.replace(partial, path)
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.render", main)

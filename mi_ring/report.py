@@ -1,0 +1,113 @@
+"""report.html: one self-contained page that shows whether to trust a fit."""
+
+import base64
+import io
+from dataclasses import dataclass
+from importlib import resources
+
+import jinja2
+import matplotlib
+import numpy as np
+from PIL import Image
+
+from mi_ring import bridge
+from mi_ring.capture import linear_to_srgb
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+THUMBNAIL = 192  # width and height of the pictures, at most [px]
+
+
+@dataclass
+class Row:
+    """One photograph of the page: its numbers and pictures as data URIs."""
+
+    name: str
+    psnr: float
+    iou: float | None
+    pictures: dict[str, str]
+
+
+def html(fit, log: list[dict]) -> str:
+    """The page for a `Fit` whose surface is shown at its final resolution."""
+    capture, ring = fit.capture, fit.ring
+    rows, errors = [], []
+    for k, name in enumerate(capture.names):
+        row, error = compare(fit, k, name)
+        rows.append(row)
+        errors.append(error)
+    masked = [row.iou for row in rows if row.iou is not None]
+    s, faces = ring.domain.sample(fit.config.subdivisions)
+    numbers = {
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels)",
+        "Silhouettes": f"{np.mean(masked):.4f} intersection over union with the masks" if masked else "no masks given",
+        "Iterations": f"{fit.iteration} of {fit.config.iterations}",
+        "Fit time": f"{fit.seconds:.0f} s",
+        "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
+        "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
+    }
+    template = resources.files("mi_ring").joinpath("report.html.jinja").read_text()
+    environment = jinja2.Environment(autoescape=True)
+    return environment.from_string(template).render(
+        name=capture.path.stem, rows=rows, numbers=numbers, curve=loss_curve(log), settings=fit.config.settings()
+    )
+
+
+def compare(fit, k: int, name: str) -> tuple[Row, float]:
+    """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
+    capture = fit.capture
+    size = capture.sensors[k].size
+    photograph = capture.photographs.select([k], size)
+    observed, _, mask = capture.observe([k])
+    predicted, coverage = bridge.draw(fit.surface, photograph, spp=4, seed=k, shadows=capture.shadows)
+    photo, guess = linear_to_srgb(observed[0].numpy()), linear_to_srgb(predicted[0].numpy())
+    small = capture.photographs.select([k], size, max(1, max(size) // THUMBNAIL))
+    maps = {key: m[0] for key, m in bridge.maps(fit.surface, small).items()}
+    normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
+    scale = 2.5 * float(fit.ring.brdf_net.scale)
+    pictures = {
+        "photograph": photo,
+        "prediction": guess,
+        "4 × difference": 4 * np.abs(photo - guess),
+        "normals": normal,
+        "diffuse": linear_to_srgb(maps["diffuse"] / scale),
+        "specular": linear_to_srgb(maps["specular"] / scale),
+        "roughness": maps["roughness"],
+    }
+    iou = None
+    if mask is not None:
+        inside, found = mask[0].numpy() > 0.5, coverage[0].numpy() > 0.5
+        iou = float((inside & found).sum() / max(1, (inside | found).sum()))
+    error = float(np.mean((photo - guess) ** 2))
+    pictures = {title: data_uri(picture) for title, picture in pictures.items()}
+    return Row(name, -10 * np.log10(max(error, 1e-10)), iou, pictures), error
+
+
+def data_uri(picture: np.ndarray) -> str:
+    """An (H, W) or (H, W, 3) picture in [0, 1] as a JPEG thumbnail."""
+    image = Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    image.thumbnail((THUMBNAIL, THUMBNAIL))
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=88)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def loss_curve(log: list[dict]) -> str:
+    """The terms of the loss over the iterations as an SVG data URI."""
+    figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
+    for term in ("loss", "rgb", "mask", "velocity"):
+        points = [(entry["iteration"], entry[term]) for entry in log if entry.get(term, 0) > 0]
+        if points:
+            axes.semilogy(*zip(*points), label=term, linewidth=2 if term == "loss" else 1)
+    for before, after in zip(log, log[1:]):
+        if before["stage"] != after["stage"]:
+            axes.axvline(before["iteration"], color="0.7", linewidth=1, linestyle=":")
+    axes.set_xlabel("iteration (dotted: next stage)")
+    axes.grid(alpha=0.3)
+    if log:
+        axes.legend()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg")
+    plt.close(figure)
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()

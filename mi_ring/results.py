@@ -1,0 +1,139 @@
+"""The results of a fit: everything that is written into its folder."""
+
+import io
+import json
+import os
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from mi_ring import bridge, report
+from mi_ring.capture import Capture, linear_to_srgb
+from mi_ring.config import Config
+from mi_ring.errors import InputError
+from mi_ring.ring import Ring
+
+
+def replace(path: Path, content: bytes | str) -> None:
+    """Write a file so that it is there whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    os.replace(partial, path)
+
+
+def save(state: dict, path: Path) -> None:
+    """`torch.save`, whole or not at all."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    replace(path, buffer.getvalue())
+
+
+def prepare(folder: Path, config: Config) -> None:
+    """Make the folder and write config.json. A folder that holds another result is moved aside, not overwritten.
+
+    Raises InputError if the folder cannot be written.
+    """
+    try:
+        if not config.resume and any((folder / name).exists() for name in ("ring.pt", "checkpoint.pt")):
+            aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
+            folder.rename(aside)
+            print(f"The results that were in {folder}/ are now in {aside}/")
+        folder.mkdir(parents=True, exist_ok=True)
+        replace(folder / "config.json", config.to_json())
+    except OSError as error:
+        raise InputError(f"{folder}: --out: cannot be written ({error.strerror}); choose another folder") from error
+
+
+def open_log(folder: Path, iteration: int):
+    """log.jsonl, open for more lines, without those after `iteration`: they will be written again."""
+    path = folder / "log.jsonl"
+    lines = path.read_text().splitlines(keepends=True) if iteration and path.exists() else []
+    replace(path, "".join(line for line in lines if json.loads(line)["iteration"] <= iteration))
+    return path.open("a")
+
+
+def read_log(folder: Path) -> list[dict]:
+    """The entries of log.jsonl."""
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def predict(surface: bridge.Surface, capture: Capture, k: int, spp: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Photograph `k` as the surface predicts it: ((H, W, 3) linear radiance, (H, W) coverage)."""
+    photograph = capture.photographs.select([k], capture.sensors[k].size)
+    with torch.no_grad():
+        rgb, coverage = bridge.draw(surface, photograph, spp=spp, seed=k, shadows=capture.shadows)
+    return rgb[0].numpy(), coverage[0].numpy()
+
+
+def write_inputs(path: Path, fit) -> None:
+    """inputs.png: the start surface drawn over each photograph, in green, where mask or pose errors show at once."""
+    s, faces = fit.ring.domain.sample(4)
+    fit.surface.show(fit.ring, s, faces)
+    fit.stage = None  # the mesh is no longer that of the stage
+    columns = min(10, len(fit.capture))
+    cell = 160
+    sheet = Image.new("RGB", (columns * cell, -(-len(fit.capture) // columns) * cell))
+    for k, name in enumerate(fit.capture.names):
+        width, height = fit.capture.sensors[k].size
+        scale = max(1, max(width, height) // cell)
+        observed, _, _ = fit.capture.observe([k], scale)
+        small = fit.capture.photographs.select([k], (width, height), scale)
+        _, coverage = bridge.draw(fit.surface, small, spp=4, seed=0, shadows=False)
+        tint = 0.35 * coverage[0, ..., None].numpy() * np.array([0.1, 1.0, 0.2])
+        picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
+        picture.thumbnail((cell, cell))
+        ImageDraw.Draw(picture).text((3, 2), name, fill=(255, 255, 255))
+        sheet.paste(picture, (k % columns * cell, k // columns * cell))
+    buffer = io.BytesIO()
+    sheet.save(buffer, "PNG")
+    replace(path, buffer.getvalue())
+
+
+def to_bytes(encoded: np.ndarray) -> np.ndarray:
+    """[0, 1] to uint8."""
+    return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def write(folder: Path, fit) -> None:
+    """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
+    save(fit.ring.state(fit.config.settings()), folder / "ring.pt")
+    write_mesh(folder / "ring.pt", fit.config.subdivisions, folder / "mesh.ply")
+    replace(folder / "scene.xml", scene_xml(fit.config.scene, folder, fit.config.subdivisions))
+    s, faces = fit.ring.domain.sample(fit.config.subdivisions)
+    fit.surface.show(fit.ring, s, faces)
+    replace(folder / "report.html", report.html(fit, read_log(folder)))
+    print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
+
+
+def write_mesh(weights: Path, subdivisions: int, path: Path) -> None:
+    """The surface as PLY in scene units, with vertex_diffuse, vertex_specular and vertex_roughness."""
+    mesh = mi.load_dict({"type": "shapenet", "weights": str(weights.resolve()), "subdivisions": subdivisions})
+    partial = path.with_name(f".{path.name}.partial.ply")
+    mesh.write_ply(str(partial))
+    os.replace(partial, path)
+
+
+def scene_xml(source: Path, folder: Path, subdivisions: int) -> bytes:
+    """The scene file `source` with the fitted object, its references rewritten to be relative to `folder`."""
+    tree = ElementTree.parse(source)
+    for element in tree.iter("string"):
+        file = source.parent / element.get("value", "")
+        if element.get("value") and file.is_file():
+            element.set("value", Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
+    shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
+    for element in list(shape):
+        if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
+            shape.remove(element)
+    ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
+    ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")
+    ElementTree.indent(tree)
+    return ElementTree.tostring(tree.getroot(), "utf-8")
+
+
+def load_ring(run: Path) -> Ring:
+    """The ring of a results folder, or of a ring.pt itself."""
+    return Ring.load(run / "ring.pt" if run.is_dir() else run)

@@ -1,0 +1,111 @@
+"""Shape-Net and BRDF-Net: the paper's sizes, its encoding, and the flow as an integrator."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import expm
+
+from mi_ring.brdfnet import BRDFNet
+from mi_ring.domain import Sphere
+from mi_ring.encoding import PosEnc
+from mi_ring.ring import Ring
+from mi_ring.shapenet import ShapeNet, euler
+
+
+def neurons(net):
+    """Outputs of all linear layers: the paper counts the neurons of hidden and output layers."""
+    return sum(layer.out_features for layer in net.modules() if isinstance(layer, torch.nn.Linear))
+
+
+def test_neuron_counts_are_the_papers():
+    assert neurons(ShapeNet()) == 771
+    assert neurons(BRDFNet()) == 1285
+    assert ShapeNet().steps == 20
+
+
+def test_layer_sizes_are_the_papers():
+    sizes = [tuple(p.shape) for name, p in ShapeNet().named_parameters() if name.endswith("weight")]
+    assert sizes == [(256, 96), (256, 256), (256, 256), (3, 256)]
+    sizes = [tuple(p.shape) for name, p in BRDFNet().named_parameters() if name.endswith("weight")]
+    assert sizes == [(256, 96)] + [(256, 256)] * 4 + [(5, 256)]
+
+
+def test_encoding_is_its_formula():
+    x = np.array([[0.3, -1.2, 0.7], [2.0, 0.0, -0.1]])
+    expected = [
+        [f(omega * value) for f in (np.cos, np.sin) for omega in range(1, 17) for value in point] for point in x
+    ]
+    found = PosEnc(16)(torch.tensor(x))
+    assert found.shape == (2, 96)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+
+
+def test_flow_of_a_linear_field_converges_to_the_matrix_exponential_at_eulers_rate():
+    a = torch.tensor([[0.2, -0.9, 0.1], [0.8, -0.3, 0.4], [0.0, 0.5, 0.6]], dtype=torch.float64)
+    x = torch.tensor([[1.0, 0.2, -0.5], [-0.3, 0.8, 0.9]], dtype=torch.float64)
+    exact = x @ torch.from_numpy(expm(a.numpy())).T
+    errors = [(euler(lambda p: p @ a.T, x, 1 / steps, steps) - exact).norm() for steps in (20, 40, 80, 160)]
+    ratios = [float(before / after) for before, after in zip(errors, errors[1:])]
+    # First order: half the step, half the error; the deviation from 2 is itself of first order in the step.
+    assert ratios == pytest.approx([2, 2, 2], abs=0.12)
+    assert abs(ratios[2] - 2) < abs(ratios[0] - 2)
+
+
+def test_shape_net_takes_its_euler_steps_through_its_velocity():
+    net = ShapeNet(steps=3)
+    net.output.weight.data.mul_(300)
+    x = torch.randn(5, 3)
+    expected = x
+    for _ in range(3):
+        expected = expected + net.velocity(expected) / 3
+    torch.testing.assert_close(net(x), expected)
+    torch.testing.assert_close(net.flow(x, 1), x + net.velocity(x) / 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_start_surface_is_the_domain(seed):
+    torch.manual_seed(seed)
+    ring = Ring(center=[10.0, -4.0, 7.0], radius=50.0)
+    s, _ = Sphere().sample(3)
+    with torch.no_grad():
+        moved = (ring.surface(s) - (torch.tensor([10.0, -4.0, 7.0]) + 50.0 * s)).norm(dim=1)
+    assert moved.max() < 0.02 * 50  # 2 % of the radius
+
+
+def test_brdf_net_predicts_positive_reflectance_and_roughness_below_one():
+    net = BRDFNet(scale=7.0)
+    net.output.weight.data.mul_(500)
+    diffuse, specular, roughness = net(torch.randn(100, 3))
+    assert diffuse.shape == (100, 3) and specular.shape == (100,) and roughness.shape == (100,)
+    assert (diffuse >= 0).all() and (specular >= 0).all()
+    assert ((roughness >= 0) & (roughness <= 1)).all() and roughness.std() > 0.1
+
+
+def test_brdf_scale_only_scales():
+    torch.manual_seed(0)
+    one, many = BRDFNet(1.0), BRDFNet(250.0)
+    many.load_state_dict({**one.state_dict(), "scale": torch.tensor(250.0)})
+    s = torch.randn(7, 3)
+    torch.testing.assert_close(250 * one(s)[0], many(s)[0])
+    torch.testing.assert_close(250 * one(s)[1], many(s)[1])
+    torch.testing.assert_close(one(s)[2], many(s)[2])
+
+
+@pytest.mark.parametrize("level", [0, 3])
+def test_icosphere_has_the_documented_size_and_rotates(level):
+    rotation = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    plain, faces = Sphere().sample(level)
+    turned, same = Sphere().sample(level, rotation)
+    assert plain.shape == (10 * 4**level + 2, 3) and faces.shape == (20 * 4**level, 3)
+    torch.testing.assert_close(plain.norm(dim=1), torch.ones(len(plain)))
+    torch.testing.assert_close(turned[4], rotation @ plain[4])
+    assert (faces == same).all()
+
+
+def test_state_survives_the_file(tmp_path):
+    ring = Ring(center=[1.0, 2.0, 3.0], radius=4.0, scale=5.0)
+    torch.save(ring.state({"seed": 3}), tmp_path / "ring.pt")
+    again = Ring.load(tmp_path / "ring.pt")
+    s = torch.randn(6, 3)
+    assert torch.equal(again.surface(s), ring.surface(s))
+    assert all(torch.equal(a, b) for a, b in zip(again.brdf_net(s), ring.brdf_net(s)))
