@@ -22,7 +22,7 @@ class Surface:
         self.scene = scene
         self.params = mi.traverse(scene)
         self.prefix = next(
-            key.removesuffix(POSITIONS) for key in self.params.keys() if key == f"{shape.id()}.{POSITIONS}"
+            name.removesuffix(POSITIONS) for name, _ in self.params if name == f"{shape.id()}.{POSITIONS}"
         )
         self.topologies: dict[int, tuple] = {}
         self.faces = None
@@ -33,7 +33,7 @@ class Surface:
         self.edges = edges_of(self.faces)
 
     def write(self, vertices: Tensor, diffuse: Tensor, specular: Tensor, roughness: Tensor, gradients: bool = False):
-        """Write (V, 3) vertices [scene units], (V, 3), (V,), (V,) attributes into the mesh. Returns the Dr.Jit arrays."""
+        """Write (V, 3) vertices [scene units], (V, 3), (V,), (V,) attributes. Returns the Dr.Jit arrays."""
         arrays = [mi.Float(t.detach().contiguous().numpy().ravel()) for t in (vertices, diffuse, specular, roughness)]
         if gradients:
             dr.enable_grad(arrays)
@@ -44,7 +44,6 @@ class Surface:
             self.params[self.prefix + name] = array
         self.params.update()
         return arrays
-
 
     def show(self, ring, s: Tensor, faces: np.ndarray) -> None:
         """Write a `Ring` at domain points (V, 3) with these triangles."""
@@ -94,8 +93,8 @@ def render(surface, photographs, vertices, diffuse, specular, roughness, spp=4, 
     """Predicted photographs of the surface, each under its own light, differentiable.
 
     `vertices` (V, 3) [scene units], `diffuse` (V, 3), `specular` (V,), `roughness` (V,): attributes as `cooktorrance`
-    defines them. `photographs`: `integrator.Photographs`, which to render and at what size; `spp` stratified samples per
-    pixel; the same `seed` gives the same samples.
+    defines them. `photographs`: `integrator.Photographs`, which to render and at what size; `spp` stratified samples
+    per pixel; the same `seed` gives the same samples.
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all four tensors are
     those of shading and of the outline, for radiance and for coverage; where a cast shadow ends they are not complete.

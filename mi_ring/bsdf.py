@@ -42,9 +42,9 @@ class CookTorrance(mi.BSDF):
     D is GGX without its 1/π and G is Smith's, so that the specular part is 4 ρᵞ times ``roughconductor`` with F = 1.
     Nothing keeps ρᵈ and ρᵞ below the conservation of energy: they also hold the scale of lamp and camera.
 
-    With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer. Black
-    there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o clamped.
-    What it does not do: transmission, two-sided surfaces, anisotropy.
+    With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer.
+    Black there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o
+    clamped. What it does not do: transmission, two-sided surfaces, anisotropy.
 
     .. code-block:: xml
 
@@ -123,9 +123,9 @@ class CookTorrance(mi.BSDF):
             chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
         )
         active &= (si.wi.z > 0) & (bs.wo.z > 0) & (bs.pdf > 0)
-        value = self.eval(ctx, si, bs.wo, active)
+        weight = self.eval(ctx, si, bs.wo, active) / dr.select(active, bs.pdf, 1)
         bs.pdf = dr.select(active, bs.pdf, 0)
-        return bs, dr.select(active, value / bs.pdf, 0)
+        return bs, weight
 
     def traverse(self, callback):
         for name, texture in self.textures.items():

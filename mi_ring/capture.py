@@ -215,10 +215,10 @@ def load(path: str | Path, images: bool = True) -> Capture:
 
 def reason(error: RuntimeError) -> str:
     """What Mitsuba's parser has to say, in one line."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    last = lines[-1].removeprefix("ValueError: ").removeprefix("mi_ring.errors.InputError: ")
-    place = lines[0].split("] ", 1)[-1].rstrip(": ")
-    return last if len(lines) > 1 else place
+    text = str(error).split("] ", 1)[-1]
+    if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
+        text = text.split("Error: ", 1)[-1]
+    return " ".join(text.split())
 
 
 def read_bitmap(path: Path, field: str, scene: Path) -> mi.Bitmap:

@@ -13,18 +13,23 @@ from mi_ring.errors import InputError
 COMMANDS = ("fit", "render")
 
 
-def parse(config_type: type, arguments: Sequence[str], program: str, default=None):
+def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING):
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood."""
-    complaint = io.StringIO()
+    box = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint):
-            return tyro.cli(config_type, args=list(arguments), prog=program, default=default or tyro.MISSING_NONPROP)
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(config_type, args=list(arguments), prog=program, default=default)
     except SystemExit as stop:
         if not stop.code:
             raise
-        # tyro draws a box: a title, the complaint, a rule, advice.
-        lines = [line.strip("│╭╮╰╯ ") for line in complaint.getvalue().split("────")[0:]]
-        raise InputError(" ".join(lines)) from None
+        raise InputError(complaint_in(box.getvalue())) from None
+
+
+def complaint_in(box: str) -> str:
+    """The complaint, in one line, of the box that tyro draws: a title, the complaint, a rule, advice."""
+    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
+    rules = [number for number, line in enumerate(lines) if set(line) == {"─"}]
+    return " ".join(lines[: rules[0]] if rules else lines)
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import drjit as dr
 import torch
+import tyro
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -243,7 +244,7 @@ def parse(arguments: Sequence[str]) -> Config:
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     early.add_argument("--preset", default="default")
     preset = early.parse_known_args([a for a in arguments if a != "--help"])[0].preset
-    return command.parse(Config, arguments, "mi_ring.fit", PRESETS.get(preset, {}))
+    return command.parse(Config, arguments, "mi_ring.fit", Config(tyro.MISSING, **PRESETS.get(preset, {})))
 
 
 if __name__ == "__main__":

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from mitsuba.ad.integrators.common import ADIntegrator
+from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` keeps the classes of an older variant
 
 from mi_ring import photograph
 from mi_ring.bsdf import CookTorrance, check_attributes
 from mi_ring.photograph import camera_ray, project
 
-#: Offset to either side of a silhouette edge [px]. Radiance grows like the square root of the distance to the outline, so
-#: that it must be small; float32 pixel coordinates of a 4096 px image still resolve it.
+#: Offset to either side of a silhouette edge [px]. Radiance grows like the square root of the distance to the outline,
+#: so that it must be small; float32 pixel coordinates of a 4096 px image still resolve it.
 EDGE_OFFSET = 1e-3
 
 
@@ -31,8 +31,8 @@ class Photometric(ADIntegrator):
 
     Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
 
-    What it does not do: interreflection. Gradients through plain ``mi.render`` are those of shading inside the outline; the
-    fit renders many photographs per launch with `render_photographs` and `backward_edges`, which add the outline.
+    What it does not do: interreflection. Gradients through plain ``mi.render`` are those of shading inside the outline;
+    the fit renders many photographs per launch with `render_photographs` and `backward_edges`, which add the outline.
 
     .. code-block:: xml
 
@@ -47,15 +47,8 @@ class Photometric(ADIntegrator):
 
     def sample(self, mode, scene, sampler, ray, depth=None, δL=None, state_in=None, active=True, **kwargs):
         self.check(scene)
-        sensor = photograph.Photograph.current
-
-        def light(si):
-            if sensor is None:
-                return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
-            return sensor.light.sample_direction(si, mi.Point2f(0), True)
-
         si = scene.ray_intersect(mi.Ray3f(ray), active)
-        radiance = self.shade(scene, si, light, sampler.next_2d, self.shadows)
+        radiance = self.shade(scene, si, photograph.flash, sampler.next_2d, self.shadows)
         return radiance, si.is_valid(), [], None
 
     def check(self, scene):
@@ -147,7 +140,7 @@ class Photographs:
         to_light = dr.select(distant, -where, where - si.p)
         distance2 = dr.squared_norm(to_light)
         ds.d = to_light * dr.rsqrt(distance2)
-        ds.dist = dr.select(distant, 1e4, dr.sqrt(distance2))
+        ds.dist = dr.select(distant, photograph.FAR, dr.sqrt(distance2))
         ds.p = dr.select(distant, si.p - where * ds.dist, where)
         intensity = mi.Color3f(b.x, b.y, b.z)
         return ds, intensity * dr.select(distant, 1, dr.rcp(distance2))
@@ -168,7 +161,7 @@ def light_row(sensor):
 
 
 def pixel_rays(photographs, spp, seed):
-    """`spp` stratified primary rays per pixel: (rays, photograph per lane). Samples of a pixel are consecutive lanes."""
+    """`spp` stratified primary rays per pixel: (rays, photograph per lane). A pixel's samples are consecutive lanes."""
     width, height = photographs.size
     lane = dr.arange(mi.UInt32, len(photographs) * width * height * spp)
     pixel = lane // spp
@@ -204,7 +197,7 @@ def trace(scene, ray, view, photographs, shadows, seed):
 def render_photographs(scene, photographs, spp, seed, shadows=True):
     """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, differentiable inside.
 
-    Box-filtered linear radiance. The gradient is that of shading inside the outline; `backward_edges` adds the outline's.
+    Box-filtered linear radiance. The gradient is that of shading inside the outline; `backward_edges` adds the rest.
     """
     ray, view = pixel_rays(photographs, spp, seed)
     shadows = shadows and not photographs.colocated
@@ -236,13 +229,13 @@ def render_maps(scene, photographs):
 def backward_edges(scene, photographs, positions, edges, channels_grad, seed, shadows=True, samples=4):
     """Accumulate into `positions` the gradient that is due to the object's outline moving across pixels.
 
-    Moving a silhouette edge by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square pixels,
-    so dI = (L_inside − L_outside) · n·dq · length. Rays 1/1000 px to either side of the edge see occlusion, background and
-    coverage as the camera does.
+    Moving a silhouette edge by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square
+    pixels, so dI = (L_inside − L_outside) · n·dq · length. Rays 1/1000 px to either side of the edge see occlusion,
+    background and coverage as the camera does.
 
-    `positions`: attached Float (3 V) of the mesh; `edges`: (vertices (UInt32 × 2), opposite vertices (UInt32 × 2)), each of
-    width E, the two triangles at an edge being (v0, v1, opposite0) and (v1, v0, opposite1); `channels_grad`: the loss's
-    gradient as four Floats like the output of `render_photographs`; `samples` points per edge.
+    `positions`: attached Float (3 V) of the mesh; `edges`: (vertices (UInt32 × 2), opposite vertices (UInt32 × 2)),
+    each of width E, the two triangles at an edge being (v0, v1, opposite0) and (v1, v0, opposite1); `channels_grad`:
+    the loss's gradient as four Floats like the output of `render_photographs`; `samples` points per edge.
     """
     (v0, v1), (w0, w1) = edges
     count = dr.width(v0)
@@ -280,10 +273,10 @@ def backward_edges(scene, photographs, positions, edges, channels_grad, seed, sh
         # An edge seen from a slant is foreshortened: uniform steps along it are not uniform in the picture.
         length *= z0 * z1 / dr.square(dr.lerp(z0, z1, t))
 
-        side = mi.UInt32(dr.tile(dr.arange(mi.UInt32, 2), n * samples))
-        lane2 = dr.arange(mi.UInt32, 2 * n * samples) // 2
-        sign = mi.Float(side) * 2 - 1
-        q2 = dr.gather(mi.Point2f, dr.ravel(q), lane2) + sign * EDGE_OFFSET * dr.gather(mi.Vector2f, dr.ravel(normal), lane2)
+        lane2 = dr.arange(mi.UInt32, 2 * n * samples)
+        sign, lane2 = mi.Float(lane2 % 2) * 2 - 1, lane2 // 2
+        q2 = dr.gather(mi.Point2f, dr.ravel(q), lane2)
+        q2 += sign * EDGE_OFFSET * dr.gather(mi.Vector2f, dr.ravel(normal), lane2)
         view2 = dr.gather(mi.UInt32, view, lane2)
         ray = mi.Ray3f(*camera_ray(*photographs.camera(view2), q2))
         shadows = shadows and not photographs.colocated

@@ -33,8 +33,9 @@ class ShapeNetMesh(mi.Mesh):
     ================ ========= ===============================================================================
 
     The mesh carries smooth normals and the attributes ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
-    ``vertex_roughness`` (1); without ``weights`` they are 0.5, 0 and 0.5. A nested BSDF that asks for another attribute, or
-    for one with another number of channels, is an error. What it does not do: texture coordinates.
+    ``vertex_roughness`` (1); without ``weights`` they are 0.5, 0 and 0.5. A nested BSDF that asks for another
+    attribute, or for one with another number of channels, is an error. What it does not do: texture coordinates;
+    colours in spectral variants, where Mitsuba takes three-channel attributes for the coefficients of a spectrum.
 
     .. code-block:: xml
 
@@ -84,8 +85,9 @@ class ShapeNetMesh(mi.Mesh):
 
         super().__init__(props.id(), len(vertices), len(faces), props, True, False)
         params = mi.traverse(self)
-        params[POSITIONS] = mi.Float(vertices.numpy().ravel())
-        params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+        # Scalar variants have array types of their own.
+        params[POSITIONS] = type(params[POSITIONS])(vertices.numpy().ravel())
+        params[FACES] = type(params[FACES])(np.asarray(faces, np.uint32).ravel())
         params.update()
         for (name, channels), value in zip(ATTRIBUTES.items(), material):
             self.add_attribute(name, channels, value.contiguous().numpy().ravel())

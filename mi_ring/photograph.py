@@ -6,6 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+SHUTTER = -1.0  #: time of a photograph's rays, by which the flash knows them from those of other sensors (0 and later)
+FAR = 1e9  #: distance of a directional light [scene units]
+
 
 def camera_ray(to_world, focal, centre, pixel):
     """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
@@ -87,13 +90,16 @@ class Photograph(mi.Sensor):
         self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
         rotation = matrix[:3, :3]
-        if not np.isfinite(matrix).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-            raise ValueError(f'photograph "{props.id()}": to_world must be a rotation and a translation, without scale')
+        rigid = np.isfinite(matrix).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+        if not rigid or np.linalg.det(rotation) < 0:
+            raise ValueError(
+                f'photograph "{props.id()}": to_world must be a rotation and a translation, without scale or mirror'
+            )
         self.matrix = mi.Matrix4f(matrix)
 
         lights = [value for _, value in props.objects() if isinstance(value, mi.Emitter)]
         if len(lights) > 1:
-            raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, at most one light per photograph')
+            raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, must be at most one')
         position = [float(v) for v in matrix[:3, 3]]
         self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
         dr.make_opaque(self.focal, self.centre, self.matrix)
@@ -106,10 +112,11 @@ class Photograph(mi.Sensor):
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         Photograph.current = self
-        size = mi.ScalarVector2f(self.film().size())
-        origin, direction = camera_ray(self.matrix, self.focal, self.centre, sample2 * size)
+        film = self.film()
+        pixel = sample2 * mi.ScalarVector2f(film.crop_size()) + mi.ScalarVector2f(film.crop_offset())
+        origin, direction = camera_ray(self.matrix, self.focal, self.centre, pixel)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
-        return mi.Ray3f(origin, direction, time, wavelengths), weight
+        return mi.Ray3f(origin, direction, SHUTTER, wavelengths), weight
 
     def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
@@ -126,11 +133,27 @@ class Photograph(mi.Sensor):
         return f"Photograph[filename={self.filename}, size={self.size}]"
 
 
+def flash(it, sample=(0, 0), active=True):
+    """The light at `it` of the photograph whose rays arrive there: (DirectionSample3f, radiance · d⁻²).
+
+    Black where the rays of another kind of sensor arrive.
+    """
+    if Photograph.current is None:
+        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+    light = Photograph.current.light
+    ds, weight = light.sample_direction(it, mi.Point2f(sample), active)
+    if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite):  # being nested, it was never told how large the scene is
+        ds.dist = mi.Float(FAR)
+        ds.p = it.p + FAR * ds.d
+    return ds, dr.select(it.time == SHUTTER, weight, 0)
+
+
 class Flash(mi.Emitter):
     """The light of whichever `photograph` is being rendered; black while another kind of sensor is.
 
-    Nested emitters light only their own photograph, so they are no emitters of the scene and stock integrators would see
-    none. `shapenet` therefore carries this one, which hands every question on to the light of the current photograph.
+    Nested emitters light only their own photograph, so they are no emitters of the scene and stock integrators would
+    see none. `shapenet` therefore carries this one, which hands every question on to the light of the current
+    photograph.
     """
 
     def __init__(self, props):
@@ -138,9 +161,7 @@ class Flash(mi.Emitter):
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
     def sample_direction(self, it, sample, active=True):
-        if Photograph.current is None:
-            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
-        return Photograph.current.light.sample_direction(it, sample, active)
+        return flash(it, sample, active)
 
     def eval(self, si, active=True):
         return mi.Spectrum(0)

@@ -1,0 +1,114 @@
+"""Small captures that the tests make themselves, and where the shared data is, if it is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
+
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture
+def shared():
+    """The folder of captures with known truth, which is not part of the repository."""
+    if not (SHARED / "data" / "captures").is_dir():
+        pytest.skip("needs the captures beside the repository (../shared/data/captures)")
+    return SHARED
+
+
+SENSOR = """
+  <sensor type="photograph" id="{id}">
+    <string name="filename" value="images/{id}.png"/>{mask}
+    <float name="fx" value="{fx}"/> <float name="fy" value="{fy}"/> <float name="cx" value="{cx}"/> <float name="cy" value="{cy}"/>
+    <transform name="to_world"><matrix value="{matrix}"/></transform>
+    <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/></film>
+    <emitter type="point"><point name="position" x="{x}" y="{y}" z="{z}"/><rgb name="intensity" value="{intensity}"/></emitter>
+  </sensor>"""  # noqa: E501
+
+SCENE = """<scene version="3.0.0">
+  <integrator type="photometric"/>
+  <shape type="shapenet" id="object"><bsdf type="cooktorrance"/></shape>{sensors}
+</scene>
+"""
+
+#: The object of `small_capture`: an ellipsoid, its axes not those of the world, far from the origin [scene units].
+CENTER, AXES = np.array([400.0, -150.0, 90.0]), np.array([30.0, 20.0, 24.0])
+
+
+@pytest.fixture(scope="session")
+def small_capture(tmp_path_factory):
+    """Path of a scene of twelve 56 × 40 photographs of a two-coloured ellipsoid, traced by stock Mitsuba."""
+    import mitsuba as mi
+    import trimesh
+    from scipy.spatial.transform import Rotation
+
+    folder = tmp_path_factory.mktemp("small")
+    (folder / "images").mkdir()
+    (folder / "masks").mkdir()
+    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    mesh = mi.Mesh("ellipsoid", len(ball.vertices), len(ball.faces), mi.Properties(), True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float((CENTER + ball.vertices * AXES @ turn.T).astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(ball.faces.astype(np.uint32).ravel())
+    params.update()
+    bands = 0.5 + 0.5 * np.sin(3 * ball.vertices[:, :1] + 2 * ball.vertices[:, 2:])
+    colour = bands * [0.6, 0.2, 0.1] + (1 - bands) * [0.3, 0.4, 0.2]
+    mesh.add_attribute("vertex_color", 3, colour.astype(np.float32).ravel())
+    mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}))
+    width, height, fx, fy, cx, cy = 56, 40, 60.0, 66.0, 30.5, 18.0
+    random, sensors = np.random.default_rng(5), []
+    for k in range(12):
+        direction = random.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        origin = CENTER + random.uniform(120, 150) * direction
+        target = CENTER + random.uniform(-3, 3, 3)
+        up = random.normal(size=3).tolist()
+        matrix = np.array(mi.ScalarTransform4f().look_at(origin.tolist(), target.tolist(), up).matrix)
+        light = origin + matrix[:3, :3] @ [15, 10, 0]
+        intensity = 2.2 * np.linalg.norm(light - CENTER) ** 2
+        scene = mi.load_dict({
+            "type": "scene",
+            "object": mesh,
+            "light": {"type": "point", "position": light.tolist(), "intensity": float(intensity)},
+        })  # fmt: skip
+        # Rays by the contract's conventions: x left, y up, z forward; 4 x 4 samples per pixel.
+        y, x = np.meshgrid((np.arange(4 * height) + 0.5) / 4, (np.arange(4 * width) + 0.5) / 4, indexing="ij")
+        local = np.stack([-(x - cx) / fx, -(y - cy) / fy, np.ones_like(x)], -1).reshape(-1, 3)
+        world = local @ matrix[:3, :3].T
+        world /= np.linalg.norm(world, axis=1, keepdims=True)
+        ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(*world.T.astype(np.float32)))
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, len(world))
+        radiance, hit, _ = mi.load_dict({"type": "direct"}).sample(scene, sampler, mi.RayDifferential3f(ray))
+        blocks = np.array(radiance).T.reshape(height, 4, width, 4, 3).mean((1, 3))
+        coverage = np.array(hit).reshape(height, 4, width, 4).mean((1, 3))
+        encoded = np.where(blocks <= 0.0031308, 12.92 * blocks, 1.055 * np.maximum(blocks, 1e-9) ** (1 / 2.4) - 0.055)
+        mi.Bitmap((np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)).write(str(folder / f"images/{k:03}.png"))
+        mi.Bitmap((coverage[..., None] > 0.5).astype(np.uint8) * 255).write(str(folder / f"masks/{k:03}.png"))
+        sensors.append(SENSOR.format(
+            id=f"{k:03}", mask=f'\n    <string name="mask" value="masks/{k:03}.png"/>', fx=fx, fy=fy, cx=cx, cy=cy,
+            matrix=" ".join(f"{v:.9g}" for v in matrix.ravel()), width=width, height=height,
+            x=light[0], y=light[1], z=light[2], intensity=intensity,
+        ))  # fmt: skip
+    (folder / "small.xml").write_text(SCENE.format(sensors="".join(sensors)))
+    return folder / "small.xml"
+
+
+@pytest.fixture
+def broken_capture(small_capture, tmp_path):
+    """A copy of the small capture to break, and a function that edits its XML."""
+    import shutil
+
+    folder = tmp_path / "broken"
+    shutil.copytree(small_capture.parent, folder)
+    path = folder / "small.xml"
+
+    def edit(old, new, count=1):
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, count))
+
+    return path, edit

@@ -1,0 +1,161 @@
+"""Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import AXES, CENTER
+
+import mitsuba as mi
+from mi_ring import capture
+from mi_ring.errors import InputError
+
+
+def test_srgb_decoding_is_the_standards():
+    image = np.array([[[0, 10, 11], [127, 200, 255]]], np.uint8)
+    linear, clipped = capture.decode(image, linear=False, saturation=1.0)
+    # IEC 61966-2-1, by hand: 10/255 is on the straight part, 11/255 on the power
+    expected = [0, 10 / 255 / 12.92, ((11 / 255 + 0.055) / 1.055) ** 2.4]
+    assert linear[0, 0] == pytest.approx(expected, abs=1e-7)
+    assert linear[0, 1] == pytest.approx([0.21223, 0.57758, 1.0], abs=1e-5)  # published table values
+    assert clipped.tolist() == [[[False, False, False], [False, False, True]]]
+
+
+def test_sixteen_bits_are_linear_and_all_of_them_count():
+    image = np.array([[[0, 1, 257], [32768, 65534, 65535]]], np.uint16)
+    linear, clipped = capture.decode(image, linear=True, saturation=0.5)
+    np.testing.assert_allclose(linear, image / 65535.0, rtol=1e-6)
+    assert clipped.tolist() == [[[False, False, False], [True, True, True]]]
+
+
+def test_srgb_encoding_inverts_decoding():
+    v = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(capture.srgb_to_linear(capture.linear_to_srgb(v)), v, atol=1e-5)
+
+
+def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
+    path, _ = broken_capture
+    pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
+    mi.Bitmap(pixels).write(str(path.parent / "images/002.png"))
+    scene = capture.load(path)
+    rgb, _, _ = scene.observe([2])
+    np.testing.assert_allclose(rgb[0].numpy(), pixels / 65535.0, rtol=1e-6)
+
+
+def test_declared_encoding_beats_the_default(broken_capture):
+    path, edit = broken_capture
+    edit('<string name="filename" value="images/001.png"/>',
+         '<string name="filename" value="images/001.png"/><string name="encoding" value="linear"/>')  # fmt: skip
+    scene = capture.load(path)
+    for k, convert in ((0, capture.srgb_to_linear), (1, np.float32)):
+        encoded = np.array(mi.Bitmap(str(path.parent / f"images/{k:03}.png"))) / 255.0
+        np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(encoded), atol=1e-6)
+
+
+def test_shrinking_averages_blocks(small_capture):
+    scene = capture.load(small_capture)
+    full, _, mask = scene.observe([3, 7])
+    small, _, coverage = scene.observe([3, 7], 4)
+    assert small.shape == (2, 10, 14, 3) and coverage.shape == (2, 10, 14)
+    torch.testing.assert_close(small[1, 4, 6], full[1, 16:20, 24:28].mean((0, 1)))
+    torch.testing.assert_close(coverage[0, 5, 7], mask[0, 20:24, 28:32].mean())
+
+
+def test_sphere_of_masks_finds_the_object(small_capture):
+    center, radius = capture.load(small_capture).sphere()
+    volume = np.prod(AXES) ** (1 / 3)
+    # Twelve views: the hull is a little larger than the object, and masks are uncertain by half a pixel, 5 % of it.
+    assert np.linalg.norm(center - CENTER) < 0.1 * volume
+    assert 0.95 * volume < radius < 1.25 * volume
+
+
+def test_sphere_of_cameras_is_near_the_object(broken_capture):
+    path, _ = broken_capture
+    text = path.read_text()
+    for k in range(12):
+        text = text.replace(f'<string name="mask" value="masks/{k:03}.png"/>', "")
+    path.write_text(text)
+    scene = capture.load(path)
+    assert scene.observe([0])[2] is None
+    center, radius = scene.sphere()
+    assert np.linalg.norm(center - CENTER) < 8  # the principal point is off the middle, the targets are off the centre
+    assert 10 < radius < 40
+
+
+def test_sphere_of_the_xml_wins(broken_capture):
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>',
+         '<bsdf type="cooktorrance"/><point name="center" x="1" y="2" z="3"/><float name="radius" value="4.5"/>')  # fmt: skip
+    center, radius = capture.load(path).sphere()
+    assert center.tolist() == [1, 2, 3] and radius == 4.5
+
+
+def test_exposure_and_reflectance_follow_the_lamp(small_capture):
+    scene = capture.load(small_capture)
+    exposure = scene.exposure()
+    values = [scene.observe([k], 4) for k in range(12)]
+    inside = torch.cat([rgb[mask > 0.5] for rgb, _, mask in values])
+    assert exposure == pytest.approx(inside.mean().item(), rel=1e-5)
+    # The lamp gives 2.2 at the centre, so a surface there that looks `exposure` bright reflects exposure / 2.2.
+    assert scene.reflectance(CENTER, exposure) == pytest.approx(exposure / 2.2, rel=1e-4)
+
+
+def rename(path, edit):
+    (path.parent / "images/004.png").rename(path.parent / "images/x.png")
+
+
+def wrong_mask(path, edit):
+    mi.Bitmap(np.zeros((40, 55, 1), np.uint8)).write(str(path.parent / "masks/005.png"))
+
+
+def wrong_film(path, edit):
+    edit('name="width" value="56"', 'name="width" value="57"')
+
+
+def no_photographs(path, edit):
+    text = path.read_text()
+    path.write_text(text[: text.index("<sensor")] + "</scene>")
+
+
+def black(path, edit):
+    for k in range(12):
+        mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(path.parent / f"images/{k:03}.png"))
+
+
+def empty_mask(path, edit):
+    mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/005.png"))
+
+
+BROKEN = {
+    "missing image": (rename, ["images/004.png", 'photograph "004"', "filename"]),
+    "truncated image": (lambda path, edit: (path.parent / "images/004.png").write_bytes(b"\x89PNG"), ["004.png", "image"]),
+    "mask of another size": (wrong_mask, ["005.png", "mask", "55 x 40", "56 x 40"]),
+    "film of another size": (wrong_film, ["000.png", "filename", "56 x 40", "57 x 40"]),
+    "no photographs": (no_photographs, ["small.xml", "sensor"]),
+    "no shapenet": (lambda path, edit: edit('type="shapenet"', 'type="sphere"'), ["small.xml", "shapenet"]),
+    "unknown property": (lambda path, edit: edit('name="fx"', 'name="fxx"'), ["small.xml", "fx"]),
+    "unknown plugin": (lambda path, edit: edit('type="photograph"', 'type="fotograph"'), ["small.xml", "fotograph"]),
+    "no XML": (lambda path, edit: path.write_text("<scene version='3.0.0'><shape"), ["small.xml"]),
+    "no file": (lambda path, edit: path.unlink(), ["small.xml", "no such file"]),
+    "scaled pose": (lambda path, edit: edit('name="to_world"', 'name="to_world">'
+                    '<scale value="2"/></transform><transform name="other"'), ["small.xml", "to_world", "scale"]),
+    "spot light": (lambda path, edit: edit('<emitter type="point"><point name="position"',
+                   '<emitter type="projector"><!-- '), ["small.xml"]),
+    "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><texture '
+                        'type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/></texture></bsdf>'),
+                        ["small.xml", "vertex_color"]),
+    "black photographs": (black, ["small.xml", "black"]),
+    "empty mask": (empty_mask, ["005.png", "mask"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_capture_gives_one_line_that_names_what_is_wrong(case, broken_capture):
+    path, edit = broken_capture
+    breaking, words = BROKEN[case]
+    breaking(path, edit)
+    with pytest.raises(InputError) as error:
+        scene = capture.load(path)
+        scene.sphere()
+        scene.exposure()
+    message = str(error.value)
+    assert "\n" not in message and all(word in message for word in words), message

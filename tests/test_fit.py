@@ -1,0 +1,243 @@
+"""The commands `fit` and `render` from end to end on a small capture."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import AXES, CENTER
+
+import mitsuba as mi
+from mi_ring import command, fit, render, results
+from mi_ring.config import PRESETS, Config
+from mi_ring.errors import InputError
+
+QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
+FILES = ["scene.xml", "ring.pt", "mesh.ply", "config.json", "log.jsonl", "inputs.png", "report.html", "checkpoint.pt"]
+
+
+@pytest.fixture(scope="module")
+def finished(small_capture, tmp_path_factory):
+    """The results folder of a quick fit."""
+    folder = tmp_path_factory.mktemp("fit") / "small"
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "90", *QUICK]) == 0
+    return folder
+
+
+def distance(mesh_file):
+    """Mean distance of a mesh's vertices from the true ellipsoid, as a share of its size (by its implicit function)."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    vertices = trimesh.load(mesh_file, process=False).vertices
+    return np.abs(np.linalg.norm((vertices - CENTER) @ turn / AXES, axis=1) - 1).mean()
+
+
+def test_fit_writes_all_results_and_no_other_files(finished):
+    assert sorted(p.name for p in finished.iterdir()) == sorted(FILES)
+
+
+def test_fit_finds_the_ellipsoid(finished):
+    # A pixel is about 2 of the ellipsoid's 25 units; the start sphere is off by a fifth.
+    assert distance(finished / "mesh.ply") < 0.04
+
+
+def test_mesh_is_closed_outward_and_carries_the_material(finished):
+    mesh = trimesh.load(finished / "mesh.ply", process=False)
+    assert mesh.is_watertight and mesh.volume > 0 and len(mesh.vertices) == 642
+    ply = mi.load_dict({"type": "ply", "filename": str(finished / "mesh.ply")})
+    for name, channels in (("vertex_diffuse", 3), ("vertex_specular", 1), ("vertex_roughness", 1)):
+        assert len(mi.traverse(ply)[name]) == 642 * channels
+
+
+def test_log_and_configuration_tell_what_happened(finished):
+    log = results.read_log(finished)
+    assert [entry["iteration"] for entry in log] == list(range(5, 95, 5))
+    assert {"seconds", "loss", "rgb", "mask", "velocity", "learning_rate", "vertices"} <= set(log[0])
+    assert log[0]["vertices"] == 162 and log[-1]["vertices"] == 642
+    assert log[-1]["rgb"] < 0.5 * log[0]["rgb"]
+    assert json.loads((finished / "config.json").read_text())["iterations"] == 90
+
+
+def test_scene_opens_in_mitsuba_and_path_shows_the_object(finished, small_capture):
+    scene = mi.load_file(str(finished / "scene.xml"))
+    for k in (1, 8):
+        photograph = np.array(mi.Bitmap(str(small_capture.parent / f"images/{k:03}.png"))) / 255.0
+        linear = mi.render(scene, integrator=mi.load_dict({"type": "path"}), sensor=k, spp=16)
+        picture = np.array(mi.Bitmap(linear).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)) / 255.0
+        assert -10 * np.log10(np.mean((picture - photograph) ** 2)) > 20
+
+
+def test_render_takes_every_photograph_under_its_name(finished, small_capture, tmp_path):
+    render.main([str(finished), str(small_capture), str(tmp_path), "--subdivisions", "4", "--spp", "16"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"{k:03}.png" for k in range(12)]
+    errors = []
+    for k in range(12):
+        a, b = (np.array(mi.Bitmap(str(d / f"{k:03}.png"))) / 255.0 for d in (tmp_path, small_capture.parent / "images"))
+        errors.append(np.mean((a - b) ** 2))
+    assert -10 * np.log10(np.mean(errors)) > 22
+
+
+def test_report_is_one_self_contained_file(finished):
+    page = (finished / "report.html").read_text()
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
+    assert "<link" not in page and "<script" not in page and "011.png" in page
+
+
+def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
+    before = (finished / "mesh.ply").read_bytes()
+    assert fit.main([str(small_capture), "--out", str(finished), "--iterations", "2", *QUICK]) == 0
+    aside = finished.with_name("small.1")
+    assert (aside / "mesh.ply").read_bytes() == before != (finished / "mesh.ply").read_bytes()
+    for name in FILES:
+        (aside / name).replace(finished / name)
+
+
+def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture, tmp_path):
+    arguments = [str(small_capture), "--iterations", "14", "--deterministic", "--seed", "4", *QUICK]
+    for name in ("a", "b"):
+        assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
+
+    interrupted = fit.parse([*arguments, "--out", str(tmp_path / "c")])
+    fit.set_threads(interrupted)
+    first = fit.Fit(fit.capture.load(small_capture), interrupted)
+    results.prepare(tmp_path / "c", interrupted)
+    fit.train(first, tmp_path / "c", lambda: first.iteration == 9)  # in the second stage
+    assert fit.main([*arguments, "--out", str(tmp_path / "c"), "--resume"]) == 0
+
+    rings = [torch.load(tmp_path / name / "ring.pt")["networks"] for name in ("a", "b", "c")]
+    for other in rings[1:]:
+        assert all(torch.equal(rings[0][key], other[key]) for key in rings[0])
+    meshes = {(tmp_path / name / "mesh.ply").read_bytes() for name in ("a", "b", "c")}
+    assert len(meshes) == 1
+    logs = [[{**e, "seconds": 0} for e in results.read_log(tmp_path / name)] for name in ("a", "c")]
+    assert logs[0] == logs[1]
+
+
+def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
+    folder = tmp_path / "run"
+    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), "--out", str(folder), "--iterations", "200", *QUICK]
+    process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    deadline = time.monotonic() + 120
+    while not ((folder / "log.jsonl").exists() and (folder / "log.jsonl").stat().st_size):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, output
+    assert "--resume" in output and "Traceback" not in output
+    assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
+    stopped = results.read_log(folder)[-1]["iteration"]
+    assert stopped < 200
+
+    subprocess.run([*call, "--resume"], check=True, timeout=300, capture_output=True)
+    assert [e["iteration"] for e in results.read_log(folder)][-1] == 200
+    assert distance(folder / "mesh.ply") < 0.04
+
+
+def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_capture, tmp_path):
+    with pytest.raises(InputError, match="checkpoint.pt: --resume: no such file"):
+        fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
+    with pytest.raises(InputError, match="--batch: was 4 before, is 5 now"):
+        fit.main([str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *QUICK, "--batch", "5"])
+    (tmp_path / "checkpoint.pt").write_bytes(b"PK")
+    with pytest.raises(InputError, match="checkpoint.pt: --resume: not a checkpoint"):
+        fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
+
+
+def call(*arguments, module="fit"):
+    """Exit status and standard error of a command in a process of its own."""
+    done = subprocess.run([sys.executable, "-m", f"mi_ring.{module}", *map(str, arguments)],
+                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    return done.returncode, done.stderr
+
+
+def test_a_users_mistake_is_one_line_and_status_2_before_any_work(broken_capture, tmp_path):
+    path, _ = broken_capture
+    (path.parent / "images/007.png").unlink()
+    status, complaint = call(path, "--out", tmp_path / "out")
+    assert status == 2 and complaint.count("\n") == 1
+    assert "007.png" in complaint and "filename" in complaint
+    assert not (tmp_path / "out").exists()
+
+
+def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_path):
+    status, complaint = call(tmp_path / "nothing", small_capture, tmp_path / "out", module="render")
+    assert status == 2 and complaint.count("\n") == 1 and "nothing" in complaint
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--preset", "quick"], ["preset", "quick", "fast"]),
+        (["--iterations", "many"], ["iterations", "many"]),
+        (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
+        (["--iteration", "5"], ["iteration"]),
+        (["--levels", "4", "9"], ["--levels", "0 to 8"]),
+        (["--levels", "4"], ["--widths", "as many"]),
+        (["--loss", "l3"], ["loss", "l3"]),
+        (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
+    ],
+)
+def test_an_unusable_option_is_one_line_that_names_it(options, words):
+    with pytest.raises(InputError) as error:
+        fit.parse(["scene.xml", *options])
+    assert "\n" not in str(error.value) and all(word in str(error.value) for word in words), error.value
+
+
+def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="--out: cannot be written"):
+        fit.main([str(small_capture), "--out", str(tmp_path / "file" / "run"), "--iterations", "1", *QUICK])
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_valid_and_can_be_overridden(preset):
+    config = fit.parse(["scene.xml", "--preset", preset, "--seed", "7"])
+    assert config.preset == preset and config.seed == 7
+    stages = config.stages()
+    assert stages[0].first == 0 and stages[-1].last == config.iterations
+    assert all(a.last == b.first for a, b in zip(stages, stages[1:]))
+    for name, value in PRESETS[preset].items():
+        assert getattr(config, name) == value
+
+
+def test_paper_preset_is_the_papers():
+    config = fit.parse(["scene.xml", "--preset", "paper"])
+    assert config.weights["velocity"] == 0.01 and config.loss == "l2"
+    assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
+    assert config.levels == (5, 6) and [s.last - s.first for s in config.stages()] == [2000, 4000]
+    assert config.precision == "float32"
+
+
+def test_help_names_every_option(capsys):
+    with pytest.raises(SystemExit) as stop:
+        fit.parse(["--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0
+    for name in Config.__dataclass_fields__:
+        assert name == "scene" or f"--{name.replace('_', '-')}" in text
+
+
+def test_program_lists_its_commands():
+    done = subprocess.run([sys.executable, "-c", "import sys; sys.argv[1:] = ['--help']; "
+                           "from mi_ring import command; command.main()"], capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 0
+    assert all(name in done.stdout for name in command.COMMANDS)
+
+
+def test_writes_are_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.pt"
+    results.save({"iteration": 1}, path)
+    monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        results.save({"iteration": 2}, path)
+    assert torch.load(path) == {"iteration": 1}
