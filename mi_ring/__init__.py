@@ -1,7 +1,7 @@
 """From photographs to a watertight mesh with a spatially varying material, inside Mitsuba 3.
 
-`import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current variant
-of Mitsuba and for every one switched to later; it selects `llvm_ad_rgb` if none is selected yet.
+`import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current
+variant of Mitsuba and for every one switched to later; it selects `llvm_ad_rgb` if none is selected yet.
 """
 
 import importlib

@@ -24,7 +24,6 @@ class Surface:
         self.prefix = next(
             name.removesuffix(POSITIONS) for name, _ in self.params if name == f"{shape.id()}.{POSITIONS}"
         )
-        self.topologies: dict[int, tuple] = {}
         self.faces = None
 
     def set_faces(self, faces: np.ndarray) -> None:

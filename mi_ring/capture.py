@@ -142,7 +142,10 @@ def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.
 
 
 def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -> tuple[np.ndarray, float]:
-    """Centre of the masks' visual hull and the radius of the ball of the same volume [scene units]."""
+    """Centre of the masks' visual hull and 1.3 times the radius of the ball of the same volume [scene units].
+
+    A start surface that is a little too large shrinks onto the object, which goes faster than growing limbs.
+    """
     cameras = [camera_of(capture.sensors[k]) for k in masked]
     pixels = []
     for k in masked:
@@ -172,7 +175,7 @@ def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -
     if not len(hull):
         raise InputError(f"{capture.path}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
     volume = len(hull) * (2 * reach / (resolution - 1)) ** 3
-    return hull.mean(0), float((3 * volume / (4 * np.pi)) ** (1 / 3))
+    return hull.mean(0), float(1.3 * (3 * volume / (4 * np.pi)) ** (1 / 3))
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:

@@ -10,7 +10,7 @@ import tyro
 
 from mi_ring.errors import InputError
 
-COMMANDS = ("fit", "render")
+COMMANDS = ("fit", "render", "evaluate")
 
 
 def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING):

@@ -53,7 +53,7 @@ class Config:
     laplacian_scale: float = 0.01
     """The paper's alpha: how much the regulariser smoothes the velocity field."""
     blur: float = 0.06
-    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to 0."""
+    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to a pixel."""
     optimizer: Literal["muon", "adam"] = "muon"
     """muon: Muon for the hidden weights, Adam for the rest. adam: Adam for all."""
     learning_rate: float = 3e-3

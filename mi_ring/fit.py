@@ -22,6 +22,7 @@ from mi_ring.ring import Ring
 
 CHECKPOINT_SECONDS = 30.0
 LOG_EVERY = 5
+FIXED_WORK = 2500  # what an iteration costs besides its vertices, in vertices: for the time left
 REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
 
 
@@ -85,8 +86,8 @@ class Fit:
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
         if mask is not None and config.weights.get("mask"):
-            sigma = config.blur * max(0.0, 1 - 1.25 * progress) * size[0] / scale
-            terms["mask"] = losses.mask_loss(coverage, mask, sigma)
+            sigma = config.blur * (1 - 1.25 * progress) * size[0] / scale
+            terms["mask"] = losses.mask_loss(coverage, mask, max(1.0, sigma))
         if config.weights.get("velocity"):
             terms["velocity"] = self.regulariser(s)
         loss = sum(config.weights.get(name, 0.0) * term for name, term in terms.items())
@@ -190,7 +191,7 @@ def interruptible():
 def train(fit: Fit, folder: Path, interrupted) -> None:
     """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints in `folder`."""
     vertices = {stage.level: len(fit.ring.domain.sample(stage.level)[0]) for stage in fit.stages}
-    work = [vertices[stage.level] for stage in fit.stages for _ in range(stage.first, stage.last)]
+    work = [vertices[s.level] + FIXED_WORK for s in fit.stages for _ in range(s.first, s.last)]
     saved = time.monotonic()
     bar = tqdm(
         total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,

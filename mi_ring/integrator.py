@@ -177,9 +177,19 @@ def pixel_rays(photographs, spp, seed):
     return mi.Ray3f(*camera_ray(*photographs.camera(view), mi.Point2f(x, y))), view
 
 
+def center_rays(photographs):
+    """One ray through the centre of every pixel: (rays, photograph per lane)."""
+    width, height = photographs.size
+    lane = dr.arange(mi.UInt32, len(photographs) * width * height)
+    view, pixel = lane // (width * height), lane % (width * height)
+    where = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
+    return mi.Ray3f(*camera_ray(*photographs.camera(view), where)), view
+
+
 def next_2d(seed, lanes):
     """A source of independent 2-D samples, one stream per lane."""
-    rng = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed))
+    # Hashed as in Mitsuba's samplers: the streams of neighbouring lanes would otherwise resemble each other.
+    rng = mi.PCG32(lanes, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), dr.arange(mi.UInt32, lanes)))
     return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
@@ -211,11 +221,7 @@ def render_maps(scene, photographs):
 
     Returns Floats of N·H·W pixels: [nx, ny, nz, diffuse r, g, b, specular, roughness], normals in world space.
     """
-    width, height = photographs.size
-    lane = dr.arange(mi.UInt32, len(photographs) * width * height)
-    view, pixel = lane // (width * height), lane % (width * height)
-    where = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
-    si = scene.ray_intersect(mi.Ray3f(*camera_ray(*photographs.camera(view), where)))
+    si = scene.ray_intersect(center_rays(photographs)[0])
     maps = [*si.sh_frame.n, *([mi.Float(0)] * 5)]
     for shape in scene.shapes():
         if isinstance(shape.bsdf(), CookTorrance):

@@ -9,8 +9,8 @@ def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: flo
     """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
 
     Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error.
-    `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so that
-    dim surfaces seen at a slant count as much as bright ones.
+    `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
+    that dim surfaces seen at a slant count as much as bright ones.
     """
     if kind == "log":
         predicted, observed = ((x / exposure * 4).clamp(min=-0.5).log1p() for x in (predicted, observed))

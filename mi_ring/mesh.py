@@ -62,12 +62,16 @@ class ShapeNetMesh(mi.Mesh):
         #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
         self.center = np.array(given["center"]).ravel() if "center" in given else None
         self.radius = given.get("radius")
+        if self.radius is not None and not self.radius > 0:
+            raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
         self.domain = Sphere()
         center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         if "domain" in given:
             mesh = trimesh.load(str(resolver.resolve(given["domain"])), force="mesh")
             if not mesh.is_watertight:
                 raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is not a closed surface')
+            if mesh.volume < 0:
+                mesh.invert()
             self.domain = Domain((mesh.vertices - center) / radius, mesh.faces)
         self.ring = Ring.load(str(resolver.resolve(given["weights"]))) if "weights" in given else None
 
@@ -82,6 +86,8 @@ class ShapeNetMesh(mi.Mesh):
                 vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
         matrix = torch.tensor(to_world, dtype=torch.float32)
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if np.linalg.det(to_world[:3, :3]) < 0:
+            faces = np.fliplr(faces)  # a mirror would turn the surface inside out
 
         super().__init__(props.id(), len(vertices), len(faces), props, True, False)
         params = mi.traverse(self)

@@ -31,7 +31,9 @@ class Ring(nn.Module):
         return self.center + self.radius * self.shape_net(s)
 
     def state(self, config: dict | None = None) -> dict:
-        domain = None if isinstance(self.domain, Sphere) else {"points": self.domain.points, "faces": self.domain.faces}
+        domain = None
+        if not isinstance(self.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
+            domain = {"points": torch.tensor(self.domain.points), "faces": torch.tensor(self.domain.faces)}
         return {"format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {}}
 
     @classmethod
@@ -47,10 +49,10 @@ class Ring(nn.Module):
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             version = state["format"]
+            if version == FORMAT:
+                return cls.from_state(state)
         except FileNotFoundError:
             raise InputError(f"{path}: no such file; weights must be the ring.pt of a finished fit") from None
         except Exception as error:
             raise InputError(f"{path}: not a saved fit ({str(error).splitlines()[0]})") from error
-        if version != FORMAT:
-            raise InputError(f"{path}: format version {version}, this mi_ring reads version {FORMAT}")
-        return cls.from_state(state)
+        raise InputError(f"{path}: format version {version}, this mi_ring reads version {FORMAT}")

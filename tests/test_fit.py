@@ -8,13 +8,13 @@ import subprocess
 import sys
 import time
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
 
-import mitsuba as mi
 from mi_ring import command, fit, render, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
@@ -80,7 +80,8 @@ def test_render_takes_every_photograph_under_its_name(finished, small_capture, t
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{k:03}.png" for k in range(12)]
     errors = []
     for k in range(12):
-        a, b = (np.array(mi.Bitmap(str(d / f"{k:03}.png"))) / 255.0 for d in (tmp_path, small_capture.parent / "images"))
+        folders = (tmp_path, small_capture.parent / "images")
+        a, b = (np.array(mi.Bitmap(str(folder / f"{k:03}.png"))) / 255.0 for folder in folders)
         errors.append(np.mean((a - b) ** 2))
     assert -10 * np.log10(np.mean(errors)) > 22
 
@@ -124,7 +125,7 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
     folder = tmp_path / "run"
-    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), "--out", str(folder), "--iterations", "200", *QUICK]
+    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), "--out", str(folder), *QUICK, "--iterations", "200"]
     process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
     while not ((folder / "log.jsonl").exists() and (folder / "log.jsonl").stat().st_size):

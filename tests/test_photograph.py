@@ -5,10 +5,10 @@ import subprocess
 import sys
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
-import mitsuba as mi
 from mi_ring.photograph import camera_ray, project
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 7, 5, 9.5, 7.25, 3.1, 2.8  # [px]; nothing in the middle, nothing square
@@ -109,14 +109,14 @@ def test_cropped_film_sees_its_part_of_the_picture():
 
 @pytest.mark.parametrize("centre", [(3.5, 2.5), (3.1, 2.9)])
 def test_equals_the_stock_perspective_sensor(centre):
-    """Where that one can express the camera: square pixels."""
+    """Where that one can express the camera: square pixels. Its offset is how far the picture moves."""
     ours = mi.load_dict(photograph(fx=FX, fy=FX, cx=centre[0], cy=centre[1]))
     stock = mi.load_dict({
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(WIDTH / 2 / FX))),
         "fov_axis": "x",
-        "principal_point_offset_x": (centre[0] - WIDTH / 2) / WIDTH,
-        "principal_point_offset_y": (centre[1] - HEIGHT / 2) / HEIGHT,
+        "principal_point_offset_x": (WIDTH / 2 - centre[0]) / WIDTH,
+        "principal_point_offset_y": (HEIGHT / 2 - centre[1]) / HEIGHT,
         "to_world": mi.ScalarTransform4f(POSE),
         "film": photograph()["film"],
     })  # fmt: skip
@@ -221,10 +221,7 @@ CLOSE = {"rtol": 2e-3}
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_every_integrator_sees_the_nested_light(integrator):
-    own = photograph()["film"]
-    scene = plane_scene(
-        a=telephoto(light=point(LIGHT, INTENSITY)), b=telephoto(light=DISTANT), c=telephoto(), d=STOCK | {"film": own}
-    )
+    scene = plane_scene(a=telephoto(light=point(LIGHT, INTENSITY)), b=telephoto(light=DISTANT), c=telephoto())
     expected = [lit_by_point(LIGHT, INTENSITY), lit_from_afar(), lit_by_point(ABOVE[:3, 3], 1.0)]
     for k in (0, 1, 2, 0):  # each by its own light, whichever came before
         np.testing.assert_allclose(picture(scene, integrator, k), expected[k], **CLOSE)
@@ -261,7 +258,9 @@ def test_shadow_of_a_blocker_far_away_toward_a_directional_light(integrator):
     film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
     scene = plane_scene(
         blocker={"type": "rectangle", "to_world": facing @ mi.ScalarTransform4f().scale([12, 7, 1])},
-        a=photograph(fx=focal, fy=focal, cx=16.0, cy=13.0, to_world=mi.ScalarTransform4f(pose), film=film, light=DISTANT),
+        a=photograph(
+            fx=focal, fy=focal, cx=16.0, cy=13.0, to_world=mi.ScalarTransform4f(pose), film=film, light=DISTANT
+        ),
     )
     axes = np.array(facing.matrix)[:3, :2]
     in_shadow = []
@@ -272,9 +271,9 @@ def test_shadow_of_a_blocker_far_away_toward_a_directional_light(integrator):
         in_shadow.append((np.abs(across) < [12, 7]).all(1).reshape(height, width))
     image = picture(scene, integrator, spp=4)
     all_of_it, some_of_it = np.all(in_shadow, 0), np.any(in_shadow, 0)
-    assert 50 < all_of_it.sum() and some_of_it.sum() < width * height - 50
+    assert all_of_it.sum() > 50 and some_of_it.sum() < width * height - 50
     assert (image[all_of_it] == 0).all()
-    np.testing.assert_allclose(image[~some_of_it], np.broadcast_to(lit_from_afar()[0, 0], image.shape)[~some_of_it], rtol=1e-4)
+    np.testing.assert_allclose(image[~some_of_it] - lit_from_afar()[0, 0], 0, atol=1e-5)  # float32
 
 
 # Every variant.

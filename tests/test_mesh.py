@@ -1,0 +1,238 @@
+"""The `shapenet` shape: any domain, any resolution, any place; always closed, and the same surface as its networks."""
+
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring.bsdf import ATTRIBUTES
+from mi_ring.domain import Domain
+from mi_ring.ring import Ring
+
+CENTER, RADIUS = [40.0, -15.0, 9.0], 12.5
+
+
+def shapenet(**properties):
+    return mi.load_dict({"type": "shapenet", "id": "object", "bsdf": {"type": "cooktorrance"}, **properties})
+
+
+def mesh_of(shape):
+    """The shape as trimesh sees it, vertices as they are."""
+    params = mi.traverse(shape)
+    vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, np.array(params["faces"]).reshape(-1, 3), process=False)
+
+
+def rows(points, digits=5):
+    """Points as a set of rounded rows."""
+    return set(map(tuple, (np.round(points, digits) + 0.0).tolist()))
+
+
+def ring_file(path, domain=None, center=CENTER, radius=RADIUS):
+    """A saved fit whose output layers are perturbed, so that neither shape nor material is trivial."""
+    torch.manual_seed(11)
+    ring = Ring(center, radius, scale=2.5, domain=domain)
+    with torch.no_grad():
+        ring.shape_net.output.weight.normal_(std=0.02)
+        ring.shape_net.output.bias.normal_(std=0.05)
+        ring.brdf_net.output.weight.normal_(std=0.5)
+    torch.save(ring.state(), path)
+    return ring
+
+
+# Where the surface is. Tolerances: float32 of the coordinates' size.
+
+
+def test_default_is_the_unit_sphere():
+    mesh = mesh_of(shapenet(subdivisions=3))
+    assert len(mesh.vertices) == 10 * 4**3 + 2
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1, atol=1e-6)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)  # an inscribed polyhedron of 1,280 faces
+
+
+def test_default_resolution_is_level_five():
+    assert shapenet().vertex_count() == 10_242
+
+
+def test_center_and_radius_move_the_sphere_and_are_kept_for_the_fit():
+    shape = shapenet(subdivisions=2, center=CENTER, radius=RADIUS)
+    mesh = mesh_of(shape)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTER, axis=1), RADIUS, rtol=1e-6)
+    np.testing.assert_allclose(shape.center, CENTER)
+    assert shape.radius == RADIUS
+    assert shapenet(subdivisions=0).center is None and shapenet(subdivisions=0).radius is None
+
+
+def test_to_world_comes_last():
+    to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.3, 1, -0.2], 70).scale([1, 2.5, 0.5])
+    plain = mesh_of(shapenet(subdivisions=2, center=CENTER, radius=RADIUS))
+    moved = mesh_of(shapenet(subdivisions=2, center=CENTER, radius=RADIUS, to_world=to_world))
+    matrix = np.array(to_world.matrix)
+    expected = plain.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(moved.vertices, expected, atol=1e-4)  # coordinates of about 100
+
+
+def test_coarse_vertices_are_among_the_fine_ones():
+    levels = [rows(mesh_of(shapenet(subdivisions=n, center=CENTER, radius=RADIUS)).vertices, 4) for n in (0, 1, 2, 3)]
+    for coarse, fine in zip(levels, levels[1:]):
+        assert coarse < fine
+
+
+# What it is made of.
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_is_closed_and_oriented_outward(tmp_path, mirror):
+    ring_file(tmp_path / "ring.pt")
+    to_world = mi.ScalarTransform4f().rotate([1, 2, 3], 40).scale([-1 if mirror else 1, 1, 1])
+    for properties in ({}, {"center": CENTER, "radius": RADIUS}, {"weights": str(tmp_path / "ring.pt")}):
+        mesh = mesh_of(shapenet(subdivisions=3, to_world=to_world, **properties))
+        assert mesh.is_watertight and mesh.is_winding_consistent
+        assert mesh.euler_number == 2
+        assert mesh.volume > 0  # signed: positive where the faces look outward
+
+
+def test_normals_look_outward_and_are_smooth():
+    shape = shapenet(subdivisions=4, center=CENTER, radius=RADIUS)
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    direction = np.random.default_rng(3).normal(size=(100, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    start = np.array(CENTER) + 3 * RADIUS * direction
+    si = scene.ray_intersect(
+        mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*-direction.T.astype(np.float32)))
+    )
+    # The faces of level 4 turn by 4 degrees; normals interpolated between true ones are much closer than that.
+    assert (np.array(si.sh_frame.n).T * direction).sum(1).min() > np.cos(np.radians(0.5))
+    assert (np.array(si.n).T * direction).sum(1).min() < np.cos(np.radians(1))
+
+
+def test_material_without_weights_is_grey_and_dull():
+    params = mi.traverse(shapenet(subdivisions=1))
+    for name, value in zip(ATTRIBUTES, (0.5, 0.0, 0.5)):
+        attribute = np.array(params[name])
+        assert attribute.shape == (42 * ATTRIBUTES[name],)
+        assert (attribute == value).all()
+
+
+@pytest.mark.parametrize("subdivisions", [2, 3])
+def test_weights_give_the_surface_and_material_of_the_networks(tmp_path, subdivisions):
+    ring = ring_file(tmp_path / "ring.pt")
+    shape = shapenet(weights=str(tmp_path / "ring.pt"), subdivisions=subdivisions)
+    params = mi.traverse(shape)
+    s, faces = ring.domain.sample(subdivisions)
+    with torch.no_grad():
+        expected, material = ring.surface(s), ring.brdf_net(s)
+    spread = (expected - torch.tensor(CENTER)).norm(dim=1) / RADIUS
+    assert spread.max() - spread.min() > 0.05  # no sphere
+    np.testing.assert_allclose(mesh_of(shape).vertices, expected, atol=1e-4)  # coordinates of about 50
+    np.testing.assert_array_equal(mesh_of(shape).faces, faces)
+    for name, value in zip(ATTRIBUTES, material):
+        assert value.std() > 1e-3
+        np.testing.assert_allclose(np.array(params[name]), value.numpy().ravel(), rtol=1e-4, atol=1e-6)
+
+
+# Other domains.
+
+
+@pytest.fixture
+def torus(tmp_path):
+    """A ring of radii 3 and 1 about an axis of its own, away from the origin: [file, mesh]."""
+    mesh = trimesh.creation.torus(3.0, 1.0, major_sections=16, minor_sections=8)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 0.5], [0, 0, 0]))
+    mesh.apply_translation(CENTER)
+    mesh.export(tmp_path / "torus.ply")
+    return str(tmp_path / "torus.ply"), mesh
+
+
+def test_domain_file_keeps_its_place_and_its_genus(torus):
+    path, original = torus
+    shape = shapenet(domain=path, center=CENTER, radius=4.0, subdivisions=3)
+    mesh = mesh_of(shape)
+    assert len(mesh.faces) >= 20 * 4**3
+    assert mesh.is_watertight and mesh.euler_number == 0
+    assert mesh.volume == pytest.approx(original.volume, rel=1e-4)  # midpoint subdivision moves nothing
+    np.testing.assert_allclose(mesh.bounds, original.bounds, atol=1e-4)
+    assert np.linalg.norm(shape.domain.points, axis=1).max() == pytest.approx(1, abs=1e-5)  # 3 + 1 over a radius of 4
+
+
+def test_domain_file_that_is_inside_out_is_turned(torus):
+    path, original = torus
+    original.invert()
+    original.export(path)
+    assert mesh_of(shapenet(domain=path, subdivisions=2)).volume > 0
+
+
+def test_saved_fit_of_another_domain_loads(torus, tmp_path):
+    _, mesh = torus
+    domain = Domain((mesh.vertices - CENTER) / 4.0, mesh.faces)
+    ring = ring_file(tmp_path / "ring.pt", domain=domain, radius=4.0)
+    shape = mesh_of(shapenet(weights=str(tmp_path / "ring.pt"), subdivisions=2))
+    with torch.no_grad():
+        expected = ring.surface(domain.sample(2)[0])
+    np.testing.assert_allclose(shape.vertices, expected, atol=1e-4)
+    assert shape.is_watertight and shape.euler_number == 0
+
+
+# What is refused, in one clear message.
+
+
+@pytest.mark.parametrize(
+    "properties, message",
+    [
+        ({"subdivisions": -1}, "subdivisions is -1, must be 0 to 8"),
+        ({"subdivisions": 9}, "subdivisions is 9, must be 0 to 8"),
+        ({"subdivision": 3}, "subdivision"),
+        ({"weights": "ring.pt", "center": CENTER}, "weights carry their own center"),
+        ({"weights": "ring.pt", "radius": 2.0}, "weights carry their own radius"),
+        ({"weights": "ring.pt", "domain": "torus.ply"}, "weights carry their own domain"),
+        ({"weights": "missing.pt"}, "missing.pt: no such file"),
+        ({"weights": "garbage.pt"}, "garbage.pt: not a saved fit"),
+        ({"weights": "list.pt"}, "list.pt: not a saved fit"),
+        ({"weights": "older.pt"}, "older.pt: format version 0"),
+        ({"weights": "half.pt"}, "half.pt: not a saved fit"),
+        ({"domain": "open.ply"}, "open.ply.* is not a closed surface"),
+        ({"domain": "missing.ply"}, "missing.ply"),
+        ({"radius": 0.0}, "radius is 0"),
+        ({"radius": -2.0}, "radius is -2"),
+    ],
+    ids=lambda value: None if isinstance(value, str) else "-".join(f"{k}={v}" for k, v in value.items()),
+)
+def test_refuses(tmp_path, properties, message):
+    ring = ring_file(tmp_path / "ring.pt")
+    (tmp_path / "garbage.pt").write_bytes(b"no torch file")
+    torch.save([1, 2], tmp_path / "list.pt")
+    torch.save(ring.state() | {"format": 0}, tmp_path / "older.pt")
+    torch.save(ring.state() | {"networks": {}}, tmp_path / "half.pt")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.export(tmp_path / "torus.ply")
+    trimesh.Trimesh(ball.vertices, ball.faces[3:], process=False).export(tmp_path / "open.ply")
+    files = {key: str(tmp_path / value) for key, value in properties.items() if key in ("weights", "domain")}
+    with pytest.raises(Exception) as caught:
+        mi.load_dict({"type": "scene", "shape": {"type": "shapenet", "id": "pot", **properties, **files}})
+    assert re.search(message, str(caught.value).splitlines()[-1])  # below Mitsuba's own words and a traceback
+
+
+# Out and in again.
+
+
+def test_write_ply_is_read_by_trimesh_and_by_mitsuba(tmp_path):
+    ring_file(tmp_path / "ring.pt")
+    shape = shapenet(weights=str(tmp_path / "ring.pt"), subdivisions=2)
+    shape.write_ply(str(tmp_path / "mesh.ply"))
+    loaded = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert loaded.is_watertight and loaded.volume > 0
+    np.testing.assert_allclose(loaded.vertices, mesh_of(shape).vertices, atol=1e-5)
+    again = mi.traverse(mi.load_dict({"type": "ply", "filename": str(tmp_path / "mesh.ply")}))
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(np.array(again[name]), np.array(mi.traverse(shape)[name]))
+
+
+def test_flash_can_be_left_out():
+    """A fit placed into a scene of one's own brings no emitter."""
+    kinds = [
+        mi.load_dict({"type": "scene", "o": shapenet(subdivisions=0, flash=on)}).emitters() for on in (True, False)
+    ]
+    assert [len(emitters) for emitters in kinds] == [1, 0]
