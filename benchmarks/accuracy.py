@@ -3,7 +3,7 @@
     python benchmarks/accuracy.py scenes/pot2.xml [MORE.xml …] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
 
 The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, or in <scene name>/truth/. Each fit is a process of
-its own: wall time and peak memory are the whole process's, start-up and report included; fit time is that of the iterations.
+its own: wall time and peak memory are the whole process's, start-up and report included; fit time is the iterations'.
 """
 
 import argparse

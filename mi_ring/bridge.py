@@ -25,6 +25,7 @@ class Surface:
             name.removesuffix(POSITIONS) for name, _ in self.params if name == f"{shape.id()}.{POSITIONS}"
         )
         self.faces = None
+        self.written = 0
 
     def set_faces(self, faces: np.ndarray) -> None:
         """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
@@ -42,6 +43,7 @@ class Surface:
         for name, array in zip((POSITIONS, DIFFUSE, SPECULAR, ROUGHNESS), arrays):
             self.params[self.prefix + name] = array
         self.params.update()
+        self.written += 1
         return arrays
 
     def show(self, ring, s: Tensor, faces: np.ndarray) -> None:
@@ -71,12 +73,14 @@ class _Render(torch.autograd.Function):
         arrays = surface.write(vertices, diffuse, specular, roughness, gradients)
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
         dr.eval(channels)
-        ctx.save = (surface, photographs, arrays, channels, seed, shadows)
+        ctx.save = (surface, surface.written, photographs, arrays, channels, seed, shadows)
         return pictures(channels, photographs)
 
     @staticmethod
     def backward(ctx, rgb_grad, alpha_grad):
-        surface, photographs, arrays, channels, seed, shadows = ctx.save
+        surface, written, photographs, arrays, channels, seed, shadows = ctx.save
+        if surface.written != written:
+            raise RuntimeError("the surface was written again since this picture: call backward before the next one")
         grads = [mi.Float(g.contiguous().numpy().ravel()) for g in (*rgb_grad.unbind(-1), alpha_grad)]
         for channel, grad in zip(channels, grads):
             if dr.grad_enabled(channel):

@@ -13,7 +13,7 @@ from mi_ring.errors import InputError
 COMMANDS = ("fit", "render", "evaluate")
 
 
-def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING):
+def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP):
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood."""
     box = io.StringIO()
     try:

@@ -24,8 +24,9 @@ class ShapeNetMesh(mi.Mesh):
     ``domain``       string    optional mesh file (scene units), closed: the canonical surface instead of the
                                sphere. Not together with ``weights``, which carry their own
     ``center``       point     centre of the normalising sphere [scene units]; with ``weights`` theirs.
-                               Default: the origin; a fit estimates it from masks or cameras
-    ``radius``       float     its radius [scene units]; likewise. Default: 1
+                               Default: the middle of ``domain``, else the origin, but a fit estimates it from
+                               masks or cameras
+    ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of ``domain``, else 1
     ``to_world``     transform applied on top of everything. Default: none
     ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it to
                                false to place a fit into a scene of your own. Default: true
@@ -65,14 +66,16 @@ class ShapeNetMesh(mi.Mesh):
         if self.radius is not None and not self.radius > 0:
             raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
         self.domain = Sphere()
-        center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         if "domain" in given:
             mesh = trimesh.load(str(resolver.resolve(given["domain"])), force="mesh")
             if not mesh.is_watertight:
                 raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is not a closed surface')
             if mesh.volume < 0:
                 mesh.invert()
-            self.domain = Domain((mesh.vertices - center) / radius, mesh.faces)
+            self.center = mesh.bounds.mean(0) if self.center is None else self.center
+            self.radius = self.radius or float(np.linalg.norm(mesh.vertices - self.center, axis=1).mean())
+            self.domain = Domain((mesh.vertices - self.center) / self.radius, mesh.faces)
+        center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         self.ring = Ring.load(str(resolver.resolve(given["weights"]))) if "weights" in given else None
 
         material = torch.tensor([0.5, 0.5, 0.5]), torch.tensor(0.0), torch.tensor(0.5)

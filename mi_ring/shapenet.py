@@ -1,5 +1,7 @@
 """Shape-Net: a recurrent ResNet that integrates a flow and carries the domain onto the object (paper, section 3)."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -27,11 +29,11 @@ class ShapeNet(nn.Module):
             self.output.bias.zero_()
 
     def velocity(self, x: Tensor) -> Tensor:
-        """V(x) for (..., 3) points, same shape, in float32."""
+        """V(x) for (..., 3) points, of the same shape and type."""
         h = self.encoding(x)
         for layer in self.hidden:
             h = F.leaky_relu(layer(h), SLOPE)
-        return self.speed * torch.tanh(self.output(h).float())
+        return self.speed * torch.tanh(self.output(h).to(x.dtype))
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
         """Φ(x, steps / T): the first `steps` of the T Euler steps, of (V, 3) points.
@@ -58,56 +60,70 @@ def euler(velocity, x: Tensor, dt: float, steps: int) -> Tensor:
 class _Flow(torch.autograd.Function):
     """Euler steps through the velocity field, differentiated by hand.
 
-    Keeps each step's encoding and activations in the precision of the matrix products and nothing else, and sums the
-    weights' gradients over the steps in float32.
+    Chunks of points that fit into a core's cache are independent and go to one thread each. Of each step the
+    encoding and the activations are kept, in the precision of the matrix products, and nothing else.
     """
 
-    CHUNK = 16384  # points at a time, which bounds the memory for temporary results
+    CHUNK = 2048  # points, at most
 
     @staticmethod
     def forward(ctx, x, dt, steps, speed, dtype, *parameters):
-        weights = [w.to(dtype) for w in parameters[::2]]
-        biases = [b.to(dtype) for b in parameters[1::2]]
-        frequencies = weights[0].shape[1] // 6
-        encode = PosEnc(frequencies)
-        chunks, saved = [], []
-        for chunk in x.split(_Flow.CHUNK):
+        weights = [w.detach().to(dtype) for w in parameters[::2]]
+        biases = [b.detach().to(dtype) for b in parameters[1::2]]
+        encode, keep = PosEnc(weights[0].shape[1] // 6), any(ctx.needs_input_grad)
+
+        @torch.no_grad()
+        def flow(x):
+            kept = []
             for _ in range(steps):
-                layers = [encode(chunk).to(dtype)]
+                layers = [encode(x).to(dtype)]
                 for w, b in zip(weights[:-1], biases):
                     layers.append(F.leaky_relu_(F.linear(layers[-1], w, b), SLOPE))
                 direction = torch.tanh(F.linear(layers[-1], weights[-1], biases[-1]).to(x.dtype))
-                chunk = chunk + dt * speed * direction
-                if any(ctx.needs_input_grad):
-                    saved.append((layers, direction))
-            chunks.append(chunk)
-        ctx.saved, ctx.weights, ctx.sizes = saved, weights, (dt, steps, speed, dtype, frequencies)
-        return torch.cat(chunks)
+                x = x + dt * speed * direction
+                if keep:
+                    kept.append((layers, direction))
+            return x, kept
+
+        ctx.chunk = min(_Flow.CHUNK, -(-len(x) // torch.get_num_threads()))
+        ends, ctx.kept = zip(*in_parallel(flow, x.detach().split(ctx.chunk)))
+        ctx.weights, ctx.constants = weights, (dt * speed, dtype, encode.frequencies)
+        return torch.cat(ends)
 
     @staticmethod
     def backward(ctx, gradient):
-        dt, steps, speed, dtype, frequencies = ctx.sizes
-        weights, saved = ctx.weights, ctx.saved
+        scale, dtype, frequencies = ctx.constants
+        weights = ctx.weights
         omega = torch.arange(1, frequencies + 1, dtype=gradient.dtype).repeat_interleave(3)
-        sums = [torch.zeros_like(w, dtype=gradient.dtype) for w in weights]
-        bias_sums = [torch.zeros(len(w), dtype=gradient.dtype) for w in weights]
-        chunks = gradient.split(_Flow.CHUNK)
-        result = []
-        for number, g in reversed(list(enumerate(chunks))):
-            ones = torch.ones(1, len(g), dtype=dtype)
-            for step in reversed(range(steps)):
-                layers, direction = saved[number * steps + step]
-                back = (dt * speed * g * (1 - direction * direction)).to(dtype)
+
+        @torch.no_grad()
+        def pull(g, kept):
+            weight_sums = [torch.zeros_like(w, dtype=g.dtype) for w in weights]
+            bias_sums = [torch.zeros(len(w), dtype=g.dtype) for w in weights]
+            for layers, direction in reversed(kept):
+                back = (scale * g * (1 - direction * direction)).to(dtype)
                 for k in reversed(range(len(weights))):
-                    sums[k] += back.T @ layers[k]
-                    bias_sums[k] += (ones @ back)[0]
+                    weight_sums[k] += back.T @ layers[k]
+                    bias_sums[k] += back.sum(0)
                     back = back @ weights[k]
                     if k:
                         back = torch.ops.aten.leaky_relu_backward(back, layers[k], SLOPE, True)
-                cosine, sine = layers[0].to(g.dtype).chunk(2, dim=1)
-                back_cosine, back_sine = back.to(g.dtype).chunk(2, dim=1)
-                phase = (cosine * back_sine).addcmul_(sine, back_cosine, value=-1).mul_(omega)
+                cosine, sine = layers[0].chunk(2, dim=1)
+                back_cosine, back_sine = back.chunk(2, dim=1)
+                phase = (cosine * back_sine - sine * back_cosine) * omega
                 g = g + phase.unflatten(1, (frequencies, 3)).sum(1)
-            result.append(g)
-        ctx.saved = None
-        return torch.cat(result[::-1]), None, None, None, None, *(g for pair in zip(sums, bias_sums) for g in pair)
+            return g, weight_sums, bias_sums
+
+        chunks, weight_sums, bias_sums = zip(*in_parallel(pull, gradient.split(ctx.chunk), ctx.kept))
+        ctx.kept = None
+        totals = [sum(parts) for pair in zip(zip(*weight_sums), zip(*bias_sums)) for parts in pair]
+        return torch.cat(chunks), None, None, None, None, *totals
+
+
+def in_parallel(function, *arguments) -> list:
+    """`map` over as many threads as torch is set to use, each computing alone."""
+    threads = torch.get_num_threads()
+    if threads == 1:
+        return list(map(function, *arguments))
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        return list(pool.map(function, *arguments))

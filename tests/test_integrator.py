@@ -92,7 +92,7 @@ class Estimate:
 
 
 def assert_same(a, b):
-    """Equal within 7 standard errors in every pixel (with 30 degrees of freedom exceeded once in 10⁷) and 5 in the means.
+    """Equal within 7 standard errors in every pixel (exceeded once in 10⁷ by 30 degrees of freedom), 5 in the means.
 
     The floor of 1e-4 is for pixels without noise, where only float32 differs.
     """
@@ -263,7 +263,8 @@ def test_shadow_of_a_board_on_the_ground_is_its_projection(shadows):
         # A pixel on an edge: 256 samples stratified here and there differ by some 1 / 64 each, five times that
         np.testing.assert_allclose(image[k, ..., 0], radiance.mean(-1), atol=0.08 * radiance.max())
         even = (lit.all(-1) | ~lit.any(-1)) & (~on_board(p, -direction)).all(-1)
-        np.testing.assert_allclose(image[k, ..., 0][even], radiance.mean(-1)[even], atol=2e-3 * radiance.max())
+        # two of the 256 may find the corner of a shadow that 16 x 16 points just miss
+        np.testing.assert_allclose(image[k, ..., 0][even], radiance.mean(-1)[even], atol=0.01 * radiance.max())
 
 
 def test_photometric_without_shadows_lights_what_the_board_hides():
@@ -276,7 +277,7 @@ def test_photometric_without_shadows_lights_what_the_board_hides():
         for s in (True, False)
     )  # fmt: skip
     np.testing.assert_allclose(off, many(scene, Photographs.of(scene.sensors()), shadows=False), atol=0.1)
-    assert ((off - on)[..., 0] > 0.05).sum() > 60
+    assert ((off - on)[..., 0] > 0.05).sum() > 30
     assert ((on - off)[..., 0] > 0.05).sum() == 0
 
 
@@ -289,11 +290,9 @@ def test_environment_adds_its_light_to_every_photograph_and_to_the_background(sc
     photographs = Photographs.of(under_sky.sensors())
     both = Estimate(lambda seed: many(under_sky, photographs, seed=seed, spp=32))
     assert_same(both, Estimate(lambda seed: one_by_one(under_sky, "direct", seed, spp=64)))
-    background = estimate.mean[..., 3] == 0
-    np.testing.assert_allclose(both.mean[background], [[0.2, 0.3, 0.5, 0]] * background.sum(), rtol=1e-5)
-    assert (
-        both.mean[estimate.mean[..., 3] == 1][:, :3].mean(0) > estimate.mean[estimate.mean[..., 3] == 1][:, :3].mean(0)
-    ).all()
+    background, inside = both.mean[..., 3] == 0, both.mean[..., 3] == 1
+    np.testing.assert_allclose(both.mean[background][:, :3], [[0.2, 0.3, 0.5]] * background.sum(), rtol=1e-5)
+    assert (both.mean[inside][:, :3].mean(0) > estimate.mean[inside][:, :3].mean(0) + 0.05).all()
 
 
 def test_lamp_of_the_scene_casts_shadows_even_where_photographs_do_not(scene):
@@ -328,6 +327,13 @@ def test_colocated_means_every_light_is_at_its_camera(unit):
     assert not colocated(0.0, 0.01)
     assert not colocated(0.01, 0.0)
     assert not colocated(None, {"type": "directional", "direction": [0.0, 0.3, -1.0], "irradiance": 1.0})
+
+
+def test_a_direction_is_not_mistaken_for_a_position():
+    """Not even where its numbers are those of the camera's centre."""
+    pose = mi.ScalarTransform4f().look_at([0.6, 0.0, -0.8], [0, 0, 0], [0, 1, 0])
+    light = {"type": "directional", "direction": [0.6, 0.0, -0.8], "irradiance": 1.0}
+    assert not Photographs.of([mi.load_dict(photograph(0, light, to_world=pose))]).colocated
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,235 @@
+"""Gradients of `bridge.render` against central finite differences with the same seed, and the edges they rest on."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring import bridge
+from mi_ring.integrator import Photographs
+
+WIDTH, HEIGHT, COUNT = 35, 25, 2  # [px], photographs
+CENTER = np.array([0.3, -0.2, 0.15])
+OFF_CAMERA = [
+    {"type": "point", "position": [2.6, 1.4, 2.5], "intensity": {"type": "rgb", "value": [20.0, 16.0, 12.0]}},
+    {"type": "directional", "direction": [0.7, -0.5, -1.0], "irradiance": 2.0},
+]
+WALL = {
+    "type": "rectangle",
+    "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).rotate([0, 0, 1], 20).scale([0.9, 2.5, 1]),
+    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}},
+}
+
+
+class Setting:
+    """A bumpy ball off the origin, two photographs of it, and two losses: random weightings of radiance and coverage.
+
+    `unit` scales the world: lengths by `unit`, intensities by its square, so that the pictures stay the same.
+    """
+
+    def __init__(self, lights, shadows, wall=False, unit=1.0):
+        self.shadows, self.unit = shadows, unit
+        sensors = {f"sensor{k}": self.photograph(k, light) for k, light in enumerate(lights)}
+        ball = {"type": "shapenet", "id": "ball", "subdivisions": 3, "bsdf": {"type": "cooktorrance"}}
+        self.scene = mi.load_dict({"type": "scene", "ball": ball, **({"wall": WALL} if wall else {}), **sensors})
+        shape = next(s for s in self.scene.shapes() if s.id() == "ball")
+        self.surface = bridge.Surface(self.scene, shape)
+        self.photographs = Photographs.of(self.scene.sensors())
+        ico = trimesh.creation.icosphere(subdivisions=3)
+        self.s, self.faces = ico.vertices, ico.faces
+        self.surface.set_faces(self.faces)
+        x, y, z = self.s.T
+        bumps = 1 + 0.1 * np.sin(3 * x + 1) + 0.08 * np.cos(4 * y - z) - 0.1 * np.exp(-6 * (z - 0.7) ** 2 - 4 * x**2)
+        self.vertices = tensor(unit * (CENTER + 0.8 * self.s * bumps[:, None]))
+        diffuse = tensor(np.stack([0.3 + 0.2 * np.sin(2 * x), 0.25 + 0.1 * y, 0.2 + 0.1 * np.cos(3 * z)], -1))
+        self.material = diffuse, tensor(0.1 + 0.05 * np.sin(2 * y)), tensor(0.35 + 0.1 * np.cos(2 * x + z))
+        random = np.random.default_rng(8)
+        v, u = np.mgrid[:HEIGHT, :WIDTH]
+        tilt = 1 + 1.2 * np.sin(0.11 * u - 0.15 * v + 0.4)
+        self.radiance_weight = tensor(tilt[..., None] + random.uniform(-0.3, 0.3, (COUNT, HEIGHT, WIDTH, 3)))
+        self.coverage_weight = tensor(tilt[::-1] + random.uniform(-0.3, 0.3, (COUNT, HEIGHT, WIDTH)))
+
+    def photograph(self, k, light):
+        origin = [[1.4, 0.5, 3.2], [-1.1, 1.2, 3.0]][k]
+        matrix = np.array(mi.ScalarTransform4f().look_at(origin, [0.2, -0.1, 0.1], [0.3 - k, 1, 0.2]).matrix)
+        matrix[:3, 3] *= self.unit
+        light = light or {"type": "point", "position": origin, "intensity": {"type": "rgb", "value": [12.0, 10.0, 9.0]}}
+        if light["type"] == "point":
+            colour = {"type": "rgb", "value": [self.unit**2 * c for c in light["intensity"]["value"]]}
+            light = light | {"position": [self.unit * p for p in light["position"]], "intensity": colour}
+        return {
+            "type": "photograph", "id": f"{k:03}", "filename": "nowhere.png",
+            "fx": 34.0, "fy": 29.0 + k, "cx": 16.2 + k, "cy": 13.4, "to_world": mi.ScalarTransform4f(matrix),
+            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}, "light": light,
+        }  # fmt: skip
+
+    def losses(self, vertices, material, spp, seed):
+        rgb, alpha = bridge.render(self.surface, self.photographs, vertices, *material, spp, seed, self.shadows)
+        return (self.radiance_weight * rgb).sum(), (self.coverage_weight * alpha).sum()
+
+
+def tensor(array):
+    return torch.tensor(np.asarray(array), dtype=torch.float32)
+
+
+#: Motions (V, 3) of the vertices at domain points s [units per step].
+MOTIONS = {
+    "translation": lambda s: np.broadcast_to(np.array([0.5, 0.8, 0.33]), s.shape),
+    "scaling": lambda s: s,
+    "bump": lambda s: s * np.exp(-8 * ((s - [0.75, 0.6, 0.28]) ** 2).sum(1, keepdims=True)),
+}
+SETTINGS = {
+    "light off the camera": {"lights": OFF_CAMERA, "shadows": False},
+    "light off the camera, wall behind": {"lights": OFF_CAMERA, "shadows": False, "wall": True},
+    "flash at the camera, wall behind": {"lights": [None, None], "shadows": True, "wall": True},
+}
+
+
+def mean_and_error(values):
+    return np.mean(values, 0), np.std(values, 0, ddof=1) / np.sqrt(len(values))
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_gradients_of_vertices_equal_finite_differences(name):
+    """Of shading and outline together, for radiance and for coverage: within 3 % or 4 standard errors.
+
+    The step of 0.015 units is about 0.15 px: smaller ones are noisier, larger ones feel the weights of the next pixels.
+    """
+    setting, step = Setting(**SETTINGS[name]), 0.015
+    motions = [tensor(motion(setting.s)) for motion in MOTIONS.values()]
+    gradients, differences = [], []  # (seed, loss, motion)
+    for seed in range(24):
+        gradients.append([])
+        for which in range(2):
+            vertices = setting.vertices.clone().requires_grad_()
+            setting.losses(vertices, setting.material, 64, 100 + 7 * seed)[which].backward()
+            gradients[-1].append([(vertices.grad * motion).sum().item() for motion in motions])
+    for seed in range(4):
+        sides = [
+            [setting.losses(setting.vertices + d * motion, setting.material, 512, seed) for motion in motions]
+            for d in (step, -step)
+        ]
+        differences.append((np.array(sides[0]) - np.array(sides[1])).T / (2 * step))
+    (a, a_error), (b, b_error) = mean_and_error(gradients), mean_and_error(differences)
+    error = np.hypot(a_error, b_error)
+    report = f"gradients\n{a}\nfinite differences\n{b}\nstandard errors\n{error}"
+    print(report)
+    assert (error < 0.05 * np.abs(b)).all(), f"too noisy to tell: {report}"
+    assert (np.abs(a - b) < np.maximum(0.03 * np.abs(b), 4 * error)).all(), report
+
+
+def test_long_edges_seen_from_a_slant():
+    """Coverage of an icosahedron that stretches toward the camera, so that its edges are foreshortened."""
+    setting, step = Setting(**SETTINGS["light off the camera"]), 0.015
+    ico = trimesh.creation.icosphere(subdivisions=0)
+    vertices = tensor(CENTER + ico.vertices * [0.5, 0.5, 1.9])
+    setting.surface.set_faces(ico.faces)
+    setting.material = torch.full((12, 3), 0.4), torch.full((12,), 0.1), torch.full((12,), 0.4)
+    motion = tensor(ico.vertices[:, 2:] * [0.3, 0.4, 1])  # most for the vertices nearest to the camera and farthest
+    gradients, differences = [], []
+    for seed in range(100):
+        moved = vertices.clone().requires_grad_()
+        setting.losses(moved, setting.material, 1, seed)[1].backward()
+        gradients.append((moved.grad * motion).sum().item())
+    for seed in range(4):
+        high, low = (setting.losses(vertices + d * motion, setting.material, 512, seed)[1] for d in (step, -step))
+        differences.append((high - low).item() / (2 * step))
+    (a, a_error), (b, b_error) = mean_and_error(gradients), mean_and_error(differences)
+    error = np.hypot(a_error, b_error)
+    print(f"gradient {a:.4g}, finite difference {b:.4g} ± {error:.2g}")
+    assert error < 0.02 * abs(b)
+    assert abs(a - b) < max(0.02 * abs(b), 4 * error), f"gradient {a:.4g}, finite difference {b:.4g} ± {error:.2g}"
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("which", ["diffuse", "specular", "roughness"])
+def test_gradients_of_the_material_equal_finite_differences(name, which):
+    """The same rays hit the same points on both sides, so that only float32 sums and the step's square differ."""
+    setting, k = Setting(**SETTINGS[name]), ["diffuse", "specular", "roughness"].index(which)
+    motion = tensor(np.random.default_rng(k).uniform(0.3, 1, setting.material[k].shape))
+    material = [m.clone().requires_grad_() for m in setting.material]
+    loss, _ = setting.losses(setting.vertices, material, 16, 5)
+    loss.backward()
+    sides = []
+    for d in (0.01, -0.01):
+        moved = [m + d * motion if i == k else m for i, m in enumerate(setting.material)]
+        sides.append(setting.losses(setting.vertices, moved, 16, 5)[0])
+    difference = ((sides[0] - sides[1]) / 0.02).item()
+    assert (material[k].grad * motion).sum().item() == pytest.approx(difference, rel=5e-3)
+    assert abs(difference) > 1  # of a loss of some hundreds
+
+
+def test_coverage_does_not_depend_on_the_material():
+    setting = Setting(**SETTINGS["light off the camera"])
+    material = [m.clone().requires_grad_() for m in setting.material]
+    setting.losses(setting.vertices, material, 4, 1)[1].backward()
+    assert all((m.grad == 0).all() for m in material)
+
+
+def test_gradients_do_not_depend_on_the_unit_of_length():
+    gradients = []
+    for unit in (1.0, 1000.0):
+        setting = Setting(OFF_CAMERA, shadows=True, unit=unit)
+        vertices = setting.vertices.clone().requires_grad_()
+        sum(setting.losses(vertices, setting.material, 16, 3)).backward()
+        gradients.append(vertices.grad * unit)
+    # The same samples; some of them fall to the other side of an edge by rounding.
+    assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()
+
+
+def test_pictures_do_not_depend_on_whether_gradients_are_wanted():
+    setting = Setting(**SETTINGS["light off the camera"])
+    args = setting.surface, setting.photographs
+    with_gradients = bridge.render(*args, setting.vertices.clone().requires_grad_(), *setting.material, 4, 9)
+    plain = bridge.render(*args, setting.vertices, *setting.material, 4, 9)
+    drawn = bridge.draw(*args, 4, 9)
+    for a, b, c in zip(with_gradients, plain, drawn):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(b, c, rtol=0, atol=0)
+    rgb, alpha = drawn
+    assert rgb.shape == (COUNT, HEIGHT, WIDTH, 3) and alpha.shape == (COUNT, HEIGHT, WIDTH)
+    assert 0.1 < alpha.mean() < 0.9
+
+
+def test_gradient_of_a_picture_that_was_painted_over_is_refused():
+    """The surface holds one set of vertices: what a second picture has replaced cannot be differentiated any more."""
+    setting = Setting(**SETTINGS["light off the camera"])
+    vertices = setting.vertices.clone().requires_grad_()
+    loss, _ = setting.losses(vertices, setting.material, 4, 2)
+    setting.losses(setting.vertices + 0.1, setting.material, 4, 2)
+    with pytest.raises(RuntimeError, match="written again"):
+        loss.backward()
+
+
+# Edges.
+
+
+@pytest.mark.parametrize(
+    "mesh", [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.torus(3.0, 1.0, 7, 5)], ids=["ball", "torus"]
+)
+def test_edges_of_a_closed_mesh(mesh):
+    faces = np.random.default_rng(6).permutation(mesh.faces)
+    (v0, v1), (opposite0, opposite1) = ([np.array(a) for a in pair] for pair in bridge.edges_of(faces))
+    assert len(v0) == len(faces) * 3 // 2
+    assert set(map(frozenset, zip(v0.tolist(), v1.tolist()))) == set(map(frozenset, mesh.edges_unique.tolist()))
+    turned = {tuple(np.roll(face, k).tolist()) for face in faces for k in range(3)}
+    assert set(zip(v0.tolist(), v1.tolist(), opposite0.tolist())) <= turned
+    assert set(zip(v1.tolist(), v0.tolist(), opposite1.tolist())) <= turned
+
+
+def test_new_faces_come_with_new_vertices_and_attributes():
+    """Another resolution of the same ball makes the same picture, up to the facets."""
+    setting = Setting(**SETTINGS["light off the camera"])
+    pictures = []
+    for level in (3, 5):
+        ico = trimesh.creation.icosphere(subdivisions=level)
+        count = len(ico.vertices)
+        setting.surface.set_faces(ico.faces)
+        material = torch.full((count, 3), 0.4), torch.full((count,), 0.1), torch.full((count,), 0.4)
+        args = setting.surface, setting.photographs, tensor(CENTER + 0.8 * ico.vertices), *material
+        pictures.append(bridge.render(*args, 64, 4, False))
+    (coarse, coarse_alpha), (fine, fine_alpha) = pictures
+    # An icosphere of level 3 lies inside the ball by up to 1 % of its radius, which is 8 px.
+    assert (coarse_alpha - fine_alpha).abs().max() < 0.2
+    assert coarse.mean().item() == pytest.approx(fine.mean().item(), rel=0.02)
