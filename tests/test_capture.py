@@ -84,7 +84,7 @@ def test_sphere_of_cameras_is_near_the_object(broken_capture):
 def test_sphere_of_the_xml_wins(broken_capture):
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>',
-         '<bsdf type="cooktorrance"/><point name="center" x="1" y="2" z="3"/><float name="radius" value="4.5"/>')  # fmt: skip
+         '<bsdf type="cooktorrance"/><float name="radius" value="4.5"/><point name="center" x="1" y="2" z="3"/>')
     center, radius = capture.load(path).sphere()
     assert center.tolist() == [1, 2, 3] and radius == 4.5
 
@@ -140,9 +140,10 @@ BROKEN = {
                     '<scale value="2"/></transform><transform name="other"'), ["small.xml", "to_world", "scale"]),
     "spot light": (lambda path, edit: edit('<emitter type="point"><point name="position"',
                    '<emitter type="projector"><!-- '), ["small.xml"]),
-    "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><texture '
-                        'type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/></texture></bsdf>'),
-                        ["small.xml", "vertex_color"]),
+    "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance">'
+                        '<texture type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/>'
+                        '</texture></bsdf>'), ["small.xml", "vertex_color"]),
+    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["small.xml", "fy"]),
     "black photographs": (black, ["small.xml", "black"]),
     "empty mask": (empty_mask, ["005.png", "mask"]),
 }  # fmt: skip

@@ -125,7 +125,8 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
     folder = tmp_path / "run"
-    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), "--out", str(folder), *QUICK, "--iterations", "200"]
+    options = ["--out", str(folder), "--iterations", "200", *QUICK]
+    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), *options]
     process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
     while not ((folder / "log.jsonl").exists() and (folder / "log.jsonl").stat().st_size):
