@@ -88,7 +88,7 @@ class Photograph(mi.Sensor):
         width, height = (int(s) for s in self.film().size())
         for name in ("fx", "fy"):
             if not 0 < props[name] < np.inf:
-                raise ValueError(f'photograph "{props.id()}": {name} is {props[name]}, must be a focal length in pixels')
+                raise ValueError(f'photograph "{props.id()}": {name} is {props[name]}, must be a length in pixels')
         self.focal = mi.Point2f(props["fx"], props["fy"])
         self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)

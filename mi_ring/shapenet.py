@@ -43,7 +43,7 @@ class ShapeNet(nn.Module):
         dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
         layers = [*self.hidden, self.output]
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
-        return _Flow.apply(x, 1 / self.steps, steps, self.speed, dtype, *parameters)
+        return _Flow.apply(x, 1 / self.steps, steps, self.speed, dtype, torch.is_grad_enabled(), *parameters)
 
     def forward(self, x: Tensor) -> Tensor:
         """Φ(x, 1)"""
@@ -67,10 +67,10 @@ class _Flow(torch.autograd.Function):
     CHUNK = 2048  # points, at most
 
     @staticmethod
-    def forward(ctx, x, dt, steps, speed, dtype, *parameters):
+    def forward(ctx, x, dt, steps, speed, dtype, keep, *parameters):
         weights = [w.detach().to(dtype) for w in parameters[::2]]
         biases = [b.detach().to(dtype) for b in parameters[1::2]]
-        encode, keep = PosEnc(weights[0].shape[1] // 6), any(ctx.needs_input_grad)
+        encode = PosEnc(weights[0].shape[1] // 6)
 
         @torch.no_grad()
         def flow(x):
@@ -117,7 +117,7 @@ class _Flow(torch.autograd.Function):
         chunks, weight_sums, bias_sums = zip(*in_parallel(pull, gradient.split(ctx.chunk), ctx.kept))
         ctx.kept = None
         totals = [sum(parts) for pair in zip(zip(*weight_sums), zip(*bias_sums)) for parts in pair]
-        return torch.cat(chunks), None, None, None, None, *totals
+        return torch.cat(chunks), None, None, None, None, None, *totals
 
 
 def in_parallel(function, *arguments) -> list:

@@ -143,7 +143,7 @@ BROKEN = {
     "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance">'
                         '<texture type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/>'
                         '</texture></bsdf>'), ["small.xml", "vertex_color"]),
-    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["small.xml", "fy"]),
+    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["fy", "0"]),
     "black photographs": (black, ["small.xml", "black"]),
     "empty mask": (empty_mask, ["005.png", "mask"]),
 }  # fmt: skip
