@@ -34,7 +34,7 @@ class Config:
     """Settings that go together; each can be overridden. paper: the paper's own, days on a CPU."""
     seed: int = 0
     """Of every random choice."""
-    iterations: int = 300
+    iterations: int = 260
     """In all, shared out among the stages."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
