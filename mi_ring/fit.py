@@ -81,7 +81,7 @@ class Fit:
         photographs = self.capture.photographs.select(index, size, scale)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, diffuse, specular, roughness,
-            spp=config.spp, seed=self.iteration, shadows=self.capture.shadows,
+            spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)), shadows=self.capture.shadows,
         )  # fmt: skip
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}

@@ -100,7 +100,8 @@ class Photographs:
         cameras = np.stack([np.array(s.matrix).reshape(4, 4)[:3] for s in sensors])
         intrinsics = [[*np.array(s.focal).ravel(), *np.array(s.centre).ravel()] for s in sensors]
         lights = np.stack([light_row(s) for s in sensors])
-        off = np.abs(lights[:, :3] - cameras[:, :, 3]).max(1) > 1e-4 * np.abs(cameras[:, :, 3]).max()
+        # Equal but for the rounding of float32.
+        off = np.abs(lights[:, :3] - cameras[:, :, 3]).max(1) > 1e-6 * np.abs(cameras[:, :, 3]).max()
         return cls(
             mi.Float(cameras.astype(np.float32).ravel()),
             mi.Float(np.array(intrinsics, np.float32).ravel()),
