@@ -41,13 +41,12 @@ $(VENV)/bin/pip:
 	  rm -rf $$deb; fi
 
 fit: setup
-	$(RUN) mi_ring.fit $(SCENE) $(ARGS)
+	$(RUN) mi_ring.fit "$(SCENE)" $(ARGS)
 
 test: setup
 	$(RUN) pytest $(ARGS)
 
 lint: setup
-	@$(RUN) ruff --version >/dev/null 2>&1 || $(RUN) pip install ruff
 	$(RUN) ruff check .
 
 clean:

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from mi_ring import bridge, capture
-from mi_ring.capture import linear_to_srgb
+from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.results import load_ring
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     scene, ring = capture.load(arguments.run / "scene.xml"), load_ring(arguments.run)
     surface = bridge.Surface(scene.scene, scene.shape)
     k = arguments.photograph
-    photograph = scene.photographs.select([k], scene.sensors[k].size)
+    photograph = scene.photograph(k)
     s, faces = ring.domain.sample(6)
     surface.set_faces(faces)
     flow = []
@@ -45,7 +45,7 @@ def main() -> None:
         np.repeat(maps["roughness"][..., None], 3, 2),
     ]
     sheet = np.concatenate([np.concatenate(row, 1) for row in (flow, results)], 0)
-    Image.fromarray((np.clip(sheet, 0, 1) * 255 + 0.5).astype(np.uint8)).save(arguments.picture, optimize=True)
+    Image.fromarray(to_bytes(sheet)).save(arguments.picture, optimize=True)
 
 
 if __name__ == "__main__":

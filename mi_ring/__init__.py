@@ -1,7 +1,8 @@
 """From photographs to a watertight mesh with a spatially varying material, inside Mitsuba 3.
 
 `import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current
-variant of Mitsuba and for every one switched to later; it selects `llvm_ad_rgb` if none is selected yet.
+variant of Mitsuba and for every one switched to later, and the emitter `flash` through which other integrators see a
+photograph's light. It selects `llvm_ad_rgb` if no variant is selected yet.
 """
 
 import importlib

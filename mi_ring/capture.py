@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
 import torch
@@ -23,11 +24,15 @@ class Capture:
     shape: "mesh.ShapeNetMesh"
     sensors: list
     images: list[np.ndarray]  # (H, W, 3) uint8, uint16 or float32 each
+    linear: list[bool]  # are the encoded pixels linear radiance, or sRGB?
     masks: list[np.ndarray | None]  # (H, W) uint8, 0 background, 255 object
     shadows: bool
 
     def __post_init__(self):
         self.photographs = Photographs.of(self.sensors)
+        sizes = [sensor.size for sensor in self.sensors]
+        #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
+        self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
 
     def __len__(self) -> int:
         return len(self.sensors)
@@ -36,36 +41,35 @@ class Capture:
     def names(self) -> list[str]:
         return [sensor.filename.name for sensor in self.sensors]
 
-    def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Indices of the photographs of each size (width, height); one launch renders photographs of one size."""
-        sizes = [sensor.size for sensor in self.sensors]
-        return {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
+    def photograph(self, k: int, scale: int = 1) -> Photographs:
+        """Photograph `k` alone, to be rendered `scale` times smaller."""
+        return self.photographs.select([k], self.sensors[k].size, scale)
 
-    def observe(self, index, scale: int = 1) -> tuple[Tensor, Tensor, Tensor | None]:
+    def observe(self, index, scale: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Photographs `index`, box-filtered `scale` times smaller.
 
-        Returns linear radiance (n, H, W, 3), where it is clipped (n, H, W, 3) bool: the scene was at least this bright,
-        and the object's coverage (n, H, W) in [0, 1] or None if one of them has no mask.
+        Returns linear radiance (n, H, W, 3); where it is clipped (n, H, W, 3) bool, the scene being at least this
+        bright; the object's coverage (n, H, W) in [0, 1]; and which photographs have a mask (n,) bool, coverage being 0
+        where there is none.
         """
         decoded, clipped, covered = [], [], []
         for k in index:
-            linear, saturated = decode(self.images[k], self.sensors[k].linear, self.sensors[k].saturation)
+            linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
             decoded.append(torch.from_numpy(linear))
             clipped.append(torch.from_numpy(saturated))
-            covered.append(self.masks[k])
+            mask = np.zeros(linear.shape[:2], np.uint8) if self.masks[k] is None else self.masks[k]
+            covered.append(torch.from_numpy(mask))
         rgb = shrink(torch.stack(decoded), scale)
         saturated = shrink(torch.stack(clipped).float(), scale) > 0
-        if any(mask is None for mask in covered):
-            return rgb, saturated, None
-        mask = torch.from_numpy(np.stack(covered)).float()[..., None] / 255
-        return rgb, saturated, shrink(mask, scale)[..., 0]
+        mask = shrink(torch.stack(covered).float()[..., None] / 255, scale)[..., 0]
+        return rgb, saturated, mask, torch.tensor([self.masks[k] is not None for k in index])
 
     def exposure(self) -> float:
         """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks)."""
         total, count = 0.0, 0
         for k in range(len(self)):
-            rgb, _, mask = self.observe([k], 4)
-            inside = (mask[0] > 0.5) if mask is not None else rgb[0].mean(-1) > 0.02 * rgb.max()
+            rgb, _, mask, masked = self.observe([k], 4 if min(self.sensors[k].size) >= 16 else 1)
+            inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
         if not total > 0:
             raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
@@ -110,6 +114,11 @@ def linear_to_srgb(v):
     """The inverse of `srgb_to_linear`, clipped to [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def to_bytes(encoded: np.ndarray) -> np.ndarray:
+    """[0, 1] to uint8."""
+    return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def shrink(images: Tensor, scale: int) -> Tensor:
@@ -209,9 +218,10 @@ def load(path: str | Path, images: bool = True) -> Capture:
         for shape in scene.shapes():
             check_attributes(shape)
         pixels = [read_image(s, path) for s in sensors] if images else []
+        linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
         masks = [read_mask(s, path) for s in sensors] if images else []
         shadows = getattr(scene.integrator(), "shadows", True)
-        return Capture(path, scene, shapes[0], sensors, pixels, masks, shadows)
+        return Capture(path, scene, shapes[0], sensors, pixels, linear, masks, shadows)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{path}: {error}") from error
 
@@ -224,47 +234,46 @@ def reason(error: RuntimeError) -> str:
     return " ".join(text.split())
 
 
-def read_bitmap(path: Path, field: str, scene: Path) -> mi.Bitmap:
-    """An image file; `field` and `scene` say who asks for it."""
+def read_pixels(path: Path, field: str, sensor, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32, all the bits that the file has.
+
+    Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
+    """
+    field = f'photograph "{sensor.id()}", {field}'
     if not path.is_file():
         raise InputError(f"{scene}: {field}: no such file: {path}")
     try:
-        return mi.Bitmap(str(path))
-    except RuntimeError as error:
-        raise InputError(f"{path}: {field}: cannot be read as an image ({str(error).splitlines()[0]})") from error
+        # imageio reads PNGs of 16 bits as 8, silently; Mitsuba reads no TIFF.
+        tiff = path.suffix.lower() in (".tif", ".tiff")
+        pixels = np.array(imageio.imread(path) if tiff else mi.Bitmap(str(path)), copy=True)
+    except Exception as error:
+        raise InputError(f"{path}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
+    expected, found = sensor.size, pixels.shape[1::-1]
+    if found != expected:
+        found, expected = ("{} x {}".format(*size) for size in (found, expected))
+        raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+        if not np.isfinite(pixels).all():
+            raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
+    return pixels if pixels.ndim == 3 else pixels[:, :, None]
 
 
 def read_image(sensor, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph: uint8, uint16 or float32."""
-    field = f'photograph "{sensor.id()}", filename'
-    bitmap = read_bitmap(sensor.filename, field, scene)
-    check_size(sensor.filename, field, tuple(bitmap.size()), sensor.size)
-    pixels = np.array(bitmap, copy=True)
-    if pixels.dtype not in (np.uint8, np.uint16):
-        pixels = pixels.astype(np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    if pixels.dtype == np.float32 and not np.isfinite(pixels).all():
-        raise InputError(f"{sensor.filename}: {field}: contains NaN or infinite pixels")
-    sensor.linear = sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
+    """Encoded pixels (H, W, 3) of a photograph; one without colours is grey."""
+    pixels = read_pixels(sensor.filename, "filename", sensor, scene)
     return pixels[:, :, :3] if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
+
+
+def is_linear(sensor, pixels: np.ndarray) -> bool:
+    """Is this image linear radiance? As its photograph says, else 8-bit files are not and others are."""
+    return sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
 
 
 def read_mask(sensor, scene: Path) -> np.ndarray | None:
     """Mask (H, W) uint8 of a photograph, None if it has none."""
     if sensor.mask is None:
         return None
-    field = f'photograph "{sensor.id()}", mask'
-    bitmap = read_bitmap(sensor.mask, field, scene)
-    check_size(sensor.mask, field, tuple(bitmap.size()), sensor.size)
-    pixels = np.array(bitmap, copy=True)
-    if pixels.dtype != np.uint8:
-        pixels = (pixels.astype(np.float32) * (255 / 65535 if pixels.dtype == np.uint16 else 255)).astype(np.uint8)
-    return pixels if pixels.ndim == 2 else pixels[:, :, 0]
-
-
-def check_size(path: Path, field: str, found: tuple, expected: tuple) -> None:
-    """Raise InputError unless an image is as large as the film of its photograph."""
-    if tuple(map(int, found)) != tuple(map(int, expected)):
-        found, expected = ("{} x {}".format(*size) for size in (found, expected))
-        raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
+    pixels = read_pixels(sensor.mask, "mask", sensor, scene)[:, :, 0]
+    full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
+    return (pixels.astype(np.float32) * (255 / full)).round().astype(np.uint8)

@@ -29,13 +29,15 @@ def complaint_in(box: str) -> str:
     """The complaint, in one line, of the box that tyro draws: a title, the complaint, a rule, advice."""
     lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
     rules = [number for number, line in enumerate(lines) if set(line) == {"─"}]
-    return " ".join(lines[: rules[0]] if rules else lines)
+    return " ".join(lines[: rules[0]] if rules else lines) or " ".join(box.split())
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: status 2 and one line on standard error for anything the user can mend."""
     try:
         sys.exit(main(sys.argv[1:] if arguments is None else arguments) or 0)
+    except KeyboardInterrupt:
+        sys.exit(130)
     except InputError as error:
         print(f"{program}: {error}", file=sys.stderr)
         sys.exit(2)

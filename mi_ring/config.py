@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -27,7 +28,7 @@ class Config:
     scene: Positional[Path]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
-    """Folder of the results. Default: out/<scene name>."""
+    """Folder of the results. Default: out/<name>, the name of the scene file, or of its folder if it is scene.xml."""
     resume: bool = False
     """Go on from the folder's checkpoint.pt. Give the same settings as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
@@ -78,24 +79,33 @@ class Config:
 
         for name in ("iterations", "batch", "spp"):
             require(getattr(self, name) >= 1, name, "at least 1")
-        for name in ("seed", "threads", "blur", "laplacian_scale"):
-            require(getattr(self, name) >= 0, name, "0 or more")
+        require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
+        for name in ("threads", "blur", "laplacian_scale"):
+            require(0 <= getattr(self, name) < math.inf, name, "0 or more")
         for name in ("learning_rate", "muon_rate", "decay"):
-            require(getattr(self, name) > 0, name, "above 0")
+            require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
         for name in ("widths", "shares"):
             value = getattr(self, name)
             require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
-            require(all(v > 0 for v in value), name, "above 0")
+            require(all(0 < v < math.inf for v in value), name, "above 0")
         unknown = set(self.weights) - {"rgb", "mask", "velocity"}
         require(not unknown, "weights", "of rgb, mask and velocity")
+        require(all(0 <= w < math.inf for w in self.weights.values()), "weights", "0 or more")
+
+    @property
+    def name(self) -> str:
+        """Of the scene: that of the file, or of its folder where the file is just called scene.xml."""
+        return self.scene.stem if self.scene.stem != "scene" else self.scene.resolve().parent.name
 
     @property
     def folder(self) -> Path:
-        return self.out or Path("out") / self.scene.stem
+        """Where the results go."""
+        return self.out or Path("out") / self.name
 
     def stages(self) -> list[Stage]:
+        """Those stages that get at least one iteration, in order."""
         total, done, first, stages = sum(self.shares), 0.0, 0, []
         for level, width, share in zip(self.levels, self.widths, self.shares):
             done += share
@@ -110,6 +120,7 @@ class Config:
         return {key: value for key, value in plain.items() if key not in ("scene", "out", "resume", "threads")}
 
     def to_json(self) -> str:
+        """Every option as used."""
         return json.dumps(dataclasses.asdict(self), indent=2, default=str)
 
 
@@ -118,7 +129,9 @@ PRESETS = {
     "default": {},
     "fine": {"iterations": 1200, "shares": (0.3, 0.4, 0.3)},
     "paper": {
-        "iterations": 6000, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "batch": 48, "spp": 4,
-        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "precision": "float32",
+        "iterations": 6000, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
+        "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
+        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0,
+        "precision": "float32",
     },
 }  # fmt: skip

@@ -11,10 +11,11 @@ import trimesh
 from tyro.conf import Positional
 
 from mi_ring import bridge, capture, command
-from mi_ring.capture import linear_to_srgb
+from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, center_rays
 from mi_ring.results import load_ring
+from mi_ring.ring import Ring
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def load_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:
-        raise InputError(f"{path}: cannot be read as a mesh ({str(error).splitlines()[0]})") from error
+        raise InputError(f"{path}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams split vertices; shading normals are per position
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True)
     params = mi.traverse(shape)
@@ -58,8 +59,8 @@ def compare_surfaces(scene: capture.Capture, guess: mi.Scene, truth: mi.Scene, d
     Normals and depths count where both surfaces are seen; `iou` is the mean over views.
     """
     angles, depths, ious = [], [], []
-    for k, sensor in enumerate(scene.sensors):
-        photograph = scene.photographs.select([k], sensor.size)
+    for k in range(len(scene)):
+        photograph = scene.photograph(k)
         (seen, t, n), (true_seen, true_t, true_n) = hits(guess, photograph), hits(truth, photograph)
         both = seen & true_seen
         ious.append(both.sum() / max(1, (seen | true_seen).sum()))
@@ -74,15 +75,14 @@ def compare_surfaces(scene: capture.Capture, guess: mi.Scene, truth: mi.Scene, d
     }  # fmt: skip
 
 
-def psnr(scene: capture.Capture, ring, spp: int, subdivisions: int = 6) -> float:
+def psnr(scene: capture.Capture, ring: Ring, subdivisions: int, spp: int) -> float:
     """Of all pixels of all photographs [dB]: predictions as 8-bit sRGB against the files, sRGB in [0, 1]."""
     surface = bridge.Surface(scene.scene, scene.shape)
     surface.show(ring, *ring.domain.sample(subdivisions))
     errors = []
-    for k, sensor in enumerate(scene.sensors):
-        photograph = scene.photographs.select([k], sensor.size)
-        rgb, _ = bridge.draw(surface, photograph, spp=spp, seed=k, shadows=scene.shadows)
-        predicted = np.round(linear_to_srgb(rgb[0].numpy()) * 255) / 255
+    for k in range(len(scene)):
+        rgb, _ = bridge.draw(surface, scene.photograph(k), spp=spp, shadows=scene.shadows)
+        predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
         errors.append(np.mean((predicted - linear_to_srgb(scene.observe([k])[0][0].numpy())) ** 2))
     return float(-10 * np.log10(np.mean(errors)))
 
@@ -90,20 +90,24 @@ def psnr(scene: capture.Capture, ring, spp: int, subdivisions: int = 6) -> float
 def evaluate(run: Path, mesh: Path, novel: Path | None = None, spp: int = 16) -> dict[str, float]:
     """The paper's columns for the results folder `run`."""
     ring = load_ring(run)
+    subdivisions = json.loads((run / "config.json").read_text())["subdivisions"]
     scene = capture.load(run / "scene.xml")
+    unseen = novel and capture.load(novel)
     truth_mesh, truth = load_mesh(mesh)
     _, guess = load_mesh(run / "mesh.ply")
     numbers = compare_surfaces(scene, guess, truth, float(np.linalg.norm(truth_mesh.extents)))
-    numbers["psnr_input"] = psnr(scene, ring, spp)
-    if novel:
-        numbers["psnr_novel"] = psnr(capture.load(novel), ring, spp)
+    numbers["psnr_input"] = psnr(scene, ring, subdivisions, spp)
+    if unseen:
+        numbers["psnr_novel"] = psnr(unseen, ring, subdivisions, spp)
     return numbers
 
 
 def main(arguments: Sequence[str]) -> None:
     """The command."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
-    for name in ("scene.xml", "mesh.ply"):
+    if config.spp < 1:
+        raise InputError(f"--spp: is {config.spp}, must be at least 1")
+    for name in ("scene.xml", "mesh.ply", "config.json"):
         if not (config.run / name).is_file():
             raise InputError(f"{config.run}: has no {name}; give the results folder of a finished fit")
     numbers = evaluate(config.run, config.mesh, config.novel, config.spp)

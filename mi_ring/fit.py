@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import hashlib
 import json
 import os
 import signal
@@ -41,6 +42,7 @@ class Fit:
         self.stages = config.stages()
         self.autocast = autocast(config.precision)
         self.iteration, self.seconds, self.stage = 0, 0.0, None
+        self.failures = 0  # gradients in a row that were not finite
 
     def deform(self, s):
         """Surface points and their reflectance at domain points (V, 3)."""
@@ -51,7 +53,7 @@ class Fit:
         """Indices of the photographs of one iteration, all of one size (width, height)."""
         first = int(torch.randint(len(self.capture), (), generator=self.random))
         size = self.capture.sensors[first].size
-        alike = self.capture.sizes()[size]
+        alike = self.capture.sizes[size]
         order = torch.randperm(len(alike), generator=self.random)[: self.config.batch]
         return alike[order.numpy()], size
 
@@ -65,7 +67,7 @@ class Fit:
         return losses.velocity_loss(net.velocity, x, self.config.laplacian_scale)
 
     def step(self) -> dict[str, float]:
-        """One iteration: sample the domain, deform, render, weigh, step. Returns the unweighted terms of the loss."""
+        """One iteration: sample the domain, deform, render, weigh, step. Returns the loss and its unweighted terms."""
         config = self.config
         started = time.perf_counter()
         self.enter_stage()
@@ -76,8 +78,8 @@ class Fit:
         vertices, diffuse, specular, roughness = self.deform(s)
 
         index, size = self.choose()
-        scale = max(1, round(size[0] / self.stage.width))
-        observed, clipped, mask = self.capture.observe(index, scale)
+        scale = -(-size[0] // self.stage.width)
+        observed, clipped, mask, masked = self.capture.observe(index, scale)
         photographs = self.capture.photographs.select(index, size, scale)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, diffuse, specular, roughness,
@@ -85,9 +87,9 @@ class Fit:
         )  # fmt: skip
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
-        if mask is not None and config.weights.get("mask"):
+        if masked.any() and config.weights.get("mask"):
             sigma = config.blur * (1 - 1.25 * progress) * size[0] / scale
-            terms["mask"] = losses.mask_loss(coverage, mask, max(1.0, sigma))
+            terms["mask"] = losses.mask_loss(coverage[masked], mask[masked], max(1.0, sigma))
         if config.weights.get("velocity"):
             terms["velocity"] = self.regulariser(s)
         loss = sum(config.weights.get(name, 0.0) * term for name, term in terms.items())
@@ -95,14 +97,19 @@ class Fit:
         for optimizer in self.optimizers:
             optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.ring.shape_net.parameters(), 1.0, error_if_nonfinite=True)
+        clip = torch.nn.utils.clip_grad_norm_
+        norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
+        self.failures = 0 if norm.isfinite() else self.failures + 1
+        if self.failures >= 10:
+            raise InputError(f"{config.scene}: diverged at iteration {self.iteration}; try a lower --muon-rate")
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * config.decay**progress
-            optimizer.step()
+            if norm.isfinite():
+                optimizer.step()
         self.iteration += 1
         self.seconds += time.perf_counter() - started
-        return {name: float(term.detach()) for name, term in terms.items()}
+        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
 
     def enter_stage(self):
         """Take up the stage that the iteration belongs to."""
@@ -114,6 +121,7 @@ class Fit:
     def state(self) -> dict:
         return {
             "settings": self.config.settings(),
+            "scene": digest(self.config.scene),
             "ring": self.ring.state(),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "random": self.random.get_state(),
@@ -134,11 +142,18 @@ class Fit:
             if before.get(name) != value:
                 raise InputError(f"{path}: --{name.replace('_', '-')}: was {before.get(name)} before, is {value} now; "
                                  "give the same settings to resume, or start anew without --resume")  # fmt: skip
+        if state["scene"] != digest(self.config.scene):
+            raise InputError(f"{path}: --resume: was made from another scene file than {self.config.scene}")
         self.ring.load_state_dict(state["ring"]["networks"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.iteration, self.seconds = state["iteration"], state["seconds"]
+
+
+def digest(file: Path) -> str:
+    """What tells one scene file from another."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def optimizers(ring: Ring, config: Config) -> list[torch.optim.Optimizer]:
@@ -201,13 +216,12 @@ def train(fit: Fit, folder: Path, interrupted) -> None:
         while fit.iteration < fit.config.iterations and not interrupted():
             terms = fit.step()
             stage = fit.stages.index(fit.stage) + 1
-            loss = sum(fit.config.weights.get(name, 0.0) * value for name, value in terms.items())
             where = f"stage {stage}/{len(fit.stages)}, iteration {fit.iteration}/{fit.config.iterations}"
             bar.set_description_str(where, refresh=False)
-            bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
+            bar.set_postfix_str(f"loss {terms['loss']:.4f}", refresh=False)
             bar.update(work[fit.iteration - 1])
             if fit.iteration % LOG_EVERY == 0 or fit.iteration == fit.config.iterations:
-                entry = {"iteration": fit.iteration, "seconds": round(fit.seconds, 3), "loss": loss, **terms,
+                entry = {"iteration": fit.iteration, "seconds": round(fit.seconds, 3), **terms,
                          "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": stage,
                          "vertices": vertices[fit.stage.level]}  # fmt: skip
                 log.write(json.dumps(entry) + "\n")
@@ -227,24 +241,29 @@ def main(arguments: Sequence[str]) -> int:
     folder = config.folder
     if config.resume:
         fit.restore(folder / "checkpoint.pt")
+    fitted_scene = results.scene_xml(config.scene, folder, config.subdivisions)
     results.prepare(folder, config)
     with interruptible() as interrupted:
         print(f"{len(scene)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
         if not config.resume:
             results.write_inputs(folder / "inputs.png", fit)
-        train(fit, folder, interrupted)
-        results.write(folder, fit)
-        if interrupted():
-            print(f"Stopped at iteration {fit.iteration} of {config.iterations}; go on with --resume")
-            return 130
+        try:
+            train(fit, folder, interrupted)
+        except Exception:
+            results.write(folder, fit, fitted_scene)
+            raise
+        results.write(folder, fit, fitted_scene)
+    if fit.iteration < config.iterations:
+        print(f"Stopped at iteration {fit.iteration} of {config.iterations}; go on with the same command and --resume")
+        return 130
     return 0
 
 
 def parse(arguments: Sequence[str]) -> Config:
     """The configuration: the preset's settings under those given on the command line."""
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
-    early.add_argument("--preset", default="default")
-    preset = early.parse_known_args([a for a in arguments if a != "--help"])[0].preset
+    early.add_argument("--preset", nargs="?", default="default")
+    preset = early.parse_known_args(arguments)[0].preset
     return command.parse(Config, arguments, "mi_ring.fit", Config(tyro.MISSING, **PRESETS.get(preset, {})))
 
 

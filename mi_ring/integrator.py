@@ -31,8 +31,10 @@ class Photometric(ADIntegrator):
 
     Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
 
-    What it does not do: interreflection. Gradients through plain ``mi.render`` are those of shading inside the outline;
-    the fit renders many photographs per launch with `render_photographs` and `backward_edges`, which add the outline.
+    What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
+    about the photographs' own lights, others always cast shadows. Gradients through plain ``mi.render`` are those of
+    shading inside the outline; the fit renders many photographs per launch with `render_photographs` and
+    `backward_edges`, which add the outline.
 
     .. code-block:: xml
 
@@ -158,6 +160,8 @@ def light_row(sensor):
     else:
         raise ValueError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
     strength = np.broadcast_to(np.array(strength).ravel(), 3)
+    if not (np.isfinite(strength).all() and strength.min() >= 0 and strength.max() > 0):
+        raise ValueError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
     return np.array([*np.array(where).ravel(), kind != "PointLight", *strength, 0.0])
 
 

@@ -7,6 +7,7 @@ import trimesh
 
 from mi_ring.bsdf import ATTRIBUTES, check_attributes
 from mi_ring.domain import Domain, Sphere
+from mi_ring.photograph import beside_scene
 from mi_ring.ring import Ring
 
 # Mitsuba's names of mesh parameters; 3.10 renames them.
@@ -47,7 +48,6 @@ class ShapeNetMesh(mi.Mesh):
     """
 
     def __init__(self, props):
-        resolver = mi.file_resolver()
         self.subdivisions = props.get("subdivisions", 5)
         if not 0 <= self.subdivisions <= 8:
             raise ValueError(f'shapenet "{props.id()}": subdivisions is {self.subdivisions}, must be 0 to 8')
@@ -67,8 +67,11 @@ class ShapeNetMesh(mi.Mesh):
             raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
         self.domain = Sphere()
         if "domain" in given:
-            mesh = trimesh.load(str(resolver.resolve(given["domain"])), force="mesh")
-            if not mesh.is_watertight:
+            try:
+                mesh = trimesh.load(beside_scene(given["domain"]), force="mesh")
+            except Exception as error:
+                raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is no mesh: {error}') from error
+            if not (mesh.is_watertight and mesh.is_winding_consistent):
                 raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is not a closed surface')
             if mesh.volume < 0:
                 mesh.invert()
@@ -76,7 +79,7 @@ class ShapeNetMesh(mi.Mesh):
             self.radius = self.radius or float(np.linalg.norm(mesh.vertices - self.center, axis=1).mean())
             self.domain = Domain((mesh.vertices - self.center) / self.radius, mesh.faces)
         center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
-        self.ring = Ring.load(str(resolver.resolve(given["weights"]))) if "weights" in given else None
+        self.ring = Ring.load(beside_scene(given["weights"])) if "weights" in given else None
 
         material = torch.tensor([0.5, 0.5, 0.5]), torch.tensor(0.0), torch.tensor(0.5)
         if self.ring is None:
@@ -92,7 +95,7 @@ class ShapeNetMesh(mi.Mesh):
         if np.linalg.det(to_world[:3, :3]) < 0:
             faces = np.fliplr(faces)  # a mirror would turn the surface inside out
 
-        super().__init__(props.id(), len(vertices), len(faces), props, True, False)
+        super().__init__(props.id() or "object", len(vertices), len(faces), props, True, False)
         params = mi.traverse(self)
         # Scalar variants have array types of their own.
         params[POSITIONS] = type(params[POSITIONS])(vertices.numpy().ravel())

@@ -10,6 +10,11 @@ SHUTTER = -1.0  #: time of a photograph's rays, by which the flash knows them fr
 FAR = 1e9  #: distance of a directional light [scene units]
 
 
+def beside_scene(name: str) -> Path:
+    """A file that a scene names, relative to the scene's own folder (to the working directory outside of a file)."""
+    return Path(str(mi.file_resolver()[0])) / name
+
+
 def camera_ray(to_world, focal, centre, pixel):
     """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
 
@@ -60,7 +65,7 @@ class Photograph(mi.Sensor):
 
     Every integrator sees the nested light while it renders this sensor, through the `flash` emitter that a `shapenet`
     shape carries. What it does not do: depth of field, lens distortion, motion blur; light tracing integrators
-    (``ptracer``) cannot see the nested light.
+    (``ptracer``) and the ``batch`` sensor cannot see the nested light.
 
     .. code-block:: xml
 
@@ -77,9 +82,11 @@ class Photograph(mi.Sensor):
 
     def __init__(self, props):
         super().__init__(props)
-        resolver = mi.file_resolver()
-        self.filename = Path(str(resolver.resolve(props["filename"])))
-        self.mask = Path(str(resolver.resolve(props["mask"]))) if "mask" in props else None
+        for name in ("filename", "fx", "fy"):
+            if name not in props:
+                raise ValueError(f'photograph "{props.id()}": {name} is missing')
+        self.filename = beside_scene(props["filename"])
+        self.mask = beside_scene(props["mask"]) if "mask" in props else None
         self.encoding = props.get("encoding", "auto")
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
@@ -87,7 +94,7 @@ class Photograph(mi.Sensor):
 
         width, height = (int(s) for s in self.film().size())
         for name in ("fx", "fy"):
-            if not 0 < props[name] < np.inf:
+            if isinstance(props[name], str) or not 0 < props[name] < np.inf:
                 raise ValueError(f'photograph "{props.id()}": {name} is {props[name]}, must be a length in pixels')
         self.focal = mi.Point2f(props["fx"], props["fy"])
         self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))

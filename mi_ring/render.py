@@ -11,7 +11,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 from mi_ring import bridge, capture, command
-from mi_ring.capture import linear_to_srgb
+from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.results import load_ring
 
@@ -25,7 +25,7 @@ class RenderConfig:
     scene: Positional[Path]
     """Mitsuba XML file with the photographs to take; their image files need not exist."""
     out: Positional[Path]
-    """Folder for the pictures: 8-bit sRGB PNG, or linear EXR where the scene names an EXR file."""
+    """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG."""
     subdivisions: int = 6
     """Level of the mesh: 10 · 4^level + 2 vertices."""
     spp: int = 64
@@ -44,6 +44,11 @@ def main(arguments: Sequence[str]) -> None:
     doubles = {name for name in scene.names if scene.names.count(name) > 1}
     if doubles:
         raise InputError(f"{config.scene}: filename: {min(doubles)} occurs twice; pictures would overwrite each other")
+    for sensor in scene.sensors:
+        if sensor.filename.suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):
+            raise InputError(f"{config.scene}: filename: {sensor.filename.name} must end in .png, .jpg or .exr")
+        if (config.out / sensor.filename.name).resolve() == sensor.filename.resolve():
+            raise InputError(f"{config.out}: holds the scene's own photographs; choose another folder")
     try:
         config.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -51,8 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     surface = bridge.Surface(scene.scene, scene.shape)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
     for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
-        photograph = scene.photographs.select([k], sensor.size)
-        rgb, _ = bridge.draw(surface, photograph, spp=config.spp, seed=k, shadows=scene.shadows)
+        rgb, _ = bridge.draw(surface, scene.photograph(k), spp=config.spp, shadows=scene.shadows)
         write_picture(rgb[0].numpy(), config.out / sensor.filename.name)
     print(f"{len(scene.sensors)} photographs in {config.out}/")
 
@@ -62,7 +66,7 @@ def write_picture(linear: np.ndarray, path: Path) -> None:
     if path.suffix.lower() == ".exr":
         bitmap = mi.Bitmap(linear.astype(np.float32))
     else:
-        bitmap = mi.Bitmap((linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8))
+        bitmap = mi.Bitmap(to_bytes(linear_to_srgb(linear)))
     partial = path.with_name(f".partial.{path.name}")
     bitmap.write(str(partial))
     os.replace(partial, path)

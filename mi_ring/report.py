@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from mi_ring import bridge
-from mi_ring.capture import linear_to_srgb
+from mi_ring.capture import linear_to_srgb, to_bytes
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -50,19 +50,17 @@ def html(fit, log: list[dict]) -> str:
     template = resources.files("mi_ring").joinpath("report.html.jinja").read_text()
     environment = jinja2.Environment(autoescape=True)
     return environment.from_string(template).render(
-        name=capture.path.stem, rows=rows, numbers=numbers, curve=loss_curve(log), settings=fit.config.settings()
+        name=fit.config.name, rows=rows, numbers=numbers, curve=loss_curve(log), settings=fit.config.settings()
     )
 
 
 def compare(fit, k: int, name: str) -> tuple[Row, float]:
     """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
     capture = fit.capture
-    size = capture.sensors[k].size
-    photograph = capture.photographs.select([k], size)
-    observed, _, mask = capture.observe([k])
-    predicted, coverage = bridge.draw(fit.surface, photograph, spp=4, seed=k, shadows=capture.shadows)
+    observed, _, mask, masked = capture.observe([k])
+    predicted, coverage = bridge.draw(fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows)
     photo, guess = linear_to_srgb(observed[0].numpy()), linear_to_srgb(predicted[0].numpy())
-    small = capture.photographs.select([k], size, max(1, max(size) // THUMBNAIL))
+    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // THUMBNAIL))
     maps = {key: m[0] for key, m in bridge.maps(fit.surface, small).items()}
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
     scale = 2.5 * float(fit.ring.brdf_net.scale)
@@ -76,7 +74,7 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
         "roughness": maps["roughness"],
     }
     iou = None
-    if mask is not None:
+    if masked:
         inside, found = mask[0].numpy() > 0.5, coverage[0].numpy() > 0.5
         iou = float((inside & found).sum() / max(1, (inside | found).sum()))
     error = float(np.mean((photo - guess) ** 2))
@@ -86,7 +84,7 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
 
 def data_uri(picture: np.ndarray) -> str:
     """An (H, W) or (H, W, 3) picture in [0, 1] as a JPEG thumbnail."""
-    image = Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    image = Image.fromarray(to_bytes(picture))
     image.thumbnail((THUMBNAIL, THUMBNAIL))
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=88)

@@ -12,7 +12,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from mi_ring import bridge, report
-from mi_ring.capture import Capture, linear_to_srgb
+from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.config import Config
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
@@ -35,8 +35,11 @@ def save(state: dict, path: Path) -> None:
 def prepare(folder: Path, config: Config) -> None:
     """Make the folder and write config.json. A folder that holds another result is moved aside, not overwritten.
 
-    Raises InputError if the folder cannot be written.
+    Raises InputError if the folder cannot be written or holds the scene.
     """
+    folder = folder.resolve()
+    if folder in config.scene.resolve().parents:
+        raise InputError(f"{folder}: --out: holds the scene file {config.scene.name} itself; choose another folder")
     try:
         if not config.resume and any((folder / name).exists() for name in ("ring.pt", "checkpoint.pt")):
             aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
@@ -51,22 +54,15 @@ def prepare(folder: Path, config: Config) -> None:
 def open_log(folder: Path, iteration: int):
     """log.jsonl, open for more lines, without those after `iteration`: they will be written again."""
     path = folder / "log.jsonl"
-    lines = path.read_text().splitlines(keepends=True) if iteration and path.exists() else []
-    replace(path, "".join(line for line in lines if json.loads(line)["iteration"] <= iteration))
+    entries = read_log(folder) if iteration and path.exists() else []
+    replace(path, "".join(json.dumps(entry) + "\n" for entry in entries if entry["iteration"] <= iteration))
     return path.open("a")
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The entries of log.jsonl."""
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-
-
-def predict(surface: bridge.Surface, capture: Capture, k: int, spp: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Photograph `k` as the surface predicts it: ((H, W, 3) linear radiance, (H, W) coverage)."""
-    photograph = capture.photographs.select([k], capture.sensors[k].size)
-    with torch.no_grad():
-        rgb, coverage = bridge.draw(surface, photograph, spp=spp, seed=k, shadows=capture.shadows)
-    return rgb[0].numpy(), coverage[0].numpy()
+    """The entries of log.jsonl; a line that was cut off when the process was killed is none."""
+    lines = (folder / "log.jsonl").read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("}\n")]
 
 
 def write_inputs(path: Path, fit) -> None:
@@ -78,11 +74,9 @@ def write_inputs(path: Path, fit) -> None:
     cell = 160
     sheet = Image.new("RGB", (columns * cell, -(-len(fit.capture) // columns) * cell))
     for k, name in enumerate(fit.capture.names):
-        width, height = fit.capture.sensors[k].size
-        scale = max(1, max(width, height) // cell)
-        observed, _, _ = fit.capture.observe([k], scale)
-        small = fit.capture.photographs.select([k], (width, height), scale)
-        _, coverage = bridge.draw(fit.surface, small, spp=4, seed=0, shadows=False)
+        scale = max(1, max(fit.capture.sensors[k].size) // cell)
+        observed = fit.capture.observe([k], scale)[0]
+        _, coverage = bridge.draw(fit.surface, fit.capture.photograph(k, scale), spp=4, shadows=False)
         tint = 0.35 * coverage[0, ..., None].numpy() * np.array([0.1, 1.0, 0.2])
         picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
         picture.thumbnail((cell, cell))
@@ -93,16 +87,11 @@ def write_inputs(path: Path, fit) -> None:
     replace(path, buffer.getvalue())
 
 
-def to_bytes(encoded: np.ndarray) -> np.ndarray:
-    """[0, 1] to uint8."""
-    return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def write(folder: Path, fit) -> None:
+def write(folder: Path, fit, fitted_scene: bytes) -> None:
     """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
     save(fit.ring.state(fit.config.settings()), folder / "ring.pt")
     write_mesh(folder / "ring.pt", fit.config.subdivisions, folder / "mesh.ply")
-    replace(folder / "scene.xml", scene_xml(fit.config.scene, folder, fit.config.subdivisions))
+    replace(folder / "scene.xml", fitted_scene)
     s, faces = fit.ring.domain.sample(fit.config.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     replace(folder / "report.html", report.html(fit, read_log(folder)))
@@ -118,14 +107,22 @@ def write_mesh(weights: Path, subdivisions: int, path: Path) -> None:
 
 
 def scene_xml(source: Path, folder: Path, subdivisions: int) -> bytes:
-    """The scene file `source` with the fitted object, its references rewritten to be relative to `folder`."""
+    """The scene file `source` with the fitted object, its references rewritten to be relative to `folder`.
+
+    Raises InputError for a scene that cannot be rewritten, and for a shapenet that a fit has no use for.
+    """
     tree = ElementTree.parse(source)
+    for tag in ("include", "default", "path"):
+        if tree.find(f".//{tag}") is not None:
+            raise InputError(f"{source}: <{tag}>: a fit needs a scene without it; write out what it stands for")
     for element in tree.iter("string"):
         file = source.parent / element.get("value", "")
         if element.get("value") and file.is_file():
             element.set("value", Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
     shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
     for element in list(shape):
+        if element.get("name") in ("weights", "to_world"):
+            raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
         if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
             shape.remove(element)
     ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))

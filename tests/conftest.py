@@ -74,7 +74,7 @@ def small_capture(tmp_path_factory):
             "object": mesh,
             "light": {"type": "point", "position": light.tolist(), "intensity": float(intensity)},
         })  # fmt: skip
-        # Rays by the contract's conventions: x left, y up, z forward; 4 x 4 samples per pixel.
+        # Rays by the README's conventions: x left, y up, z forward; 4 x 4 samples per pixel.
         y, x = np.meshgrid((np.arange(4 * height) + 0.5) / 4, (np.arange(4 * width) + 0.5) / 4, indexing="ij")
         local = np.stack([-(x - cx) / fx, -(y - cy) / fy, np.ones_like(x)], -1).reshape(-1, 3)
         world = local @ matrix[:3, :3].T

@@ -1,12 +1,16 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
+import re
+import shutil
+
 import mitsuba as mi
 import numpy as np
 import pytest
+import tifffile
 import torch
 from conftest import AXES, CENTER
 
-from mi_ring import capture
+from mi_ring import bridge, capture
 from mi_ring.errors import InputError
 
 
@@ -37,8 +41,51 @@ def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
     pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
     mi.Bitmap(pixels).write(str(path.parent / "images/002.png"))
     scene = capture.load(path)
-    rgb, _, _ = scene.observe([2])
+    rgb = scene.observe([2])[0]
     np.testing.assert_allclose(rgb[0].numpy(), pixels / 65535.0, rtol=1e-6)
+
+
+def test_tiff_files_are_read_with_all_bits(broken_capture):
+    path, edit = broken_capture
+    edit("images/002.png", "images/002.tiff")
+    pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
+    tifffile.imwrite(path.parent / "images/002.tiff", pixels)
+    np.testing.assert_allclose(capture.load(path).observe([2])[0][0].numpy(), pixels / 65535.0, rtol=1e-6)
+
+
+def test_grey_pictures_and_those_with_alpha_are_read(broken_capture):
+    path, _ = broken_capture
+    grey = np.arange(56 * 40, dtype=np.uint8).reshape(40, 56, 1)
+    mi.Bitmap(grey).write(str(path.parent / "images/000.png"))
+    mi.Bitmap(np.concatenate([grey, grey // 2, grey // 3, grey * 0], 2)).write(str(path.parent / "images/001.png"))
+    scene = capture.load(path)
+    assert np.array_equal(scene.images[0], np.repeat(grey, 3, 2))
+    assert np.array_equal(scene.images[1], np.concatenate([grey, grey // 2, grey // 3], 2))
+
+
+def test_sixteen_bit_masks_are_read(broken_capture):
+    path, _ = broken_capture
+    mask = np.zeros((40, 56, 1), np.uint16)
+    mask[10:20, 5:30] = 65535
+    mi.Bitmap(mask).write(str(path.parent / "masks/003.png"))
+    assert np.array_equal(capture.load(path).masks[3], (mask[:, :, 0] // 257).astype(np.uint8))
+
+
+def test_files_are_those_beside_the_scene_not_those_of_the_working_directory(broken_capture, monkeypatch):
+    path, _ = broken_capture
+    elsewhere = path.parent.parent / "elsewhere"
+    shutil.copytree(path.parent, elsewhere)
+    (path.parent / "images/003.png").unlink()
+    monkeypatch.chdir(elsewhere)
+    with pytest.raises(InputError, match="images/003.png"):
+        capture.load(path)
+
+
+def test_a_shape_needs_no_id(broken_capture):
+    path, edit = broken_capture
+    edit(' id="object"', "")
+    scene = capture.load(path)
+    bridge.Surface(scene.scene, scene.shape)
 
 
 def test_declared_encoding_beats_the_default(broken_capture):
@@ -53,8 +100,9 @@ def test_declared_encoding_beats_the_default(broken_capture):
 
 def test_shrinking_averages_blocks(small_capture):
     scene = capture.load(small_capture)
-    full, _, mask = scene.observe([3, 7])
-    small, _, coverage = scene.observe([3, 7], 4)
+    full, _, mask, masked = scene.observe([3, 7])
+    small, _, coverage, _ = scene.observe([3, 7], 4)
+    assert masked.tolist() == [True, True]
     assert small.shape == (2, 10, 14, 3) and coverage.shape == (2, 10, 14)
     torch.testing.assert_close(small[1, 4, 6], full[1, 16:20, 24:28].mean((0, 1)))
     torch.testing.assert_close(coverage[0, 5, 7], mask[0, 20:24, 28:32].mean())
@@ -75,7 +123,7 @@ def test_sphere_of_cameras_is_near_the_object(broken_capture):
         text = text.replace(f'<string name="mask" value="masks/{k:03}.png"/>', "")
     path.write_text(text)
     scene = capture.load(path)
-    assert scene.observe([0])[2] is None
+    assert scene.observe([0])[3].tolist() == [False]
     center, radius = scene.sphere()
     assert np.linalg.norm(center - CENTER) < 8  # principal point and targets are off the centre
     assert 10 < radius < 40
@@ -93,7 +141,7 @@ def test_exposure_and_reflectance_follow_the_lamp(small_capture):
     scene = capture.load(small_capture)
     exposure = scene.exposure()
     values = [scene.observe([k], 4) for k in range(12)]
-    inside = torch.cat([rgb[mask > 0.5] for rgb, _, mask in values])
+    inside = torch.cat([rgb[mask > 0.5] for rgb, _, mask, _ in values])
     assert exposure == pytest.approx(inside.mean().item(), rel=1e-5)
     # The lamp gives 2.2 at the centre, so a surface there that looks `exposure` bright reflects exposure / 2.2.
     assert scene.reflectance(CENTER, exposure) == pytest.approx(exposure / 2.2, rel=1e-4)
@@ -125,6 +173,14 @@ def empty_mask(path, edit):
     mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/005.png"))
 
 
+def spot(path, edit):
+    path.write_text(re.sub(r"<emitter.*?</emitter>", '<emitter type="spot"/>', path.read_text(), count=1))
+
+
+def dark(path, edit):
+    path.write_text(re.sub(r'(<rgb name="intensity" value=")[^"]*', r"\g<1>0", path.read_text(), count=1))
+
+
 BROKEN = {
     "missing image": (rename, ["images/004.png", 'photograph "004"', "filename"]),
     "truncated image": (lambda path, edit: (path.parent / "images/004.png").write_bytes(b"\x89PNG"), ["004.png"]),
@@ -138,12 +194,13 @@ BROKEN = {
     "no file": (lambda path, edit: path.unlink(), ["small.xml", "no such file"]),
     "scaled pose": (lambda path, edit: edit('name="to_world"', 'name="to_world">'
                     '<scale value="2"/></transform><transform name="other"'), ["small.xml", "to_world", "scale"]),
-    "spot light": (lambda path, edit: edit('<emitter type="point"><point name="position"',
-                   '<emitter type="projector"><!-- '), ["small.xml"]),
+    "spot light": (spot, ['"000"', "SpotLight", "directional"]),
+    "light switched off": (dark, ['"000"', "light", "positive"]),
+    "no focal length": (lambda path, edit: edit('<float name="fx" value="60.0"/>', ""), ['"000"', "fx is missing"]),
     "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance">'
                         '<texture type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/>'
                         '</texture></bsdf>'), ["small.xml", "vertex_color"]),
-    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["fy", "0"]),
+    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["000", "fy is 0"]),
     "black photographs": (black, ["small.xml", "black"]),
     "empty mask": (empty_mask, ["005.png", "mask"]),
 }  # fmt: skip

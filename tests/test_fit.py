@@ -123,6 +123,87 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
     assert logs[0] == logs[1]
 
 
+@pytest.mark.parametrize("moment", ["write_inputs", "write"])
+def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, monkeypatch, capsys):
+    genuine = getattr(results, moment)
+
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        genuine(*arguments)
+
+    monkeypatch.setattr(results, moment, interrupted)
+    status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *QUICK])
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == sorted(FILES)
+    assert status == (130 if moment == "write_inputs" else 0)  # at the end there is nothing left to resume
+    assert ("--resume" in capsys.readouterr().out) == (status == 130)
+
+
+def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_path, monkeypatch):
+    genuine = fit.losses.rgb_loss
+    monkeypatch.setattr(fit.losses, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
+    with pytest.raises(InputError, match="diverged at iteration 9"):
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "20", *QUICK])
+    ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
+    assert all(tensor.isfinite().all() for tensor in ring.values())
+
+
+def masks_on_some(path):
+    text = path.read_text()
+    for k in range(0, 12, 2):
+        text = text.replace(f'<string name="mask" value="masks/{k:03}.png"/>', "")
+    path.write_text(text)
+
+
+def no_masks(path):
+    path.write_text(re.sub(r'<string name="mask" value="[^"]*"/>', "", path.read_text()))
+
+
+def two_sizes(path):
+    """The first photograph loses its last 3 columns and 5 rows, film and mask as well."""
+    for folder in ("images", "masks"):
+        file = path.parent / folder / "000.png"
+        mi.Bitmap(np.ascontiguousarray(np.array(mi.Bitmap(str(file)))[:-5, :-3])).write(str(file))
+    film = '<integer name="width" value="56"/><integer name="height" value="40"/>'
+    path.write_text(path.read_text().replace(film, film.replace("56", "53").replace("40", "35"), 1))
+
+
+def torus_domain(path):
+    trimesh.creation.torus(20, 8).apply_translation(CENTER).export(path.parent / "torus.ply")
+    bsdf = '<bsdf type="cooktorrance"/>'
+    path.write_text(path.read_text().replace(bsdf, '<string name="domain" value="torus.ply"/>' + bsdf))
+
+
+def distant_lights(path):
+    light = '<emitter type="directional"><vector name="direction" x="1" y="0.2" z="-2"/></emitter>'
+    path.write_text(re.sub(r"<emitter.*?</emitter>", light, path.read_text()))
+
+
+@pytest.mark.parametrize("change", [masks_on_some, no_masks, two_sizes, torus_domain, distant_lights])
+def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
+    path, _ = broken_capture
+    change(path)
+    assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "12", *QUICK]) == 0
+    log = results.read_log(tmp_path / "run")
+    assert all(np.isfinite(entry["loss"]) for entry in log)
+    mesh = trimesh.load(tmp_path / "run" / "mesh.ply", process=False)
+    assert mesh.is_watertight and mesh.euler_number == (0 if change is torus_domain else 2)
+
+
+def test_results_never_go_onto_the_scene_itself(finished, broken_capture):
+    path, _ = broken_capture
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="holds the scene file"):
+        fit.main([str(path), "--out", str(path.parent), "--iterations", "1", *QUICK])
+    with pytest.raises(InputError, match="own photographs"):
+        render.main([str(finished), str(path), str(path.parent / "images")])
+    assert path.read_bytes() == before
+
+
+def test_a_finished_fit_is_not_silently_fitted_anew(finished, tmp_path):
+    with pytest.raises(InputError, match="weights: is for finished fits"):
+        fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), *QUICK])
+
+
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
     folder = tmp_path / "run"
     options = ["--out", str(folder), "--iterations", "200", *QUICK]
@@ -145,11 +226,15 @@ def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_pa
     assert distance(folder / "mesh.ply") < 0.04
 
 
-def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_capture, tmp_path):
+def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_capture, broken_capture, tmp_path):
     with pytest.raises(InputError, match="checkpoint.pt: --resume: no such file"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="--batch: was 4 before, is 5 now"):
         fit.main([str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *QUICK, "--batch", "5"])
+    same = [str(broken_capture[0]), "--out", str(finished), "--resume", "--iterations", "90", *QUICK]
+    broken_capture[1]('id="003"', 'id="three"')
+    with pytest.raises(InputError, match="another scene file"):
+        fit.main(same)
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: --resume: not a checkpoint"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
@@ -180,6 +265,9 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
     ("options", "words"),
     [
         (["--preset", "quick"], ["preset", "quick", "fast"]),
+        (["--preset"], ["preset"]),
+        (["--weights.mask", "-5"], ["--weights", "0 or more"]),
+        (["--seed", str(2**70)], ["--seed", "below 2^63"]),
         (["--iterations", "many"], ["iterations", "many"]),
         (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
         (["--iteration", "5"], ["iteration"]),
@@ -214,7 +302,7 @@ def test_presets_are_valid_and_can_be_overridden(preset):
 
 def test_paper_preset_is_the_papers():
     config = fit.parse(["scene.xml", "--preset", "paper"])
-    assert config.weights["velocity"] == 0.01 and config.loss == "l2"
+    assert config.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.01} and config.loss == "l2"
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
     assert config.levels == (5, 6) and [s.last - s.first for s in config.stages()] == [2000, 4000]
     assert config.precision == "float32"
