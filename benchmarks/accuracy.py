@@ -43,7 +43,7 @@ def measure(scene: Path, out: Path, options: list[str]) -> dict:
     """Fit one scene and evaluate it."""
     command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]
     started = time.perf_counter()
-    subprocess.run(command, check=True)
+    subprocess.run(command, check=True, stdout=sys.stderr)
     wall = time.perf_counter() - started
     memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # KiB → GiB; the largest child so far
     truth = truth_of(scene)

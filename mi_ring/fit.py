@@ -42,7 +42,7 @@ class Fit:
         self.stages = config.stages()
         self.autocast = autocast(config.precision)
         self.iteration, self.seconds, self.stage = 0, 0.0, None
-        self.failures = 0  # gradients in a row that were not finite
+        self.failures = 0  # losses or gradients in a row that were not finite
 
     def deform(self, s):
         """Surface points and their reflectance at domain points (V, 3)."""
@@ -99,13 +99,14 @@ class Fit:
         loss.backward()
         clip = torch.nn.utils.clip_grad_norm_
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
-        self.failures = 0 if norm.isfinite() else self.failures + 1
+        healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
+        self.failures = 0 if healthy else self.failures + 1
         if self.failures >= 10:
             raise InputError(f"{config.scene}: diverged at iteration {self.iteration}; try a lower --muon-rate")
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * config.decay**progress
-            if norm.isfinite():
+            if healthy:
                 optimizer.step()
         self.iteration += 1
         self.seconds += time.perf_counter() - started

@@ -95,7 +95,9 @@ class ShapeNetMesh(mi.Mesh):
         if np.linalg.det(to_world[:3, :3]) < 0:
             faces = np.fliplr(faces)  # a mirror would turn the surface inside out
 
-        super().__init__(props.id() or "object", len(vertices), len(faces), props, True, False)
+        super().__init__(props.id(), len(vertices), len(faces), props, True, False)
+        if not self.id():
+            self.set_id("object")
         params = mi.traverse(self)
         # Scalar variants have array types of their own.
         params[POSITIONS] = type(params[POSITIONS])(vertices.numpy().ravel())
