@@ -20,10 +20,11 @@ help:
 
 setup: $(VENV)/.setup-done
 
+# editable_mode=compat: a checkout called mi_ring would otherwise hide the package from scripts in the folder above it.
 $(VENV)/.setup-done: pyproject.toml Makefile mi_ring/llvm.py | $(VENV)/bin/pip
 	$(VENV)/bin/python -I mi_ring/llvm.py
 	$(RUN) pip install $(TORCH)
-	$(RUN) pip install -e '.[test]'
+	$(RUN) pip install --config-settings editable_mode=compat -e '.[test]'
 	@touch $@
 
 # Debian and Ubuntu keep ensurepip in the package python3-venv. Without it, the wheel in python3-pip-whl is pip enough to

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -91,6 +92,14 @@ def test_report_is_one_self_contained_file(finished):
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
     assert "<link" not in page and "<script" not in page and "011.png" in page
+
+
+def test_the_python_of_the_readme_runs(finished, tmp_path, monkeypatch):
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    block = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
+    monkeypatch.chdir(tmp_path)
+    exec(block.replace("out/pot2/ring.pt", str(finished / "ring.pt")).replace("spp=64", "spp=1"), names := {})
+    assert np.array(names["picture"]).mean() > 0  # at least the sky: its camera looks at the pot
 
 
 def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
