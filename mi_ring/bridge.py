@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.integrator import backward_edges, render_maps, render_photographs
+from mi_ring.edges import Edges
+from mi_ring.integrator import render_maps, render_photographs
 from mi_ring.mesh import FACES, POSITIONS
 
 DIFFUSE, SPECULAR, ROUGHNESS = "vertex_diffuse", "vertex_specular", "vertex_roughness"
@@ -24,13 +25,12 @@ class Surface:
         self.prefix = next(
             name.removesuffix(POSITIONS) for name, _ in self.params if name == f"{shape.id()}.{POSITIONS}"
         )
-        self.faces = None
+        self.faces, self.edges = None, None
         self.written = 0
 
     def set_faces(self, faces: np.ndarray) -> None:
         """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
         self.faces = np.ascontiguousarray(faces, np.uint32)
-        self.edges = edges_of(self.faces)
 
     def write(self, vertices: Tensor, diffuse: Tensor, specular: Tensor, roughness: Tensor, gradients: bool = False):
         """Write (V, 3) vertices [scene units], (V, 3), (V,), (V,) attributes. Returns the Dr.Jit arrays."""
@@ -53,41 +53,27 @@ class Surface:
             self.write(ring.surface(s), *ring.brdf_net(s))
 
 
-def edges_of(faces: np.ndarray):
-    """Edges of a closed mesh: ((v0, v1), (opposite0, opposite1)) as UInt32, for triangles (v0 v1 o0) and (v1 v0 o1)."""
-    f = faces.astype(np.int64)
-    start, end, opposite = f.ravel(), np.roll(f, -1, 1).ravel(), np.roll(f, -2, 1).ravel()
-    key = np.minimum(start, end) * (f.max() + 1) + np.maximum(start, end)
-    order = np.lexsort((start > end, key))
-    first, second = order[::2], order[1::2]
-    return tuple(mi.UInt32(a[i].astype(np.uint32)) for a, i in ((start, first), (end, first))), (
-        mi.UInt32(opposite[first].astype(np.uint32)),
-        mi.UInt32(opposite[second].astype(np.uint32)),
-    )
-
-
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows):
         gradients = any(t.requires_grad for t in (vertices, diffuse, specular, roughness))
         arrays = surface.write(vertices, diffuse, specular, roughness, gradients)
-        channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
+        surface.edges = Edges.of(surface.scene, surface.edges)
+        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, surface.edges)
         dr.eval(channels)
-        ctx.save = (surface, surface.written, photographs, arrays, channels, seed, shadows)
+        ctx.save = (surface, surface.written, arrays, channels)
         return pictures(channels, photographs)
 
     @staticmethod
     def backward(ctx, rgb_grad, alpha_grad):
-        surface, written, photographs, arrays, channels, seed, shadows = ctx.save
+        surface, written, arrays, channels = ctx.save
         if surface.written != written:
             raise RuntimeError("the surface was written again since this picture: call backward before the next one")
-        grads = [mi.Float(g.contiguous().numpy().ravel()) for g in (*rgb_grad.unbind(-1), alpha_grad)]
-        for channel, grad in zip(channels, grads):
+        for channel, grad in zip(channels, (*rgb_grad.unbind(-1), alpha_grad)):
             if dr.grad_enabled(channel):
-                dr.set_grad(channel, grad)
+                dr.set_grad(channel, mi.Float(grad.contiguous().numpy().ravel()))
                 dr.enqueue(dr.ADMode.Backward, channel)
-        dr.traverse(dr.ADMode.Backward, dr.ADFlag.Default)
-        backward_edges(surface.scene, photographs, arrays[0], surface.edges, grads, seed + 1, shadows)
+        dr.traverse(dr.ADMode.Backward)
         out = [torch.from_numpy(np.array(dr.grad(a))) for a in arrays]
         return out[0].reshape(-1, 3), out[1].reshape(-1, 3), out[2], out[3], None, None, None, None, None
 
@@ -100,7 +86,7 @@ def render(surface, photographs, vertices, diffuse, specular, roughness, spp=4, 
     per pixel; the same `seed` gives the same samples.
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all four tensors are
-    those of shading and of the outline, for radiance and for coverage; where a cast shadow ends they are not complete.
+    those of shading, of outlines and of edges of cast shadows, for radiance and for coverage.
     """
     return _Render.apply(vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows)
 

@@ -1,6 +1,6 @@
 """The `photometric` integrator: photographs of the scene, each lit by its own light (Mitsuba plugin)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,12 +8,11 @@ import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` keeps the classes of an older variant
 
 from mi_ring import photograph
-from mi_ring.bsdf import CookTorrance, check_attributes
-from mi_ring.photograph import camera_ray, project
+from mi_ring.bsdf import MIN_COSINE, CookTorrance, check_attributes
+from mi_ring.edges import Curve, Edges, cast, leave
+from mi_ring.photograph import Photograph, camera_ray, project, project_tangent
 
-#: Offset to either side of a silhouette edge [px]. Radiance grows like the square root of the distance to the outline,
-#: so that it must be small; float32 pixel coordinates of a 4096 px image still resolve it.
-EDGE_OFFSET = 1e-3
+EDGE_ROUNDINGS = 16  #: the least offset to either side of an edge, in rounding errors of a pixel's coordinate
 
 
 class Photometric(ADIntegrator):
@@ -31,10 +30,14 @@ class Photometric(ADIntegrator):
 
     Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
 
+    Gradients, through `mi.render` and through `render_photographs`, are those with respect to everything that
+    `mi.traverse` lists: shading by automatic differentiation, and the motion of outlines, creases and edges of cast
+    shadows, of all meshes, rectangles, disks, spheres and cylinders, by sampling these edges (Li et al. 2018,
+    "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
+
     What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
-    about the photographs' own lights, others always cast shadows. Gradients through plain ``mi.render`` are those of
-    shading inside the outline; the fit renders many photographs per launch with `render_photographs` and
-    `backward_edges`, which add the outline.
+    about the photographs' own lights, others always cast shadows. Gradients need an RGB variant and a `photograph`
+    sensor; the soft shadows of area lights and environment maps give none when they move.
 
     .. code-block:: xml
 
@@ -46,6 +49,7 @@ class Photometric(ADIntegrator):
         super().__init__(props)
         self.shadows = props.get("shadows", True)
         self.checked = None
+        self.edges = None
 
     def sample(self, mode, scene, sampler, ray, depth=None, δL=None, state_in=None, active=True, **kwargs):
         self.check(scene)
@@ -64,11 +68,14 @@ class Photometric(ADIntegrator):
     def shade(scene, si, light, next_2d, shadows):
         """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²)."""
         context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
+        # At an outline interpolated normals turn away before the faces do. Black there would be an edge of its own.
+        rim = (si.wi.z < MIN_COSINE) & (dr.dot(si.wi, si.to_local(si.n)) > 0)
+        si.wi = dr.normalize(mi.Vector3f(si.wi.x, si.wi.y, dr.select(rim, MIN_COSINE, si.wi.z)))
 
         def reflected(ds, weight, shadows):
             lit = active & dr.any(weight != 0)
             if shadows:
-                lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
+                lit &= sees(scene, si, ds, lit)
             value = bsdf.eval(context, si, si.to_local(ds.d), lit)
             return dr.select(lit, value * weight, 0)
 
@@ -80,6 +87,54 @@ class Photometric(ADIntegrator):
             if emitter.is_environment():
                 radiance += dr.select(active, 0, emitter.eval(si, ~active))
         return radiance
+
+    def differentiable(self, scene, sensor, seed, spp):
+        """The image of `render`, attached, the motion of edges included."""
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        if not (mi.is_rgb and isinstance(sensor, Photograph)):
+            raise ValueError("photometric: gradients need an RGB variant and a photograph sensor")
+        self.edges = Edges.of(scene, self.edges)
+        film = sensor.film()
+        sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
+        ray, weight, where = self.sample_rays(scene, sensor, sampler)
+        radiance, valid, _, _ = self.sample(dr.ADMode.Backward, scene, sampler, ray)
+        block = film.create_block()
+        block.set_coalesce(block.coalesce() and spp >= 4)
+        coverage = dr.select(valid, mi.Float(1), 0)
+        self._splat_to_block(block, film, where, radiance * weight, 1.0, coverage, [], ray.wavelengths)
+        film.put_block(block)
+        one = Photographs.of([sensor], attached=True)
+        for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows):
+            block = film.create_block()
+            block.set_coalesce(False)
+            # The film divides by the sum of the weights, `spp` per pixel.
+            step = [dr.select(active, value * spp, 0) for value in step]
+            self._splat_to_block(block, film, where, mi.Color3f(step[:3]), 0.0, step[3], [], ray.wavelengths)
+            film.put_block(block)
+        return film.develop()
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        image = self.differentiable(scene, sensor, seed, spp)
+        dr.forward_to(image)
+        return dr.grad(image)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        image = self.differentiable(scene, sensor, seed, spp)
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)
+
+
+def sees(scene, si, ds, active=True):
+    """Does the surface at `si` see the light at `ds`?"""
+    n, d = dr.detach(si.n), dr.detach(ds.d)
+    origin = dr.detach(si.p) + n * dr.mulsign(leave(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
+    to_light = dr.detach(ds.p) - origin
+    distance = dr.norm(to_light)
+    # Short of the light, which may be a surface
+    ray = mi.Ray3f(origin, to_light / distance, (1 - 2.0**-10) * distance, si.time, si.wavelengths)
+    return ~scene.ray_test(ray, active)
 
 
 @dataclass(frozen=True)
@@ -99,7 +154,7 @@ class Photographs:
     @classmethod
     def of(cls, sensors) -> "Photographs":
         """All `photograph` sensors of a scene; `size` is the first one's, `select` those of equal size."""
-        cameras = np.stack([np.array(s.matrix).reshape(4, 4)[:3] for s in sensors])
+        cameras = np.stack([np.array(s.to_world.matrix).reshape(4, 4)[:3] for s in sensors])
         intrinsics = [[*np.array(s.focal).ravel(), *np.array(s.centre).ravel()] for s in sensors]
         lights = np.stack([light_row(s) for s in sensors])
         # Equal but for the rounding of float32.
@@ -111,6 +166,18 @@ class Photographs:
             dr.arange(mi.UInt32, len(sensors)),
             sensors[0].size,
             not (off | (lights[:, 3] > 0)).any(),
+        )
+
+    @classmethod
+    def attached(cls, sensor) -> "Photographs":
+        """One photograph, its camera and its light attached to the parameters of the sensor."""
+        m = sensor.to_world.matrix
+        where, distant, strength = light_of(sensor)
+        return replace(
+            cls.of([sensor]),
+            cameras=dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
+            intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
+            lights=dr.concat([*where, mi.Float(distant), *strength, mi.Float(0)]),
         )
 
     def select(self, index, size: tuple[int, int], scale: int = 1) -> "Photographs":
@@ -132,37 +199,51 @@ class Photographs:
         to_world = mi.Matrix4f(*[list(row) for row in rows], [0, 0, 0, 1])
         return to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w)
 
+    def eye(self, view):
+        """The camera of photograph `view`, one per lane, as an eye of `Edges`."""
+        to_world, _, _ = self.camera(view)
+        return mi.Vector3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]), mi.Bool(True)
+
+    def source(self, view):
+        """The light of photograph `view`, one per lane, as an eye of `Edges`."""
+        where = dr.gather(mi.Vector4f, self.lights, 2 * dr.gather(mi.UInt32, self.index, view))
+        finite = where.w == 0
+        return dr.select(finite, 1, -1) * where.xyz, finite
+
     def light(self, view, si):
         """(DirectionSample3f, radiance · d⁻²) at `si` of the light of photograph `view`, one per lane."""
-        k = dr.gather(mi.UInt32, self.index, view)
-        a = dr.gather(mi.Vector4f, self.lights, 2 * k)
-        b = dr.gather(mi.Vector4f, self.lights, 2 * k + 1)
-        distant = a.w > 0
+        where, finite = self.source(view)
+        strength = dr.gather(mi.Vector4f, self.lights, 2 * dr.gather(mi.UInt32, self.index, view) + 1)
         ds = dr.zeros(mi.DirectionSample3f)
-        where = mi.Vector3f(a.x, a.y, a.z)
-        to_light = dr.select(distant, -where, where - si.p)
+        to_light = dr.select(finite, where - si.p, where)
         distance2 = dr.squared_norm(to_light)
         ds.d = to_light * dr.rsqrt(distance2)
-        ds.dist = dr.select(distant, photograph.FAR, dr.sqrt(distance2))
-        ds.p = dr.select(distant, si.p - where * ds.dist, where)
-        intensity = mi.Color3f(b.x, b.y, b.z)
-        return ds, intensity * dr.select(distant, 1, dr.rcp(distance2))
+        ds.dist = dr.select(finite, dr.sqrt(distance2), photograph.FAR)
+        ds.p = si.p + ds.d * ds.dist
+        return ds, mi.Color3f(strength.xyz) * dr.select(finite, dr.rcp(distance2), 1)
 
 
-def light_row(sensor):
-    """The light of a photograph as one row of `Photographs.lights`."""
-    params = dict(mi.traverse(sensor.light))
+def light_of(sensor):
+    """The light of a photograph: position or direction of travel (3), is it distant?, strength (3); all attached."""
+    params = mi.traverse(sensor.light)
     kind = sensor.light.class_name()
     if kind == "PointLight":
         where, strength = params["position"], params["intensity.value"]
     elif kind == "DirectionalEmitter":
-        where, strength = np.array(params["to_world"].matrix).reshape(4, 4)[:3, 2], params["irradiance.value"]
+        m, strength = params["to_world"].matrix, params["irradiance.value"]
+        where = mi.Vector3f(m[0, 2], m[1, 2], m[2, 2])
     else:
         raise ValueError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
-    strength = np.broadcast_to(np.array(strength).ravel(), 3)
+    return mi.Vector3f(where), kind == "DirectionalEmitter", mi.Color3f(strength)
+
+
+def light_row(sensor) -> np.ndarray:
+    """The light of a photograph as one row of `Photographs.lights`."""
+    where, distant, strength = light_of(sensor)
+    strength = np.array(strength).ravel()
     if not (np.isfinite(strength).all() and strength.min() >= 0 and strength.max() > 0):
         raise ValueError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
-    return np.array([*np.array(where).ravel(), kind != "PointLight", *strength, 0.0])
+    return np.array([*np.array(where).ravel(), distant, *strength, 0.0])
 
 
 def pixel_rays(photographs, spp, seed):
@@ -191,34 +272,91 @@ def center_rays(photographs):
     return mi.Ray3f(*camera_ray(*photographs.camera(view), where)), view
 
 
-def next_2d(seed, lanes):
-    """A source of independent 2-D samples, one stream per lane."""
-    # Hashed as in Mitsuba's samplers: the streams of neighbouring lanes would otherwise resemble each other.
-    rng = mi.PCG32(lanes, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), dr.arange(mi.UInt32, lanes)))
+def next_2d(seed, lanes, stream=None):
+    """A source of 2-D samples: independent streams, the lane's own or the one that `stream` (UInt32) says."""
+    # Hashed as in Mitsuba's samplers: neighbouring streams would otherwise resemble each other.
+    stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
+    rng = mi.PCG32(lanes, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream))
     return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-def trace(scene, ray, view, photographs, shadows, seed):
+def trace(scene, ray, view, photographs, shadows, next_2d):
     """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph."""
     hit = scene.ray_intersect_preliminary(ray, coherent=True)
     dr.eval(hit)  # one traversal serves the image and its gradient
     si = hit.compute_surface_interaction(ray)
-    radiance = Photometric.shade(
-        scene, si, lambda si: photographs.light(view, si), next_2d(seed, dr.width(ray)), shadows
-    )
+    radiance = Photometric.shade(scene, si, lambda si: photographs.light(view, si), next_2d, shadows)
     return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]
 
 
-def render_photographs(scene, photographs, spp, seed, shadows=True):
-    """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, differentiable inside.
+def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None):
+    """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, attached.
 
-    Box-filtered linear radiance. The gradient is that of shading inside the outline; `backward_edges` adds the rest.
+    Box-filtered linear radiance. Without `edges` the gradient is that of shading between the edges.
     """
     ray, view = pixel_rays(photographs, spp, seed)
     shadows = shadows and not photographs.colocated
-    channels = trace(scene, ray, view, photographs, shadows, seed)
+    channels = trace(scene, ray, view, photographs, shadows, next_2d(seed, dr.width(ray)))
     dr.schedule(channels)  # together: block_sum would otherwise render once per channel
-    return [dr.block_sum(c, spp) / spp for c in channels]
+    channels = [dr.block_sum(c, spp) / spp for c in channels]
+    if edges is None:
+        return channels
+    width, height = photographs.size
+    for where, view, step, active in boundaries(scene, photographs, edges, seed, shadows):
+        pixel = view * (width * height) + mi.UInt32(where.y) * width + mi.UInt32(where.x)
+        for k, value in enumerate(step):
+            motion = dr.zeros(mi.Float, dr.width(channels[k]))
+            dr.scatter_add(motion, value, pixel, active)
+            channels[k] += motion
+    return channels
+
+
+def boundaries(scene, photographs, edges, seed, shadows=True):
+    """What edges add to the gradient of photographs: (where [px], view, step, active) of samples along each curve.
+
+    An edge that moves by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square pixels:
+    dI = (L_before − L_beyond) · n·dq · length. Rays to either side of the edge see occlusion, background, coverage and
+    shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative is dI, to be added to the pixel at
+    `where`.
+    """
+    views = len(photographs)
+    curves, fronts = edges.outlines(photographs.eye, views, seed)
+    if shadows and not photographs.colocated:
+        casters, terminators = edges.shadow_casters(photographs.source, views, seed + 1, fronts)
+        curves += terminators + [cast(scene, curve, photographs.source, photographs.eye) for curve in casters]
+    return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows)) is not None]
+
+
+def boundary(scene, photographs, curve: Curve, seed, shadows):
+    """`boundaries` of one curve; None if nothing moves it."""
+    camera = photographs.camera(curve.view)
+    where, depth = project(*camera, curve.point)
+    if not dr.grad_enabled(where):
+        return None
+    with dr.suspend_grad():
+        q = dr.detach(where)
+        width, height = photographs.size
+        active = curve.active & (depth > 0) & (q.x > 0) & (q.x < width) & (q.y > 0) & (q.y < height)
+        along = project_tangent(camera[0], camera[1], curve.point, curve.tangent)
+        across = mi.Vector2f(-along.y, along.x)
+        active &= dr.isfinite(dr.squared_norm(across)) & (dr.squared_norm(across) > 0)
+        offset = max(curve.offset, EDGE_ROUNDINGS * 2.0**-24 * max(width, height))
+        shift = dr.select(active, offset * dr.rsqrt(dr.squared_norm(across)), 0) * across
+        dr.eval(q, shift, across, active)
+        n = dr.width(q)
+        lane = dr.arange(mi.UInt32, 2 * n)
+        sign, pair = mi.Float(lane % 2) * 2 - 1, lane // 2
+        view = dr.gather(mi.UInt32, curve.view, pair)
+        pixel = dr.gather(mi.Point2f, q, pair) + sign * dr.gather(mi.Vector2f, shift, pair)
+        ray = mi.Ray3f(*camera_ray(*photographs.camera(view), pixel))
+        # The same random numbers on both sides: only what jumps must differ.
+        sides = trace(scene, ray, view, photographs, shadows, next_2d(seed, 2 * n, pair))
+        dr.eval(sides)
+        before = 2 * dr.arange(mi.UInt32, n)
+        jumps = [dr.gather(mi.Float, s, before, active) - dr.gather(mi.Float, s, before + 1, active) for s in sides]
+        dr.eval(jumps)
+    moved = dr.dot(dr.select(active, across, 0), where)
+    return q, curve.view, [dr.replace_grad(mi.Float(0), jump * moved) for jump in jumps], active
 
 
 def render_maps(scene, photographs):
@@ -235,77 +373,6 @@ def render_maps(scene, photographs):
             material = [*diffuse, specular, roughness]
             maps[3:] = [dr.select(here, new, old) for new, old in zip(material, maps[3:])]
     return [dr.select(si.is_valid(), m, 0) for m in maps]
-
-
-def backward_edges(scene, photographs, positions, edges, channels_grad, seed, shadows=True, samples=4):
-    """Accumulate into `positions` the gradient that is due to the object's outline moving across pixels.
-
-    Moving a silhouette edge by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square
-    pixels, so dI = (L_inside − L_outside) · n·dq · length. Rays 1/1000 px to either side of the edge see occlusion,
-    background and coverage as the camera does.
-
-    `positions`: attached Float (3 V) of the mesh; `edges`: (vertices (UInt32 × 2), opposite vertices (UInt32 × 2)),
-    each of width E, the two triangles at an edge being (v0, v1, opposite0) and (v1, v0, opposite1); `channels_grad`:
-    the loss's gradient as four Floats like the output of `render_photographs`; `samples` points per edge.
-    """
-    (v0, v1), (w0, w1) = edges
-    count = dr.width(v0)
-    width, height = photographs.size
-
-    def vertex(source, index):
-        return dr.gather(mi.Point3f, source, index)
-
-    with dr.suspend_grad():
-        fixed = dr.detach(positions)
-        lane = dr.arange(mi.UInt32, count * len(photographs))
-        view, edge = lane // count, lane % count
-        a, b, c, d = (vertex(fixed, dr.gather(mi.UInt32, v, edge)) for v in (v0, v1, w0, w1))
-        to_world, _, _ = photographs.camera(view)
-        toward = a - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3])
-        front0 = dr.dot(dr.cross(b - a, c - a), toward) < 0
-        front1 = dr.dot(dr.cross(a - b, d - b), toward) < 0
-        silhouette = dr.compress(front0 != front1)
-
-        n = dr.width(silhouette)
-        if n == 0:
-            return
-        lane = dr.arange(mi.UInt32, n * samples)
-        chosen = dr.gather(mi.UInt32, silhouette, lane // samples)
-        view, edge = chosen // count, chosen % count
-        t = (mi.Float(lane % samples) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / samples
-        i0, i1 = dr.gather(mi.UInt32, v0, edge), dr.gather(mi.UInt32, v1, edge)
-        camera = photographs.camera(view)
-        q0, z0 = project(*camera, vertex(fixed, i0))
-        q1, z1 = project(*camera, vertex(fixed, i1))
-        q, _ = project(*camera, dr.lerp(vertex(fixed, i0), vertex(fixed, i1), t))
-        length = dr.norm(q1 - q0)
-        normal = mi.Vector2f(q0.y - q1.y, q1.x - q0.x) / dr.maximum(length, 1e-8)
-        seen = (q.x > 0) & (q.x < width) & (q.y > 0) & (q.y < height) & (z0 > 0) & (z1 > 0)
-        # An edge seen from a slant is foreshortened: uniform steps along it are not uniform in the picture.
-        length *= z0 * z1 / dr.square(dr.lerp(z0, z1, t))
-
-        lane2 = dr.arange(mi.UInt32, 2 * n * samples)
-        sign, lane2 = mi.Float(lane2 % 2) * 2 - 1, lane2 // 2
-        q2 = dr.gather(mi.Point2f, dr.ravel(q), lane2)
-        q2 += sign * EDGE_OFFSET * dr.gather(mi.Vector2f, dr.ravel(normal), lane2)
-        view2 = dr.gather(mi.UInt32, view, lane2)
-        ray = mi.Ray3f(*camera_ray(*photographs.camera(view2), q2))
-        shadows = shadows and not photographs.colocated
-        channels = trace(scene, ray, view2, photographs, shadows, seed)
-        pixel = view * (width * height) + mi.UInt32(dr.clip(q.y, 0, height - 1)) * width
-        pixel += mi.UInt32(dr.clip(q.x, 0, width - 1))
-        dr.eval(channels)
-        before, beyond = 2 * lane, 2 * lane + 1
-        weight = mi.Float(0)
-        for value, grad in zip(channels, channels_grad):
-            step = dr.gather(mi.Float, value, before) - dr.gather(mi.Float, value, beyond)
-            weight += step * dr.gather(mi.Float, grad, pixel, seen)
-        weight = dr.select(seen, weight * length / samples, 0)
-        dr.eval(weight, normal, i0, i1, t, view)
-
-    point = dr.lerp(vertex(positions, i0), vertex(positions, i1), t)
-    q, _ = project(*photographs.camera(view), point)
-    dr.backward(dr.sum(weight * dr.dot(normal, q)))
 
 
 mi.register_integrator("photometric", Photometric)

@@ -31,15 +31,26 @@ def camera_ray(to_world, focal, centre, pixel):
     return mi.Point3f(m[0, 3], m[1, 3], m[2, 3]), dr.normalize(direction)
 
 
-def project(to_world, focal, centre, point):
-    """The inverse of `camera_ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point.
+def camera_coordinates(to_world, vector):
+    """A direction in the world in the axes of a camera: the inverse of the upper left 3 × 3 of `to_world`."""
+    a, b, c = (mi.Vector3f(to_world[0, k], to_world[1, k], to_world[2, k]) for k in range(3))
+    across = dr.cross(a, b)
+    return mi.Vector3f(dr.dot(dr.cross(b, c), vector), dr.dot(dr.cross(c, a), vector), dr.dot(across, vector)) / dr.dot(
+        across, c
+    )
 
-    The rotation part of `to_world` must be orthonormal.
-    """
-    m = to_world
-    d = point - mi.Point3f(m[0, 3], m[1, 3], m[2, 3])
-    x, y, z = (m[0, k] * d.x + m[1, k] * d.y + m[2, k] * d.z for k in range(3))
+
+def project(to_world, focal, centre, point):
+    """The inverse of `camera_ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point."""
+    x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     return mi.Point2f(centre.x - focal.x * x / z, centre.y - focal.y * y / z), z
+
+
+def project_tangent(to_world, focal, point, tangent):
+    """Pixels that a point moves in the picture for a step `tangent` in the world: the derivative of `project`."""
+    x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
+    dx, dy, dz = camera_coordinates(to_world, tangent)
+    return mi.Vector2f(focal.x * (x * dz - dx * z), focal.y * (y * dz - dy * z)) / (z * z)
 
 
 class Photograph(mi.Sensor):
@@ -105,14 +116,14 @@ class Photograph(mi.Sensor):
             raise ValueError(
                 f'photograph "{props.id()}": to_world must be a rotation and a translation, without scale or mirror'
             )
-        self.matrix = mi.Matrix4f(matrix)
+        self.to_world = mi.AffineTransform4f(mi.Matrix4f(matrix))
 
         lights = [value for _, value in props.objects() if isinstance(value, mi.Emitter)]
         if len(lights) > 1:
             raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, must be at most one')
         position = [float(v) for v in matrix[:3, 3]]
         self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
-        dr.make_opaque(self.focal, self.centre, self.matrix)
+        dr.make_opaque(self.focal, self.centre, self.to_world)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -124,7 +135,7 @@ class Photograph(mi.Sensor):
         Photograph.current = self
         film = self.film()
         pixel = sample2 * mi.ScalarVector2f(film.crop_size()) + mi.ScalarVector2f(film.crop_offset())
-        origin, direction = camera_ray(self.matrix, self.focal, self.centre, pixel)
+        origin, direction = camera_ray(self.to_world.matrix, self.focal, self.centre, pixel)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         return mi.Ray3f(origin, direction, SHUTTER, wavelengths), weight
 
@@ -134,7 +145,7 @@ class Photograph(mi.Sensor):
 
     def traverse(self, callback):
         super().traverse(callback)
-        callback.put("to_world", self.matrix, mi.ParamFlags.Differentiable)
+        callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
         callback.put("focal", self.focal, mi.ParamFlags.Differentiable)
         callback.put("centre", self.centre, mi.ParamFlags.Differentiable)
         callback.put("light", self.light, mi.ParamFlags.Differentiable)
