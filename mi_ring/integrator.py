@@ -102,15 +102,15 @@ class Photometric(ADIntegrator):
         block = film.create_block()
         block.set_coalesce(block.coalesce() and spp >= 4)
         coverage = dr.select(valid, mi.Float(1), 0)
-        self._splat_to_block(block, film, where, radiance * weight, 1.0, coverage, [], ray.wavelengths)
+        ADIntegrator._splat_to_block(block, film, where, radiance * weight, 1.0, coverage, [], ray.wavelengths)
         film.put_block(block)
-        one = Photographs.of([sensor], attached=True)
+        one = Photographs.attached(sensor)
         for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows):
             block = film.create_block()
             block.set_coalesce(False)
             # The film divides by the sum of the weights, `spp` per pixel.
             step = [dr.select(active, value * spp, 0) for value in step]
-            self._splat_to_block(block, film, where, mi.Color3f(step[:3]), 0.0, step[3], [], ray.wavelengths)
+            ADIntegrator._splat_to_block(block, film, where, mi.Color3f(step[:3]), 0.0, step[3], [], ray.wavelengths)
             film.put_block(block)
         return film.develop()
 
