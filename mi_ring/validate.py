@@ -121,7 +121,7 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
                          'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
     if count == 1:
         return scene
-    lamps = [emitter for emitter in scene.emitters() if emitter.shape() is None]
+    lamps = [e for e in scene.emitters() if not mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]  # shapes have theirs
     parts = {f"part{k}": part for k, part in enumerate([*scene.shapes(), *lamps])}
     return mi.load_dict({"type": "scene", "flash": {"type": "flash"}, **parts}, optimize=False, parallel=False)
 
