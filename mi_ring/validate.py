@@ -262,7 +262,7 @@ def table(rows: list[Comparison]) -> str:
     cells += [(
         r.name, f"{r.radiance:.4g}", f"{100 * r.difference:+.2f}", f"{100 * r.absolute_difference:.2f}",
         f"{100 * r.noise:.2f}", f"{r.psnr:.1f} dB", f"{100 * r.shadows:.2f}", f"{100 * r.interreflection:.2f}",
-        f"{100 * r.unexplained:+.2f} ± {100 * r.unexplained_noise:.2f}",
+        f"{100 * r.unexplained:+.3f} ± {100 * r.unexplained_noise:.3f}",
         *(probability(p).removeprefix("p ").removeprefix("= ") for p in (r.p_direct, r.p_path)),
     ) for r in rows]  # fmt: skip
     widths = [max(map(len, column)) for column in zip(*cells)]
