@@ -202,15 +202,7 @@ def load(path: str | Path, images: bool = True) -> Capture:
     Without `images` only cameras and lights are read: enough to render.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the XML file of a scene")
-    try:
-        scene = mi.load_file(str(path), optimize=False, parallel=False)
-    except RuntimeError as error:
-        raise InputError(f"{path}: {reason(error)}") from error
-    sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
-    if not sensors:
-        raise InputError(f'{path}: sensor: found no <sensor type="photograph">; a fit needs one per photograph')
+    scene, sensors = open_scene(path)
     shapes = [s for s in scene.shapes() if isinstance(s, mesh.ShapeNetMesh)]
     if len(shapes) != 1:
         raise InputError(f'{path}: shape: found {len(shapes)} <shape type="shapenet">; a fit needs exactly one')
@@ -224,6 +216,20 @@ def load(path: str | Path, images: bool = True) -> Capture:
         return Capture(path, scene, shapes[0], sensors, pixels, linear, masks, shadows)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{path}: {error}") from error
+
+
+def open_scene(path: Path) -> tuple[mi.Scene, list]:
+    """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the XML file of a scene")
+    try:
+        scene = mi.load_file(str(path), optimize=False, parallel=False)
+    except RuntimeError as error:
+        raise InputError(f"{path}: {reason(error)}") from error
+    sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
+    if not sensors:
+        raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
+    return scene, sensors
 
 
 def reason(error: RuntimeError) -> str:

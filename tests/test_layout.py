@@ -11,7 +11,7 @@ from mi_ring.command import COMMANDS
 PACKAGE = Path(mi_ring.__file__).parent
 NETWORKS = {"encoding", "shapenet", "brdfnet"}
 PLUGINS = {"photograph", "bsdf", "mesh", "integrator"}
-TRAINING = {"fit", "losses", "config", "results", "report", "command", "capture", "render", "evaluate", "bridge"}
+TRAINING = {"losses", "config", "results", "report", "command", "capture", "bridge"} | set(COMMANDS)
 
 
 def imports(module: str) -> set[str]:
