@@ -35,9 +35,8 @@ class CookTorrance(mi.BSDF):
 
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
-    and this is reached by narrow lobes (Walter's fit for Beckmann may exceed it by 0.2 %). A surface with
-    π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves energy. Nothing enforces that: ρ also holds the scale of lamp and
-    camera, and only direct light is ever fitted.
+    and narrow lobes reach it. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves energy. Nothing enforces
+    that: ρ also holds the scale of lamp and camera, and only direct light is ever fitted.
 
     With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer.
     Black there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o
