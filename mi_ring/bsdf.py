@@ -36,7 +36,7 @@ class CookTorrance(mi.BSDF):
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
     and narrow lobes reach it. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves energy. Nothing enforces
-    that: ρ also holds the scale of lamp and camera, and only direct light is ever fitted.
+    that: ρ also holds the scale of lamp and camera.
 
     With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer.
     Black there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o
