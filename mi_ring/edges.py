@@ -9,7 +9,7 @@ import numpy as np
 SMOOTH, CREASE, BORDER = 0, 1, 2  # edges of a mesh where the normals of both sides agree or differ, or where it ends
 SAMPLES = 4  #: samples per edge of a mesh
 CURVE_SAMPLES = 256  #: samples per curve of any other shape
-LEAVE = 2.0**-15  #: see `leave`
+LEAVE = 2.0**-19  #: see `leave`
 
 #: How far to both sides of an edge one has to look for the jump [px]. Radiance grows like the square root of the
 #: distance to an outline, so that there it must be little; the edge of a shadow is known with less precision.
@@ -31,6 +31,7 @@ class Curve:
     view: mi.UInt32  # the photograph
     point: mi.Point3f  # attached to what moves the curve
     tangent: mi.Vector3f  # detached: the piece of the curve that the sample stands for [scene units]
+    inside: mi.Point3f  # detached: what the curve bounds lies on this side of it
     active: mi.Bool
     offset: float  # how far to both sides of it one has to look [px]
 
@@ -110,7 +111,17 @@ class Edges:
         t = (mi.Float(lane % SAMPLES) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / SAMPLES
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
-        return Curve(chosen // count, dr.lerp(a, b, t), dr.detach(b - a) / SAMPLES, mi.Bool(True), offset)
+        return Curve(
+            chosen // count, dr.lerp(a, b, t), dr.detach(b - a) / SAMPLES, self.middle(edge), mi.Bool(True), offset
+        )
+
+    def middle(self, edge):
+        """The centre of the two triangles at an edge, detached."""
+        positions, corners = dr.detach(self.positions()), mi.Point3f(0)
+        for face in (self.f0, self.f1):
+            for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
+                corners += dr.gather(mi.Point3f, positions, vertex) / 6
+        return corners
 
     def outlines(self, eye, views, seed):
         """(curves, fronts): what may be an outline or a crease to the eye of each of so many photographs."""
@@ -143,7 +154,7 @@ class Edges:
                 edge, first, second = self.sides(seen, lanes)
                 both = dr.compress(first & second & (dr.gather(mi.UInt32, self.kind, edge) == SMOOTH))
                 if dr.width(both):
-                    terminators.append(self.sample(dr.gather(mi.UInt32, lanes, both), seed + 1, JUMP))
+                    terminators.append(self.sample(dr.gather(mi.UInt32, lanes, both), seed + 1))
         return casters, terminators
 
 
@@ -156,11 +167,18 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
     d = dr.normalize(dr.select(finite, curve.point - where, -where))
     away = dr.detach(dr.select(finite, dr.norm(curve.point - where), 0))
     start = leave(dr.detach(curve.point), away)
-    ray = mi.Ray3f(curve.point + d * start, d)
+    ray = mi.Ray3f(curve.point, d)
     with dr.suspend_grad():
-        hit = scene.ray_intersect_preliminary(dr.detach(ray), active=curve.active)
-    si = hit.compute_surface_interaction(ray, active=curve.active)
-    d, n, t = dr.detach(d), dr.detach(si.n), dr.detach(si.t) + start
+        # A ray that grazes the shape may not meet it again: it passes a little outside. Where the shape is hollow that
+        # is inside it, and such an edge casts no shadow.
+        aside = dr.normalize(dr.cross(curve.tangent, ray.d))
+        aside *= dr.mulsign(start, dr.dot(aside, ray.o - curve.inside))
+        origin = dr.detach(curve.point) + dr.select(dr.isfinite(aside.x), aside, 0)
+        reach = dr.select(finite, (1 - 2.0**-10) * away, dr.largest(mi.Float))
+        active = curve.active & ~scene.ray_test(mi.Ray3f(origin, -d, reach, 0, []), curve.active)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, d), active=active)
+    si = hit.compute_surface_interaction(ray, active=active)
+    d, n, t = dr.detach(d), dr.detach(si.n), dr.detach(si.t)
     slope = dr.dot(n, d)
     # The shadow of a step along the curve: stretched by the distance from the light, and sheared into the plane that
     # it falls on.
@@ -169,7 +187,8 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
     # Whether a point is in shadow is asked a little above the surface.
     above = dr.mulsign(leave(dr.detach(si.p), dr.norm(dr.detach(si.p - camera(curve.view)[0]))), -slope)
     shift = d * (above / slope) - n * above
-    return Curve(curve.view, si.p + shift, tangent, curve.active & si.is_valid() & (dr.abs(slope) > 1e-4), JUMP)
+    active &= si.is_valid() & (dr.abs(slope) > 1e-4)
+    return Curve(curve.view, si.p + shift, tangent, curve.inside, active, JUMP)
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
@@ -273,5 +292,6 @@ def outline_of(shape, eye, views, seed) -> list[Curve]:
             p, tangent = curve(e, dr.select(finite, mi.Float(1), 0), t)
             tangent = dr.detach(to_world) @ mi.Vector3f(tangent) / CURVE_SAMPLES
             dr.eval(p, tangent)
-        curves.append(Curve(view, to_world @ p, tangent, dr.isfinite(p.x), ROOT))
+        middle = dr.detach(to_world) @ mi.Point3f(0, 0, 0.5 if shape.class_name() == "Cylinder" else 0)
+        curves.append(Curve(view, to_world @ p, tangent, middle, dr.isfinite(p.x), ROOT))
     return curves
