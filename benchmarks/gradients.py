@@ -13,7 +13,9 @@ import sys
 from itertools import product
 from pathlib import Path
 
-import mi_ring  # noqa: F401, I001  (chooses LLVM before Mitsuba is imported)
+import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
+
+# isort: split
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -52,6 +54,7 @@ class Picture:
                 "intensity": {"type": "rgb", "value": [18 * unit**2, 15 * unit**2, 12 * unit**2]}}  # fmt: skip
         if light == "directional":
             lamp = {"type": "directional", "direction": DIRECTION, "irradiance": {"type": "rgb", "value": [1.2, 1, 1]}}
+        pose = mi.ScalarTransform4f().look_at((unit * CAMERA).tolist(), (unit * TARGET).tolist(), [0.1, 1, 0.2])
         scene = {
             "type": "scene",
             "integrator": {"type": "photometric"},
@@ -62,27 +65,28 @@ class Picture:
             },
             "sensor": {
                 "type": "photograph", "filename": "nowhere.png", "fx": 121.0, "fy": 109.0, "cx": 45.0, "cy": 43.0,
-                "to_world": mi.ScalarTransform4f().look_at((unit * CAMERA).tolist(), (unit * TARGET).tolist(), [0.1, 1, 0.2]),
+                "to_world": pose,
                 "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba",
                          "component_format": "float32", "rfilter": {"type": rfilter}},
                 "sampler": {"type": "multijitter"}, "light": lamp,
             },
         }  # fmt: skip
         if wall:
-            scene["wall"] = {
-                "type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}},
-                "to_world": mi.ScalarTransform4f().translate([0, 0, -1.7 * unit]).rotate([0.3, 1, 0], 9).scale(20 * unit),
-            }  # fmt: skip
+            place = mi.ScalarTransform4f().translate([0, 0, -1.7 * unit]).rotate([0.3, 1, 0], 9).scale(20 * unit)
+            paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}
+            scene["wall"] = {"type": "rectangle", "to_world": place, "bsdf": paint}
         self.scene = mi.load_dict(scene)
         self.params = mi.traverse(self.scene)
         self.vertices = next(name for name, _ in self.params if name.endswith("vertex_positions"))
         sphere = np.array(self.params[self.vertices], np.float64).reshape(-1, 3)
         x, y, z = sphere.T
-        radius = 1 + (shape == "bumpy") * (0.22 * np.sin(5 * x + 1) * np.cos(4 * y - 2 * z) + 0.12 * np.cos(7 * z + 2 * x))
+        bumps = 0.22 * np.sin(5 * x + 1) * np.cos(4 * y - 2 * z) + 0.12 * np.cos(7 * z + 2 * x)
+        radius = 1 + (shape == "bumpy") * bumps
         self.bump = mi.Float((unit * sphere * np.exp(-9 * ((sphere - [0.6, 0.7, 0.4]) ** 2).sum(1))[:, None]).ravel())
         self.params[self.vertices] = mi.Float((unit * sphere * radius[:, None]).ravel())
         self.params.update()
-        self.before = {name: type(value)(value) for name, value in self.params if name.startswith(MOVABLE) or name == self.vertices}
+        movable = (*MOVABLE, self.vertices)
+        self.before = {name: type(value)(value) for name, value in self.params if name.startswith(movable)}
         v, u = np.mgrid[:HEIGHT, :WIDTH]
         waves = [1.2 + np.sin(0.06 * u + 0.03 * v + k) + 0.4 * np.cos(0.07 * v - 0.02 * k * u) for k in range(4)]
         self.weights = np.stack(waves, -1)

@@ -6,7 +6,8 @@ A bumpy sphere of 10,242 vertices, eight cameras with a lamp beside each, 128² 
 is: write the vertices, render, and differentiate a fixed weighted sum of all pixels with respect to positions and
 material. `photometric` renders all photographs in one launch; the others take one `mi.render` per photograph, through
 stock `perspective` sensors and a stock point light. `direct_projective` is measured as it is and with `sppi` = 0,
-which it recommends itself here. Of these only `photometric` has the edges of shadows that the bumps cast. CPU time is process time, summed over threads; methods take turns.
+which it recommends itself here. Of these only `photometric` has the edges of shadows that the bumps cast. CPU time is
+process time, summed over threads; methods take turns.
 
 Signal to noise is that of the gradient at a vertex from one such gradient: |mean| / standard deviation over seeds, the
 median over the vertices that have a gradient; and of all vertices together, root mean square over root mean variance.
@@ -18,10 +19,13 @@ import sys
 import time
 from pathlib import Path
 
-import mi_ring  # noqa: F401, I001  (chooses LLVM before Mitsuba is imported)
+import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
+
+# isort: split
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
 from mi_ring.edges import Edges
 from mi_ring.integrator import Photographs, render_photographs
 
@@ -76,7 +80,8 @@ class Scene:
         sphere = np.array(self.params[self.names[0]], np.float64).reshape(-1, 3)
         x, y, z = sphere.T
         radius = 1 + 0.1 * np.sin(4 * x + 1) * np.cos(3 * y) + 0.08 * np.cos(5 * z + x)
-        self.values = [(sphere * radius[:, None]).ravel(), np.tile([0.4, 0.3, 0.2], len(x)), 0.05 + 0 * x, 0.35 + 0.1 * y]
+        diffuse = np.tile([0.4, 0.3, 0.2], len(x))
+        self.values = [(sphere * radius[:, None]).ravel(), diffuse, 0.05 + 0 * x, 0.35 + 0.1 * y]
         v, u = np.mgrid[:SIZE, :SIZE]
         waves = [np.sin(0.05 * u + 0.04 * v + k + 1.3 * c) for k in range(VIEWS) for c in range(3)]
         self.weights = np.stack(waves).reshape(VIEWS, 3, SIZE, SIZE).astype(np.float32)

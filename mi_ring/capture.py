@@ -137,7 +137,8 @@ def pixel_directions(matrix, focal, centre, pixels):
 
 def camera_of(sensor):
     """(to_world (4, 4), focal (2,), centre (2,)) of a photograph as numpy arrays."""
-    return np.array(sensor.to_world.matrix).reshape(4, 4), np.array(sensor.focal).ravel(), np.array(sensor.centre).ravel()
+    matrix = np.array(sensor.to_world.matrix).reshape(4, 4)
+    return matrix, np.array(sensor.focal).ravel(), np.array(sensor.centre).ravel()
 
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:

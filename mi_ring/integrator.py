@@ -146,7 +146,7 @@ class Photographs:
 
     cameras: object  # Float, 12 per photograph: the upper three rows of to_world
     intrinsics: object  # Float, 4 per photograph: fx, fy, cx, cy [px]
-    lights: object  # Float, 8 per photograph: position or direction of travel, 0 point | 1 distant, intensity, unused
+    lights: object  # Float, 8 per photograph: position or direction toward it, 0 point | 1 distant, intensity, unused
     index: object
     size: tuple[int, int]
     colocated: bool  # is every light at its camera's centre? Then nothing that is seen is in shadow
@@ -156,7 +156,7 @@ class Photographs:
         """All `photograph` sensors of a scene; `size` is the first one's, `select` those of equal size."""
         cameras = np.stack([np.array(s.to_world.matrix).reshape(4, 4)[:3] for s in sensors])
         intrinsics = [[*np.array(s.focal).ravel(), *np.array(s.centre).ravel()] for s in sensors]
-        lights = np.stack([light_row(s) for s in sensors])
+        lights = np.array([light_of(s) for s in sensors], np.float64).reshape(-1, 8)
         # Equal but for the rounding of float32.
         off = np.abs(lights[:, :3] - cameras[:, :, 3]).max(1) > 1e-6 * np.abs(cameras[:, :, 3]).max()
         return cls(
@@ -172,12 +172,11 @@ class Photographs:
     def attached(cls, sensor) -> "Photographs":
         """One photograph, its camera and its light attached to the parameters of the sensor."""
         m = sensor.to_world.matrix
-        where, distant, strength = light_of(sensor)
         return replace(
             cls.of([sensor]),
             cameras=dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
             intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
-            lights=dr.concat([*where, mi.Float(distant), *strength, mi.Float(0)]),
+            lights=dr.concat(light_of(sensor)),
         )
 
     def select(self, index, size: tuple[int, int], scale: int = 1) -> "Photographs":
@@ -207,8 +206,7 @@ class Photographs:
     def source(self, view):
         """The light of photograph `view`, one per lane, as an eye of `Edges`."""
         where = dr.gather(mi.Vector4f, self.lights, 2 * dr.gather(mi.UInt32, self.index, view))
-        finite = where.w == 0
-        return dr.select(finite, 1, -1) * where.xyz, finite
+        return where.xyz, where.w == 0
 
     def light(self, view, si):
         """(DirectionSample3f, radiance · d⁻²) at `si` of the light of photograph `view`, one per lane."""
@@ -223,27 +221,34 @@ class Photographs:
         return ds, mi.Color3f(strength.xyz) * dr.select(finite, dr.rcp(distance2), 1)
 
 
+def source_of(emitter):
+    """Where a lamp is, attached: (Vector3f, True), or (direction toward it, False) if it is infinitely far away.
+
+    None for lamps that are neither: area lights, environment maps.
+    """
+    params = mi.traverse(emitter)
+    match emitter.class_name():
+        case "PointLight":
+            return mi.Vector3f(params["position"]), True
+        case "SpotLight":
+            m = params["to_world"].matrix
+            return mi.Vector3f(m[0, 3], m[1, 3], m[2, 3]), True
+        case "DirectionalEmitter":
+            m = params["to_world"].matrix
+            return -mi.Vector3f(m[0, 2], m[1, 2], m[2, 2]), False
+
+
 def light_of(sensor):
-    """The light of a photograph: position or direction of travel (3), is it distant?, strength (3); all attached."""
-    params = mi.traverse(sensor.light)
-    kind = sensor.light.class_name()
-    if kind == "PointLight":
-        where, strength = params["position"], params["intensity.value"]
-    elif kind == "DirectionalEmitter":
-        m, strength = params["to_world"].matrix, params["irradiance.value"]
-        where = mi.Vector3f(m[0, 2], m[1, 2], m[2, 2])
-    else:
+    """The light of a photograph as one row of `Photographs.lights`, eight attached Floats."""
+    light = sensor.light
+    kind = light.class_name()
+    if kind not in ("PointLight", "DirectionalEmitter"):
         raise ValueError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
-    return mi.Vector3f(where), kind == "DirectionalEmitter", mi.Color3f(strength)
-
-
-def light_row(sensor) -> np.ndarray:
-    """The light of a photograph as one row of `Photographs.lights`."""
-    where, distant, strength = light_of(sensor)
-    strength = np.array(strength).ravel()
-    if not (np.isfinite(strength).all() and strength.min() >= 0 and strength.max() > 0):
+    where, finite = source_of(light)
+    strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
+    if not (dr.all(dr.isfinite(strength) & (strength >= 0)) and dr.any(strength > 0)):
         raise ValueError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
-    return np.array([*np.array(where).ravel(), distant, *strength, 0.0])
+    return [*where, mi.Float(not finite), *strength, mi.Float(0)]
 
 
 def pixel_rays(photographs, spp, seed):
@@ -321,9 +326,12 @@ def boundaries(scene, photographs, edges, seed, shadows=True):
     """
     views = len(photographs)
     curves, fronts = edges.outlines(photographs.eye, views, seed)
-    if shadows and not photographs.colocated:
-        casters, terminators = edges.shadow_casters(photographs.source, views, seed + 1, fronts)
-        curves += terminators + [cast(scene, curve, photographs.source, photographs.eye) for curve in casters]
+    sources = [photographs.source] if shadows and not photographs.colocated else []
+    for source in filter(None, map(source_of, scene.emitters())):
+        sources.append(lambda view, source=source: (source[0], mi.Bool(source[1])))
+    for k, source in enumerate(sources, 1):
+        casters, terminators = edges.shadow_casters(source, views, seed + k, fronts)
+        curves += terminators + [cast(scene, curve, source, photographs.eye) for curve in casters]
     return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows)) is not None]
 
 
