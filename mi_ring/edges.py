@@ -46,8 +46,9 @@ class Edges:
     """
 
     def __init__(self, scene):
-        self.meshes = [shape for shape in scene.shapes() if shape.is_mesh()]
-        self.others = [shape for shape in scene.shapes() if not shape.is_mesh()]
+        self.shapes = list(scene.shapes())
+        self.meshes = [shape for shape in self.shapes if shape.is_mesh()]
+        self.others = [shape for shape in self.shapes if not shape.is_mesh()]
         for shape in self.others:
             if shape.class_name() not in CURVES:
                 raise ValueError(
@@ -69,9 +70,8 @@ class Edges:
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
         """The edges of a scene: `known`, if they are still those."""
-        meshes = [shape for shape in scene.shapes() if shape.is_mesh()]
-        if known is not None and meshes == known.meshes:
-            now = (np.array(mesh.faces_buffer()).reshape(-1, 3) for mesh in meshes)
+        if known is not None and list(scene.shapes()) == known.shapes:
+            now = (np.array(mesh.faces_buffer()).reshape(-1, 3) for mesh in known.meshes)
             if all(np.array_equal(a, b) for a, b in zip(now, known.faces)):
                 return known
         return cls(scene)
@@ -94,7 +94,7 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """Per photograph and edge: (lane, edge, do its first and its second triangle show their fronts?)."""
+        """(edge, do its first and its second triangle show their fronts?) of these lanes, or of all `views`."""
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
         view, edge = lane // count, lane % count
