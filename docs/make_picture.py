@@ -24,7 +24,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     scene, ring = capture.load(arguments.run / "scene.xml"), load_ring(arguments.run)
-    surface = bridge.Surface(scene.scene, scene.shape)
+    surface = bridge.Surface(scene.scene, scene.shape, ring)
     k = arguments.photograph
     photograph = scene.photograph(k)
     s, faces = ring.domain.sample(6)
@@ -33,7 +33,7 @@ def main() -> None:
     with torch.no_grad():
         for step in (0, 5, 10, 15, 20):
             vertices = ring.center + ring.radius * ring.shape_net.flow(s, step)
-            surface.write(vertices, *ring.brdf_net(s))
+            surface.write(vertices, ring.brdf_net(s))
             flow.append(linear_to_srgb(bridge.draw(surface, photograph, spp=64)[0][0].numpy()))
     maps = {name: m[0] for name, m in bridge.maps(surface, photograph).items()}
     seen = (maps["normal"] != 0).any(-1, keepdims=True)

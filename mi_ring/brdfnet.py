@@ -1,5 +1,9 @@
 """BRDF-Net: the reflectance at every point of the domain (paper, section 3)."""
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -7,27 +11,56 @@ from torch.nn import functional as F
 from mi_ring.encoding import PosEnc
 
 
+class Parameter(NamedTuple):
+    """A parameter of a BSDF that BRDF-Net predicts."""
+
+    name: str
+    channels: int  # 1 or 3
+    low: float
+    high: float  # inf: no upper end
+    start: float = 0.0  # is added to the network's output, before that is brought into the range
+
+
+#: The paper's five numbers.
+COOK_TORRANCE = (
+    Parameter("diffuse", 3, 0.0, math.inf),
+    Parameter("specular", 1, 0.0, math.inf, -2.0),
+    Parameter("roughness", 1, 0.0, 1.0, -0.5),
+)
+
+
 class BRDFNet(nn.Module):
     """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons on the domain point s, never on the deformed point.
 
-    `scale` is the order of magnitude of ρ in the scene's units of light: the networks see numbers near 1 whatever the
-    photographer's units are. Diffuse and specular are positive (softplus), roughness lies in (0, 1) (sigmoid).
+    Or the parameters of another BSDF. `scale` is the order of magnitude of ρ in the scene's units of light: the
+    networks see numbers near 1 whatever the photographer's units are. Softplus times `scale` keeps a parameter without
+    an upper end above its lower one, a sigmoid the others in their ranges.
     """
 
-    def __init__(self, scale: float = 1.0, width: int = 256, frequencies: int = 16):
+    def __init__(
+        self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE, width: int = 256,
+        frequencies: int = 16,
+    ):  # fmt: skip
         super().__init__()
+        self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.encoding = PosEnc(frequencies)
         sizes = [self.encoding.width] + [width] * 5
         self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:]))
-        self.output = nn.Linear(width, 5)
+        self.output = nn.Linear(width, sum(p.channels for p in self.bsdf_parameters))
         self.register_buffer("scale", torch.tensor(float(scale)))
 
-    def forward(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(diffuse (..., 3), specular (...), roughness (...)) at domain points (..., 3)."""
+    def forward(self, s: Tensor) -> dict[str, Tensor]:
+        """The parameters by name at domain points (..., 3): (..., 3) where they are colours, else (...)."""
         h = self.encoding(s)
         for layer in self.hidden:
             h = F.leaky_relu(layer(h))
-        raw = self.output(h).float()
-        diffuse = self.scale * F.softplus(raw[..., :3])
-        specular = self.scale * F.softplus(raw[..., 3] - 2)
-        return diffuse, specular, torch.sigmoid(raw[..., 4] - 0.5)
+        raw = self.output(h).float().split([p.channels for p in self.bsdf_parameters], -1)
+        result = {}
+        for parameter, x in zip(self.bsdf_parameters, raw):
+            x = x if parameter.channels == 3 else x[..., 0]
+            if math.isinf(parameter.high):
+                value = parameter.low + self.scale * F.softplus(x + parameter.start)
+            else:
+                value = parameter.low + (parameter.high - parameter.low) * torch.sigmoid(x + parameter.start)
+            result[parameter.name] = value
+        return result

@@ -6,20 +6,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring import reflectance
+from mi_ring.brdfnet import COOK_TORRANCE
+from mi_ring.bsdf import check_attributes
 from mi_ring.edges import Edges
 from mi_ring.integrator import render_maps, render_photographs
 from mi_ring.mesh import FACES, POSITIONS
-
-DIFFUSE, SPECULAR, ROUGHNESS = "vertex_diffuse", "vertex_specular", "vertex_roughness"
 
 
 class Surface:
     """The `shapenet` shape of a loaded scene, as something that torch tensors are written to.
 
-    Other shapes and top-level emitters of the scene take part in every picture but are not changed.
+    With a `Ring`, the shape takes on the BSDF that the ring's parameters are those of. Other shapes and top-level
+    emitters of the scene take part in every picture but are not changed.
     """
 
-    def __init__(self, scene, shape):
+    def __init__(self, scene, shape, ring=None):
+        if ring is not None:
+            for parameter in ring.brdf_net.bsdf_parameters:
+                if not shape.has_attribute(f"vertex_{parameter.name}"):
+                    values = np.zeros(shape.vertex_count() * parameter.channels, np.float32)
+                    shape.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
+            shape.set_bsdf(reflectance.load(ring.bsdf))
+            check_attributes(shape)
         self.scene = scene
         self.params = mi.traverse(scene)
         self.prefix = next(
@@ -32,41 +41,45 @@ class Surface:
         """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
         self.faces = np.ascontiguousarray(faces, np.uint32)
 
-    def write(self, vertices: Tensor, diffuse: Tensor, specular: Tensor, roughness: Tensor, gradients: bool = False):
-        """Write (V, 3) vertices [scene units], (V, 3), (V,), (V,) attributes. Returns the Dr.Jit arrays."""
-        arrays = [mi.Float(t.detach().contiguous().numpy().ravel()) for t in (vertices, diffuse, specular, roughness)]
+    def write(self, vertices: Tensor, attributes: dict[str, Tensor], gradients: bool = False):
+        """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes. Returns the Dr.Jit arrays, in that order.
+
+        All attributes that the shape has must be written when the number of vertices changes.
+        """
+        tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
+        arrays = {name: mi.Float(t.detach().contiguous().numpy().ravel()) for name, t in tensors.items()}
         if gradients:
-            dr.enable_grad(arrays)
+            dr.enable_grad(*arrays.values())
         if self.faces is not None:
             self.params[self.prefix + FACES] = mi.UInt32(self.faces.ravel())
             self.faces = None
-        for name, array in zip((POSITIONS, DIFFUSE, SPECULAR, ROUGHNESS), arrays):
+        for name, array in arrays.items():
             self.params[self.prefix + name] = array
         self.params.update()
         self.written += 1
-        return arrays
+        return list(arrays.values())
 
     def show(self, ring, s: Tensor, faces: np.ndarray) -> None:
         """Write a `Ring` at domain points (V, 3) with these triangles."""
         with torch.no_grad():
             self.set_faces(faces)
-            self.write(ring.surface(s), *ring.brdf_net(s))
+            self.write(ring.surface(s), ring.brdf_net(s))
 
 
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows):
-        gradients = any(t.requires_grad for t in (vertices, diffuse, specular, roughness))
-        arrays = surface.write(vertices, diffuse, specular, roughness, gradients)
+    def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *attributes):
+        gradients = any(t.requires_grad for t in (vertices, *attributes))
+        arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
         surface.edges = Edges.of(surface.scene, surface.edges)
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows, surface.edges)
         dr.eval(channels)
-        ctx.save = (surface, surface.written, arrays, channels)
+        ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *attributes)])
         return pictures(channels, photographs)
 
     @staticmethod
     def backward(ctx, rgb_grad, alpha_grad):
-        surface, written, arrays, channels = ctx.save
+        surface, written, arrays, channels, shapes = ctx.save
         if surface.written != written:
             raise RuntimeError("the surface was written again since this picture: call backward before the next one")
         for channel, grad in zip(channels, (*rgb_grad.unbind(-1), alpha_grad)):
@@ -74,21 +87,21 @@ class _Render(torch.autograd.Function):
                 dr.set_grad(channel, mi.Float(grad.contiguous().numpy().ravel()))
                 dr.enqueue(dr.ADMode.Backward, channel)
         dr.traverse(dr.ADMode.Backward)
-        out = [torch.from_numpy(np.array(dr.grad(a))) for a in arrays]
-        return out[0].reshape(-1, 3), out[1].reshape(-1, 3), out[2], out[3], None, None, None, None, None
+        grads = [torch.from_numpy(np.array(dr.grad(a))).reshape(shape) for a, shape in zip(arrays, shapes)]
+        return None, None, None, None, None, None, *grads
 
 
-def render(surface, photographs, vertices, diffuse, specular, roughness, spp=4, seed=0, shadows=True):
+def render(surface, photographs, vertices, attributes, spp=4, seed=0, shadows=True):
     """Predicted photographs of the surface, each under its own light, differentiable.
 
-    `vertices` (V, 3) [scene units], `diffuse` (V, 3), `specular` (V,), `roughness` (V,): attributes as `cooktorrance`
-    defines them. `photographs`: `integrator.Photographs`, which to render and at what size; `spp` stratified samples
-    per pixel; the same `seed` gives the same samples.
+    `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
+    `photographs`: `integrator.Photographs`, which to render and at what size; `spp` stratified samples per pixel; the
+    same `seed` gives the same samples.
 
-    Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all four tensors are
+    Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage.
     """
-    return _Render.apply(vertices, diffuse, specular, roughness, surface, photographs, spp, seed, shadows)
+    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values())
 
 
 def draw(surface, photographs, spp=16, seed=0, shadows=True):
@@ -106,16 +119,16 @@ def pictures(channels, photographs):
     return torch.stack(picture[:3], dim=-1), picture[3]
 
 
-def maps(surface, photographs) -> dict[str, np.ndarray]:
+def maps(surface, photographs, parameters=COOK_TORRANCE) -> dict[str, np.ndarray]:
     """What the pixels of `photographs` see of the surface as last written, zero where they see none.
 
-    `normal` (N, H, W, 3) in world space, `diffuse` (N, H, W, 3), `specular` and `roughness` (N, H, W).
+    `normal` (N, H, W, 3) in world space, and these BSDF parameters by name, (N, H, W, 3) or (N, H, W).
     """
     width, height = photographs.size
-    channels = [np.array(c).reshape(len(photographs), height, width) for c in render_maps(surface.scene, photographs)]
-    return {
-        "normal": np.stack(channels[:3], -1),
-        "diffuse": np.stack(channels[3:6], -1),
-        "specular": channels[6],
-        "roughness": channels[7],
-    }
+    channels = render_maps(surface.scene, photographs, {f"vertex_{p.name}": p.channels for p in parameters})
+    channels = np.stack([np.array(c) for c in channels], -1).reshape(len(photographs), height, width, -1)
+    result, first = {"normal": channels[..., :3]}, 3
+    for p in parameters:
+        result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
+        first += p.channels
+    return result

@@ -49,6 +49,9 @@ class Config:
     """Samples per pixel."""
     loss: Literal["l2", "l1", "log"] = "l1"
     """How predicted and observed radiance are compared."""
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
+    base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
     laplacian_scale: float = 0.01

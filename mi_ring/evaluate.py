@@ -77,7 +77,7 @@ def compare_surfaces(scene: capture.Capture, guess: mi.Scene, truth: mi.Scene, d
 
 def psnr(scene: capture.Capture, ring: Ring, subdivisions: int, spp: int) -> float:
     """Of all pixels of all photographs [dB]: predictions as 8-bit sRGB against the files, sRGB in [0, 1]."""
-    surface = bridge.Surface(scene.scene, scene.shape)
+    surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(subdivisions))
     errors = []
     for k in range(len(scene)):

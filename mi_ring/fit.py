@@ -16,7 +16,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from mi_ring import bridge, capture, command, losses, results
+from mi_ring import bridge, capture, command, losses, reflectance, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
@@ -36,8 +36,10 @@ class Fit:
         torch.manual_seed(config.seed)
         center, radius = scene.sphere()
         self.exposure = scene.exposure()
-        self.ring = Ring(center, radius, scene.reflectance(center, self.exposure), scene.shape.domain)
-        self.surface = bridge.Surface(scene.scene, scene.shape)
+        parameters, bsdf = reflectance.predicted(scene.path, scene.shape, config.parameters)
+        scale = scene.reflectance(center, self.exposure)
+        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf)
+        self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
         self.optimizers = optimizers(self.ring, config)
         self.stages = config.stages()
         self.autocast = autocast(config.precision)
@@ -45,9 +47,9 @@ class Fit:
         self.failures = 0  # losses or gradients in a row that were not finite
 
     def deform(self, s):
-        """Surface points and their reflectance at domain points (V, 3)."""
+        """Surface points, and their reflectance by the names of its parameters, at domain points (V, 3)."""
         with self.autocast():
-            return self.ring.surface(s), *self.ring.brdf_net(s)
+            return self.ring.surface(s), self.ring.brdf_net(s)
 
     def choose(self):
         """Indices of the photographs of one iteration, all of one size (width, height)."""
@@ -75,14 +77,14 @@ class Fit:
         rotation = Rotation.from_quat(torch.randn(4, generator=self.random).numpy()).as_matrix()
         s, _ = self.ring.domain.sample(self.stage.level, torch.as_tensor(rotation, dtype=torch.float32))
 
-        vertices, diffuse, specular, roughness = self.deform(s)
+        vertices, material = self.deform(s)
 
         index, size = self.choose()
         scale = -(-size[0] // self.stage.width)
         observed, clipped, mask, masked = self.capture.observe(index, scale)
         photographs = self.capture.photographs.select(index, size, scale)
         predicted, coverage = bridge.render(
-            self.surface, photographs, vertices, diffuse, specular, roughness,
+            self.surface, photographs, vertices, material,
             spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)), shadows=self.capture.shadows,
         )  # fmt: skip
 
@@ -242,7 +244,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = config.folder
     if config.resume:
         fit.restore(folder / "checkpoint.pt")
-    fitted_scene = results.scene_xml(config.scene, folder, config.subdivisions)
+    fitted_scene = results.scene_xml(config.scene, folder, config.subdivisions, fit.ring.bsdf)
     results.prepare(folder, config)
     with interruptible() as interrupted:
         print(f"{len(scene)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")

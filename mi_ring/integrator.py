@@ -8,7 +8,7 @@ import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` keeps the classes of an older variant
 
 from mi_ring import photograph
-from mi_ring.bsdf import MIN_COSINE, CookTorrance, check_attributes
+from mi_ring.bsdf import MIN_COSINE, check_attributes
 from mi_ring.edges import Curve, Edges, cast, leave
 from mi_ring.photograph import Photograph, camera_ray, project, project_tangent
 
@@ -367,20 +367,23 @@ def boundary(scene, photographs, curve: Curve, seed, shadows):
     return q, curve.view, [dr.replace_grad(mi.Float(0), jump * moved) for jump in jumps], active
 
 
-def render_maps(scene, photographs):
-    """Normals and material where the centre of each pixel sees a `cooktorrance` surface, zero elsewhere.
+def render_maps(scene, photographs, attributes):
+    """Normals, and mesh attributes (channels by name) of the shapes that have them, at the centres of pixels.
 
-    Returns Floats of N·H·W pixels: [nx, ny, nz, diffuse r, g, b, specular, roughness], normals in world space.
+    Returns Floats of N·H·W pixels: [nx, ny, nz, first attribute, …], normals in world space, zero where there is none.
     """
     si = scene.ray_intersect(center_rays(photographs)[0])
-    maps = [*si.sh_frame.n, *([mi.Float(0)] * 5)]
-    for shape in scene.shapes():
-        if isinstance(shape.bsdf(), CookTorrance):
-            here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
-            diffuse, specular, roughness = shape.bsdf().parameters(si, here)
-            material = [*diffuse, specular, roughness]
-            maps[3:] = [dr.select(here, new, old) for new, old in zip(material, maps[3:])]
-    return [dr.select(si.is_valid(), m, 0) for m in maps]
+    maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]
+    for name, channels in attributes.items():
+        values = [mi.Float(0)] * channels
+        for shape in scene.shapes():
+            if shape.is_mesh() and shape.has_attribute(name):
+                here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+                one = channels == 1
+                found = [shape.eval_attribute_1(name, si, here)] if one else shape.eval_attribute_3(name, si, here)
+                values = [dr.select(here, new, old) for new, old in zip(found, values)]
+        maps += values
+    return maps
 
 
 mi.register_integrator("photometric", Photometric)

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 import trimesh
 
-from mi_ring.bsdf import ATTRIBUTES, check_attributes
+from mi_ring.bsdf import check_attributes
 from mi_ring.domain import Domain, Sphere
 from mi_ring.photograph import beside_scene
 from mi_ring.ring import Ring
@@ -34,8 +34,9 @@ class ShapeNetMesh(mi.Mesh):
     (nested)         bsdf      usually ``cooktorrance``, which reads the attributes below
     ================ ========= ===============================================================================
 
-    The mesh carries smooth normals and the attributes ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
-    ``vertex_roughness`` (1); without ``weights`` they are 0.5, 0 and 0.5. A nested BSDF that asks for another
+    The mesh carries smooth normals and, for each parameter that the fit of ``weights`` predicts, the attribute
+    ``vertex_<parameter>``: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
+    ``vertex_roughness`` (1). Without ``weights`` it has these, 0.5, 0 and 0.5. A nested BSDF that asks for another
     attribute, or for one with another number of channels, is an error. What it does not do: texture coordinates;
     colours in spectral variants, where Mitsuba takes three-channel attributes for the coefficients of a spectrum.
 
@@ -81,11 +82,12 @@ class ShapeNetMesh(mi.Mesh):
         center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         self.ring = Ring.load(beside_scene(given["weights"])) if "weights" in given else None
 
-        material = torch.tensor([0.5, 0.5, 0.5]), torch.tensor(0.0), torch.tensor(0.5)
+        material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
+                    "roughness": torch.tensor(0.5)}  # fmt: skip
         if self.ring is None:
             s, faces = self.domain.sample(self.subdivisions)
             vertices = torch.as_tensor(center, dtype=torch.float32) + radius * s
-            material = [m.expand(len(s), *m.shape) for m in material]
+            material = {name: m.expand(len(s), *m.shape) for name, m in material.items()}
         else:
             s, faces = self.ring.domain.sample(self.subdivisions)
             with torch.no_grad():
@@ -103,8 +105,8 @@ class ShapeNetMesh(mi.Mesh):
         params[POSITIONS] = type(params[POSITIONS])(vertices.numpy().ravel())
         params[FACES] = type(params[FACES])(np.asarray(faces, np.uint32).ravel())
         params.update()
-        for (name, channels), value in zip(ATTRIBUTES.items(), material):
-            self.add_attribute(name, channels, value.contiguous().numpy().ravel())
+        for name, value in material.items():
+            self.add_attribute(f"vertex_{name}", value[0].numel(), value.contiguous().numpy().ravel())
         check_attributes(self)
 
     def to_string(self):

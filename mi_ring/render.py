@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> None:
         config.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{config.out}: cannot be written ({error.strerror}); choose another folder") from error
-    surface = bridge.Surface(scene.scene, scene.shape)
+    surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
     for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
         rgb, _ = bridge.draw(surface, scene.photograph(k), spp=config.spp, shadows=scene.shadows)

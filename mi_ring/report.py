@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from dataclasses import dataclass
 from importlib import resources
 
@@ -61,18 +62,21 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
     predicted, coverage = bridge.draw(fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows)
     photo, guess = linear_to_srgb(observed[0].numpy()), linear_to_srgb(predicted[0].numpy())
     small = capture.photograph(k, max(1, max(capture.sensors[k].size) // THUMBNAIL))
-    maps = {key: m[0] for key, m in bridge.maps(fit.surface, small).items()}
+    parameters = fit.ring.brdf_net.bsdf_parameters
+    maps = {key: m[0] for key, m in bridge.maps(fit.surface, small, parameters).items()}
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
-    scale = 2.5 * float(fit.ring.brdf_net.scale)
     pictures = {
         "photograph": photo,
         "prediction": guess,
         "4 × difference": 4 * np.abs(photo - guess),
         "normals": normal,
-        "diffuse": linear_to_srgb(maps["diffuse"] / scale),
-        "specular": linear_to_srgb(maps["specular"] / scale),
-        "roughness": maps["roughness"],
     }
+    for p in parameters:
+        if math.isinf(p.high):
+            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(fit.ring.brdf_net.scale)))
+        else:
+            value = (maps[p.name] - p.low) / (p.high - p.low)
+            pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
     iou = None
     if masked:
         inside, found = mask[0].numpy() > 0.5, coverage[0].numpy() > 0.5

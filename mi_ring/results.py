@@ -99,15 +99,15 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
 
 
 def write_mesh(weights: Path, subdivisions: int, path: Path) -> None:
-    """The surface as PLY in scene units, with vertex_diffuse, vertex_specular and vertex_roughness."""
+    """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …)."""
     mesh = mi.load_dict({"type": "shapenet", "weights": str(weights.resolve()), "subdivisions": subdivisions})
     partial = path.with_name(f".{path.name}.partial.ply")
     mesh.write_ply(str(partial))
     os.replace(partial, path)
 
 
-def scene_xml(source: Path, folder: Path, subdivisions: int) -> bytes:
-    """The scene file `source` with the fitted object, its references rewritten to be relative to `folder`.
+def scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
+    """The scene file `source` with the fitted object and its `bsdf`, file names rewritten to be relative to `folder`.
 
     Raises InputError for a scene that cannot be rewritten, and for a shapenet that a fit has no use for.
     """
@@ -125,6 +125,9 @@ def scene_xml(source: Path, folder: Path, subdivisions: int) -> bytes:
             raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
         if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
             shape.remove(element)
+    for element in shape.findall("bsdf") + shape.findall("ref"):
+        shape.remove(element)
+    shape.append(ElementTree.fromstring(bsdf))
     ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
     ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")
     ElementTree.indent(tree)

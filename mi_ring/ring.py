@@ -5,23 +5,26 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mi_ring.brdfnet import BRDFNet
+from mi_ring.brdfnet import COOK_TORRANCE, BRDFNet
 from mi_ring.domain import Domain, Sphere
 from mi_ring.errors import InputError
 from mi_ring.shapenet import ShapeNet
 
-FORMAT = 1  #: version of the file `ring.pt`
+FORMAT = 2  #: version of the file `ring.pt`
 
 
 class Ring(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
 
-    `center` (3,) and `radius` are in scene units.
+    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
     """
 
-    def __init__(self, center, radius: float, scale: float = 1.0, domain: Domain | None = None):
+    def __init__(
+        self, center, radius: float, scale: float = 1.0, domain: Domain | None = None, parameters=COOK_TORRANCE,
+        bsdf: str = '<bsdf type="cooktorrance"/>',
+    ):  # fmt: skip
         super().__init__()
-        self.shape_net, self.brdf_net = ShapeNet(), BRDFNet(scale)
+        self.shape_net, self.brdf_net, self.bsdf = ShapeNet(), BRDFNet(scale, parameters), bsdf
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.domain = domain or Sphere()
@@ -34,12 +37,16 @@ class Ring(nn.Module):
         domain = None
         if not isinstance(self.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
             domain = {"points": torch.tensor(self.domain.points), "faces": torch.tensor(self.domain.faces)}
-        return {"format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {}}
+        parameters = [tuple(p) for p in self.brdf_net.bsdf_parameters]
+        return {
+            "format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {},
+            "parameters": parameters, "bsdf": self.bsdf,
+        }  # fmt: skip
 
     @classmethod
     def from_state(cls, state: dict) -> "Ring":
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
-        ring = cls(torch.zeros(3), 1.0, domain=domain)
+        ring = cls(torch.zeros(3), 1.0, domain=domain, parameters=state["parameters"], bsdf=state["bsdf"])
         ring.load_state_dict(state["networks"])
         return ring
 

@@ -65,7 +65,7 @@ class Setting:
         }  # fmt: skip
 
     def losses(self, vertices, material, spp, seed):
-        rgb, alpha = bridge.render(self.surface, self.photographs, vertices, *material, spp, seed, self.shadows)
+        rgb, alpha = bridge.render(self.surface, self.photographs, vertices, material, spp, seed, self.shadows)
         return (self.radiance_weight * rgb).sum(), (self.coverage_weight * alpha).sum()
 
 
