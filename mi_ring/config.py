@@ -49,6 +49,10 @@ class Config:
     """Samples per pixel."""
     loss: Literal["l2", "l1", "log"] = "l1"
     """How predicted and observed radiance are compared."""
+    shadows: bool = True
+    """Is a point lit only if it sees the light?"""
+    indirect: bool = True
+    """Add the light that bounces between surfaces to the predictions. It needs lights of the true intensity."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
     laplacian_scale: float = 0.01

@@ -16,7 +16,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from mi_ring import bridge, capture, command, losses, results
+from mi_ring import bridge, capture, command, indirect, losses, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
@@ -24,6 +24,7 @@ from mi_ring.ring import Ring
 CHECKPOINT_SECONDS = 30.0
 LOG_EVERY = 5
 FIXED_WORK = 2500  # what an iteration costs besides its vertices, in vertices: for the time left
+INDIRECT_FROM = 0.2  # share of the iterations after which interreflection is added: the shape must be roughly right
 REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
 
 
@@ -83,8 +84,12 @@ class Fit:
         photographs = self.capture.photographs.select(index, size, scale)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, diffuse, specular, roughness,
-            spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)), shadows=self.capture.shadows,
+            spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)),
+            shadows=config.shadows and self.capture.shadows,
         )  # fmt: skip
+        if config.indirect and progress >= INDIRECT_FROM:
+            seed = int(torch.randint(2**31, (), generator=self.random))
+            predicted = predicted + indirect.interreflection(self.surface, photographs, coverage, seed)
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
         if masked.any() and config.weights.get("mask"):
