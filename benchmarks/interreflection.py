@@ -14,13 +14,15 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "scenes"))
 
-import mi_ring  # noqa: I001 (chooses LLVM before Mitsuba is imported)
 import make_pot2
-import mitsuba as mi
 import numpy as np
 import trimesh
 from accuracy import COLUMNS, measure, processor
 from scipy.interpolate import CubicSpline
+
+from mi_ring import bridge, capture, indirect, results  # chooses LLVM before Mitsuba is imported
+
+import mitsuba as mi  # isort: skip
 
 CENTER = np.array([-21.0, 33.0, 95.0])  # of the bowl's bounding box, scene units [mm]
 VIEWS, NOVEL_VIEWS = 28, 8
@@ -58,9 +60,11 @@ def bowl(rings=160, sectors=288):
 
 
 def glaze(p):
-    """Base colour (N, 3) and roughness (N,): a bright glaze, apricot that has run into cream, with a few brush marks."""
+    """Base colour (N, 3) and roughness (N,): a bright glaze, apricot that has run into cream, and brush marks."""
     rng = np.random.default_rng(3)
-    run, cloud, brush = make_pot2.noise(p, 40, rng), make_pot2.noise(p, 50, rng), make_pot2.noise(p * [1, 4, 1], 28, rng)
+    run, cloud, brush = (
+        make_pot2.noise(p * [1, stretch, 1], size, rng) for stretch, size in ((1, 40), (1, 50), (4, 28))
+    )
     share = make_pot2.smooth_step(-1.0, 1.0, run + 0.03 * p[:, 1])[:, None]
     color = share * [0.82, 0.62, 0.40] + (1 - share) * [0.80, 0.75, 0.62]
     color *= 1 - 0.25 * make_pot2.smooth_step(1.2, 1.8, brush)[:, None]
@@ -120,6 +124,21 @@ def make_capture(folder, spp):
     make_pot2.write_scene(folder / "scene.xml", "", True, seen, intensity)
 
 
+def novel_psnr(run: Path, scene: Path) -> dict[str, float]:
+    """Of novel photographs [dB], predicted as directly lit and with interreflection."""
+    ring, novel = results.load_ring(run), capture.load(scene)
+    surface = bridge.Surface(novel.scene, novel.shape)
+    surface.show(ring, *ring.domain.sample(6))
+    numbers = {}
+    for name, draw in (("direct", bridge.draw), ("indirect", indirect.draw)):
+        errors = []
+        for k in range(len(novel)):
+            predicted = capture.linear_to_srgb(draw(surface, novel.photograph(k), spp=64)[0][0].numpy())
+            errors.append(np.mean((predicted - capture.linear_to_srgb(novel.observe([k])[0][0].numpy())) ** 2))
+        numbers[name] = float(-10 * np.log10(np.mean(errors)))
+    return numbers
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -130,12 +149,15 @@ def main() -> None:
     if not scene.is_file():
         make_capture(scene.parent, arguments.spp)
     print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
-    heads = [c.replace("_", " ") for c in COLUMNS]
-    print("| fit | " + " | ".join(heads) + " | fit s |")
-    print("|---" * (len(heads) + 2) + "|", flush=True)
+    columns = [c for c in COLUMNS if not c.startswith("psnr")]
+    heads = [*(c.replace("_", " ") for c in columns), "psnr novel, direct", "with interreflection", "fit s"]
+    print("| fit | " + " | ".join(heads) + " |")
+    print("|---" * (len(heads) + 1) + "|", flush=True)
     for option in ("--no-indirect", "--indirect"):
-        row = measure(scene, arguments.out / option.strip("-"), [option, *options])
-        cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in COLUMNS]
+        run = arguments.out / option.strip("-")
+        row = measure(scene, run, [option, *options])
+        row |= novel_psnr(run, scene.parent / "truth" / "scene.xml")
+        cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in (*columns, "direct", "indirect")]
         print(f"| `{option}` | " + " | ".join(cells) + f" | {row['fit_seconds']:.0f} |", flush=True)
 
 

@@ -52,7 +52,7 @@ class Config:
     shadows: bool = True
     """Is a point lit only if it sees the light?"""
     indirect: bool = True
-    """Add the light that bounces between surfaces to the predictions. It needs lights of the true intensity."""
+    """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
     laplacian_scale: float = 0.01

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import hashlib
 import json
+import math
 import os
 import signal
 import time
@@ -24,7 +25,6 @@ from mi_ring.ring import Ring
 CHECKPOINT_SECONDS = 30.0
 LOG_EVERY = 5
 FIXED_WORK = 2500  # what an iteration costs besides its vertices, in vertices: for the time left
-INDIRECT_FROM = 0.2  # share of the iterations after which interreflection is added: the shape must be roughly right
 REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
 
 
@@ -37,7 +37,11 @@ class Fit:
         torch.manual_seed(config.seed)
         center, radius = scene.sphere()
         self.exposure = scene.exposure()
-        self.ring = Ring(center, radius, scene.reflectance(center, self.exposure), scene.shape.domain)
+        reflectance = scene.reflectance(center, self.exposure)
+        self.ring = Ring(center, radius, reflectance, scene.shape.domain)
+        #: Of the light it gets, how much the object reflects: more than all where the lights' intensities are not true.
+        self.albedo = math.pi * reflectance
+        self.indirect = config.indirect and self.albedo < 1
         self.surface = bridge.Surface(scene.scene, scene.shape)
         self.optimizers = optimizers(self.ring, config)
         self.stages = config.stages()
@@ -87,7 +91,7 @@ class Fit:
             spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)),
             shadows=config.shadows and self.capture.shadows,
         )  # fmt: skip
-        if config.indirect and progress >= INDIRECT_FROM:
+        if self.indirect:
             seed = int(torch.randint(2**31, (), generator=self.random))
             predicted = predicted + indirect.interreflection(self.surface, photographs, coverage, seed)
 
@@ -251,6 +255,9 @@ def main(arguments: Sequence[str]) -> int:
     results.prepare(folder, config)
     with interruptible() as interrupted:
         print(f"{len(scene)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
+        if config.indirect and not fit.indirect:
+            print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
+                  f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
         if not config.resume:
             results.write_inputs(folder / "inputs.png", fit)
         try:

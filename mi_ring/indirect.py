@@ -10,12 +10,13 @@ from mi_ring import bridge
 from mi_ring.integrator import Photometric, next_2d, pixel_rays
 from mi_ring.losses import blur
 
+BOUNCES = 3  # after the first surface
 WIDTH = 64  # of the pictures of interreflection, at most [px]: it varies slowly
 SPP = 4
 BLUR = 1.0  # [px]: smoothes the few samples
 
 
-def render_indirect(scene, photographs, spp, seed, bounces=3):
+def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES):
     """Light that has been reflected more than once: [R, G, B, coverage], Floats of N·H·W pixels, no gradients.
 
     Paths are traced from the camera, the BSDFs sampled, and shaded directly lit wherever they arrive (the light of
@@ -71,3 +72,10 @@ def interreflection(surface, photographs, coverage: Tensor, seed: int) -> Tensor
     height, width = coverage.shape[1:]
     images = F.pad(images, (0, width - images.shape[3], 0, height - images.shape[2]), mode="replicate")
     return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
+
+
+def draw(surface, photographs, spp=16, seed=0, shadows=True):
+    """Like `bridge.draw`, interreflection included."""
+    rgb, coverage = bridge.draw(surface, photographs, spp, seed, shadows)
+    channels = render_indirect(surface.scene, photographs, spp, seed + 1)
+    return rgb + bridge.pictures(channels, photographs)[0], coverage
