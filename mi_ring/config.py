@@ -52,6 +52,10 @@ class Config:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
     base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
+    shadows: bool = True
+    """Is a point lit only if it sees the light?"""
+    indirect: bool = True
+    """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
     laplacian_scale: float = 0.01

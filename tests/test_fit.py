@@ -156,6 +156,40 @@ def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_
     assert all(tensor.isfinite().all() for tensor in ring.values())
 
 
+def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
+    def glare(surface, photographs, coverage, seed):
+        return 1000 * coverage[..., None].expand(*coverage.shape, 3)
+
+    monkeypatch.setattr(fit.indirect, "interreflection", glare)
+    for options, bright in (([], True), (["--no-indirect"], False)):
+        first = fit.Fit(fit.capture.load(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
+        assert (first.step()["rgb"] > 100) == bright
+
+
+def test_interreflection_is_left_out_where_intensities_cannot_be_true(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    path.write_text(re.sub(r'name="intensity" value="[^"]*"', 'name="intensity" value="1"', path.read_text()))
+    for option, said in (("--indirect", True), ("--no-indirect", False)):
+        assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "1", option, *QUICK]) == 0
+        assert ("Interreflection is left out" in capsys.readouterr().out) == said
+
+
+def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatch):
+    path, edit = broken_capture
+    genuine, used = fit.bridge.render, []
+    monkeypatch.setattr(fit.bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
+
+    def step(*options):
+        fit.Fit(fit.capture.load(path), fit.parse([str(path), *QUICK, *options])).step()
+
+    step()
+    step("--no-shadows")
+    edit('<integrator type="photometric"/>',
+         '<integrator type="photometric"><boolean name="shadows" value="false"/></integrator>')  # fmt: skip
+    step()
+    assert used == [True, False, False]
+
+
 def masks_on_some(path):
     text = path.read_text()
     for k in range(0, 12, 2):

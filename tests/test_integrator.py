@@ -193,10 +193,15 @@ def test_alpha_is_the_coverage_of_the_ball():
 
 
 def test_maps_are_normals_and_material_at_the_pixel_centres():
-    """Of the ball, and zero where the background is; the wall is no `cooktorrance` surface."""
+    """Of the ball, and zero where the background is; the wall has no attributes."""
     scene = load(BALL, WALL)
+    params = mi.traverse(scene)
+    for name, value in (("diffuse", DIFFUSE), ("specular", [SPECULAR]), ("roughness", [ROUGHNESS])):
+        params[f"ball.vertex_{name}"] = mi.Float(np.tile(value, 10242))
+    params.update()
     photographs = Photographs.of(scene.sensors())
-    maps = np.stack([np.array(m).reshape(4, HEIGHT, WIDTH) for m in render_maps(scene, photographs)], -1)
+    maps = render_maps(scene, photographs, {"vertex_diffuse": 3, "vertex_specular": 1, "vertex_roughness": 1})
+    maps = np.stack([np.array(m).reshape(4, HEIGHT, WIDTH) for m in maps], -1)
     for k in range(4):
         origin, direction = rays(k)
         t = ball_distance(origin, direction)

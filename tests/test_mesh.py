@@ -129,9 +129,10 @@ def test_weights_give_the_surface_and_material_of_the_networks(tmp_path, subdivi
     assert spread.max() - spread.min() > 0.05  # no sphere
     np.testing.assert_allclose(mesh_of(shape).vertices, expected, atol=1e-4)  # coordinates of about 50
     np.testing.assert_array_equal(mesh_of(shape).faces, faces)
-    for name, value in zip(ATTRIBUTES, material):
+    assert {f"vertex_{name}" for name in material} == set(ATTRIBUTES)
+    for name, value in material.items():
         assert value.std() > 1e-3
-        np.testing.assert_allclose(np.array(params[name]), value.numpy().ravel(), rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(np.array(params[f"vertex_{name}"]), value.numpy().ravel(), rtol=1e-4, atol=1e-6)
 
 
 # Other domains.

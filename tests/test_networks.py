@@ -1,11 +1,13 @@
 """Shape-Net and BRDF-Net: the paper's sizes, its encoding, and the flow as an integrator."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import expm
 
-from mi_ring.brdfnet import BRDFNet
+from mi_ring.brdfnet import BRDFNet, Parameter
 from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 from mi_ring.ring import Ring
@@ -109,10 +111,32 @@ def test_brdf_net_predicts_positive_reflectance_and_roughness_below_one():
     net = BRDFNet(scale=7.0)
     for parameter in net.parameters():
         parameter.data.mul_(4)
-    diffuse, specular, roughness = net(torch.randn(100, 3))
+    diffuse, specular, roughness = net(torch.randn(100, 3)).values()
     assert diffuse.shape == (100, 3) and specular.shape == (100,) and roughness.shape == (100,)
     assert (diffuse >= 0).all() and (specular >= 0).all()
     assert ((roughness >= 0) & (roughness <= 1)).all() and roughness.std() > 0.1
+
+
+def test_brdf_net_keeps_the_ranges_of_other_parameters():
+    """Begins where it is told to, stays between low and high, colours apart from numbers."""
+    tint, colour = Parameter("tint", 1, -0.5, 2.0, 1.5), Parameter("colour", 3, 0.2, 0.7)
+    net = BRDFNet(50.0, [tint, colour, Parameter("haze", 1, 1.0, math.inf)])
+    net.output.weight.data.zero_()
+    net.output.bias.data.zero_()
+    first = net(torch.randn(2, 5, 3))
+    assert {name: value.shape for name, value in first.items()} == {
+        "tint": (2, 5), "colour": (2, 5, 3), "haze": (2, 5)
+    }  # fmt: skip
+    assert first["tint"][0, 0].item() == pytest.approx(-0.5 + 2.5 / (1 + math.exp(-1.5)))
+    assert first["colour"][0, 0, 1].item() == pytest.approx(0.45)
+    assert first["haze"][0, 0].item() == pytest.approx(1 + 50 * math.log(2))
+    net = BRDFNet(50.0, [tint, colour, Parameter("haze", 1, 1.0, math.inf)])
+    for parameter in net.parameters():
+        parameter.data.mul_(4)
+    wild = net(torch.randn(1000, 3))
+    assert wild["tint"].min() >= -0.5 and wild["tint"].max() <= 2.0 and wild["tint"].std() > 0.1
+    assert wild["colour"].min() >= 0.2 and wild["colour"].max() <= 0.7 and wild["colour"].std(1).max() > 0.02
+    assert wild["haze"].min() >= 1 and wild["haze"].max() > 60
 
 
 def test_brdf_scale_only_scales():
@@ -120,9 +144,10 @@ def test_brdf_scale_only_scales():
     one, many = BRDFNet(1.0), BRDFNet(250.0)
     many.load_state_dict({**one.state_dict(), "scale": torch.tensor(250.0)})
     s = torch.randn(7, 3)
-    torch.testing.assert_close(250 * one(s)[0], many(s)[0])
-    torch.testing.assert_close(250 * one(s)[1], many(s)[1])
-    torch.testing.assert_close(one(s)[2], many(s)[2])
+    one, many = one(s), many(s)
+    torch.testing.assert_close(250 * one["diffuse"], many["diffuse"])
+    torch.testing.assert_close(250 * one["specular"], many["specular"])
+    torch.testing.assert_close(one["roughness"], many["roughness"])
 
 
 @pytest.mark.parametrize("level", [0, 3])
@@ -142,4 +167,4 @@ def test_state_survives_the_file(tmp_path):
     again = Ring.load(tmp_path / "ring.pt")
     s = torch.randn(6, 3)
     assert torch.equal(again.surface(s), ring.surface(s))
-    assert all(torch.equal(a, b) for a, b in zip(again.brdf_net(s), ring.brdf_net(s)))
+    assert all(torch.equal(value, ring.brdf_net(s)[name]) for name, value in again.brdf_net(s).items())

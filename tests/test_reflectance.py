@@ -1,0 +1,144 @@
+"""Fits with other BSDFs than `cooktorrance`: which parameters are predicted, and what becomes of the scene."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring import bridge, capture, fit, reflectance
+from mi_ring.errors import InputError
+from mi_ring.results import load_ring
+
+QUICK = "--levels 3 --widths 56 --shares 1 --iterations 12 --batch 4 --subdivisions 3".split()
+PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
+  <float name="roughness" value="0.6"/><float name="spec_tint" value="0.2"/><float name="eta" value="1.4"/></bsdf>"""
+PREDICT = {"base_color": (0.0, 0.9), "roughness": (0.2, 1.0)}
+
+
+@pytest.fixture
+def scene(broken_capture):
+    """The small capture with an object of a `principled` BSDF, and a function that edits it."""
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>', PRINCIPLED)
+    return path, edit
+
+
+def arguments(path, out):
+    ranges = [str(v) for name, (low, high) in PREDICT.items() for v in (name, low, high)]
+    return [str(path), "--out", str(out), *QUICK, "--parameters", *ranges]
+
+
+def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
+    loaded = capture.load(scene[0])
+    (colour, rough), xml = reflectance.predicted(scene[0], loaded.shape, PREDICT)
+    assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
+    assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
+    assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
+    text = str(reflectance.load(xml))
+    assert '"vertex_base_color"' in text and '"vertex_roughness"' in text and "vertex_spec_tint" not in text
+
+
+def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
+    """The result's own scene, rendered by stock Mitsuba, is what the fit predicts."""
+    out = tmp_path / "run"
+    assert fit.main(arguments(scene[0], out)) == 0
+    ring = load_ring(out)
+    assert [p.name for p in ring.brdf_net.bsdf_parameters] == list(PREDICT)
+    saved = trimesh.load(out / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+    assert any("base_color" in name for name in saved.dtype.names)
+    loaded = capture.load(out / "scene.xml")
+    # As it stands in the file: the shape's own weights, without a ring given
+    surface = bridge.Surface(loaded.scene, loaded.shape)
+    predicted, _ = bridge.draw(surface, loaded.photograph(2), spp=256)
+    stock = mi.render(loaded.scene, sensor=2, integrator=mi.load_dict({"type": "direct"}), spp=256)
+    assert predicted.mean() > 0.01
+    assert predicted.mean().item() == pytest.approx(float(np.array(stock)[..., :3].mean()), rel=0.01)
+
+
+def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture, tmp_path):
+    """Shown in a scene whose shape has another BSDF, the fitted object looks the same."""
+    out = tmp_path / "run"
+    assert fit.main([*arguments(scene[0], out), "--no-indirect"]) == 0
+    ring, pictures = load_ring(out), []
+    for path in (out / "scene.xml", small_capture):
+        loaded = capture.load(path)
+        surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+        surface.show(ring, *ring.domain.sample(3))
+        pictures.append(bridge.draw(surface, loaded.photograph(4), spp=64)[0])
+    torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
+    assert pictures[0].mean() > 0.01
+
+
+@pytest.mark.parametrize("which", PREDICT)
+def test_gradients_of_attributes_equal_finite_differences(scene, which):
+    loaded = capture.load(scene[0])
+    parameters, xml = reflectance.predicted(scene[0], loaded.shape, PREDICT)
+    ring = fit.Ring(*loaded.sphere(), 1.0, None, parameters, xml)
+    surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+    s, faces = ring.domain.sample(3)
+    surface.set_faces(faces)
+    vertices = ring.surface(s).detach()
+    x, y, _ = s.T
+    material = {
+        "base_color": torch.stack([0.4 + 0.2 * x, 0.3 + 0.1 * y, 0.5 - 0.2 * x], -1),
+        "roughness": 0.5 + 0.2 * torch.sin(2 * y),
+    }
+    weight = 1 + torch.linspace(0, 1, 56)[:, None]
+
+    def loss(change):
+        moved = material | {which: material[which] + change}
+        return (weight * bridge.render(surface, loaded.photograph(1), vertices, moved, 16, 3)[0]).sum()
+
+    change = torch.zeros_like(material[which], requires_grad=True)
+    loss(change).backward()
+    direction = torch.rand(change.shape, generator=torch.Generator().manual_seed(1)) + 0.5
+    difference = (loss(0.01 * direction) - loss(-0.01 * direction)) / 0.02
+    assert abs(difference) > 0.1
+    assert (change.grad * direction).sum().item() == pytest.approx(difference.item(), rel=5e-3)
+
+
+def test_cooktorrance_keeps_its_distribution(broken_capture, tmp_path):
+    path, edit = broken_capture
+    given = '<bsdf type="cooktorrance"><string name="distribution" value="beckmann"/></bsdf>'
+    edit('<bsdf type="cooktorrance"/>', given)
+    assert fit.main([str(path), "--out", str(tmp_path / "run"), *QUICK, "--no-indirect"]) == 0
+    assert "beckmann" in load_ring(tmp_path / "run").bsdf
+    assert "beckmann" in str(mi.load_file(str(tmp_path / "run" / "scene.xml")).shapes()[0].bsdf())
+
+
+def test_part_of_cooktorrance(broken_capture):
+    """What the XML leaves to mesh attributes needs no starting value."""
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="specular" value="0.05"/></bsdf>')
+    ranges = {"diffuse": (0, math.inf), "roughness": (0.1, 1)}
+    parameters, xml = reflectance.predicted(path, capture.load(path).shape, ranges)
+    assert [p.channels for p in parameters] == [3, 1]
+    assert "vertex_specular" not in str(reflectance.load(xml))
+
+
+WRONG = {
+    "no parameters": ({}, "--parameters must say which.* of principled to predict.*base_color"),
+    "unknown": ({"colour": (0, 1)}, "principled has no texture colour; it has .*base_color"),
+    "a plain number": ({"eta": (1, 2)}, "principled has no texture eta"),
+    "upside down": ({"roughness": (1, 0)}, "range is 1 to 0, must be from lower to higher"),
+    "nan": ({"roughness": (math.nan, 1)}, "range is nan to 1"),
+    "nothing to start from": ({"metallic": (0, 1)}, "metallic: has no value"),
+}
+
+
+@pytest.mark.parametrize("ranges, message", WRONG.values(), ids=WRONG)
+def test_wrong_parameters_are_refused_in_one_line(scene, ranges, message):
+    loaded = capture.load(scene[0])
+    with pytest.raises(InputError, match=message) as caught:
+        reflectance.predicted(scene[0], loaded.shape, ranges)
+    assert "\n" not in str(caught.value)
+
+
+def test_shape_without_a_bsdf_is_refused(broken_capture):
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>', "")
+    with pytest.raises(InputError, match="has no <bsdf>"):
+        reflectance.predicted(path, capture.load(path).shape, {})
