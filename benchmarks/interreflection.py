@@ -20,7 +20,7 @@ import trimesh
 from accuracy import COLUMNS, measure, processor
 from scipy.interpolate import CubicSpline
 
-from mi_ring import bridge, capture, indirect, results  # chooses LLVM before Mitsuba is imported
+from mi_ring import bridge, capture, results  # chooses LLVM before Mitsuba is imported
 
 import mitsuba as mi  # isort: skip
 
@@ -127,13 +127,14 @@ def make_capture(folder, spp):
 def novel_psnr(run: Path, scene: Path) -> dict[str, float]:
     """Of novel photographs [dB], predicted as directly lit and with interreflection."""
     ring, novel = results.load_ring(run), capture.load(scene)
-    surface = bridge.Surface(novel.scene, novel.shape)
+    surface = bridge.Surface(novel.scene, novel.shape, ring)
     surface.show(ring, *ring.domain.sample(6))
     numbers = {}
-    for name, draw in (("direct", bridge.draw), ("indirect", indirect.draw)):
+    for name in ("direct", "indirect"):
         errors = []
         for k in range(len(novel)):
-            predicted = capture.linear_to_srgb(draw(surface, novel.photograph(k), spp=64)[0][0].numpy())
+            rgb, _ = bridge.draw(surface, novel.photograph(k), spp=64, indirect=name == "indirect")
+            predicted = capture.linear_to_srgb(rgb[0].numpy())
             errors.append(np.mean((predicted - capture.linear_to_srgb(novel.observe([k])[0][0].numpy())) ** 2))
         numbers[name] = float(-10 * np.log10(np.mean(errors)))
     return numbers

@@ -5,12 +5,15 @@ import mitsuba as mi
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from mi_ring import reflectance
 from mi_ring.brdfnet import COOK_TORRANCE
 from mi_ring.bsdf import check_attributes
 from mi_ring.edges import Edges
+from mi_ring.indirect import render_indirect
 from mi_ring.integrator import render_maps, render_photographs
+from mi_ring.losses import blur
 from mi_ring.mesh import FACES, POSITIONS
 
 
@@ -104,11 +107,31 @@ def render(surface, photographs, vertices, attributes, spp=4, seed=0, shadows=Tr
     return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values())
 
 
-def draw(surface, photographs, spp=16, seed=0, shadows=True):
-    """Like `render`, of the surface as last written and without gradients."""
+def draw(surface, photographs, spp=16, seed=0, shadows=True, indirect=False):
+    """Like `render`, of the surface as last written and without gradients; `indirect`: with interreflection."""
     channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
     dr.eval(channels)
-    return pictures(channels, photographs)
+    rgb, coverage = pictures(channels, photographs)
+    return rgb + interreflection(surface, photographs, coverage, seed + 1, 128, 32) if indirect else rgb, coverage
+
+
+def interreflection(surface, photographs, coverage: Tensor, seed: int, width: int = 64, spp: int = 4) -> Tensor:
+    """What interreflection adds to pictures of the surface as last written: linear radiance (N, H, W, 3).
+
+    `photographs`: as they were rendered; `coverage` (N, H, W): of that picture, through which alone gradients flow: the
+    outline feels this light too, shape and material do not (they are corrected for it, as in "Shape from
+    Interreflections", Nayar, Ikeuchi and Kanade, IJCV 1991). It varies slowly: it is rendered at most `width` pixels
+    wide, smoothed, and spread over what the object covers, so that its edges are those of the picture.
+    """
+    factor = -(-max(photographs.size) // width)
+    small = photographs.select(np.array(photographs.index), photographs.size, factor)
+    rgb, alpha = pictures(render_indirect(surface.scene, small, spp, seed), small)
+    images = torch.cat([rgb, alpha[..., None]], -1).movedim(-1, 1)
+    images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
+    images = F.interpolate(images, scale_factor=factor, mode="bilinear", align_corners=False)
+    height, width = coverage.shape[1:]
+    images = F.pad(images, (0, width - images.shape[3], 0, height - images.shape[2]), mode="replicate")
+    return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
 
 
 def pictures(channels, photographs):

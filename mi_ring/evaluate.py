@@ -81,7 +81,7 @@ def psnr(scene: capture.Capture, ring: Ring, subdivisions: int, spp: int) -> flo
     surface.show(ring, *ring.domain.sample(subdivisions))
     errors = []
     for k in range(len(scene)):
-        rgb, _ = bridge.draw(surface, scene.photograph(k), spp=spp, shadows=scene.shadows)
+        rgb, _ = bridge.draw(surface, scene.photograph(k), spp=spp, shadows=scene.shadows, indirect=ring.indirect)
         predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
         errors.append(np.mean((predicted - linear_to_srgb(scene.observe([k])[0][0].numpy())) ** 2))
     return float(-10 * np.log10(np.mean(errors)))

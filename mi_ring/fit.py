@@ -17,7 +17,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from mi_ring import bridge, capture, command, indirect, losses, reflectance, results
+from mi_ring import bridge, capture, command, losses, reflectance, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
@@ -42,7 +42,7 @@ class Fit:
         self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf)
         #: Of the light it gets, how much the object reflects: more than all where the lights' intensities are not true.
         self.albedo = math.pi * scale
-        self.indirect = config.indirect and self.albedo < 1
+        self.ring.indirect = config.indirect and self.albedo < 1
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
         self.optimizers = optimizers(self.ring, config)
         self.stages = config.stages()
@@ -92,9 +92,9 @@ class Fit:
             spp=config.spp, seed=int(torch.randint(2**31, (), generator=self.random)),
             shadows=config.shadows and self.capture.shadows,
         )  # fmt: skip
-        if self.indirect:
+        if self.ring.indirect:
             seed = int(torch.randint(2**31, (), generator=self.random))
-            predicted = predicted + indirect.interreflection(self.surface, photographs, coverage, seed)
+            predicted = predicted + bridge.interreflection(self.surface, photographs, coverage, seed)
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
         if masked.any() and config.weights.get("mask"):
@@ -256,7 +256,7 @@ def main(arguments: Sequence[str]) -> int:
     results.prepare(folder, config)
     with interruptible() as interrupted:
         print(f"{len(scene)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
-        if config.indirect and not fit.indirect:
+        if config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
                   f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
         if not config.resume:

@@ -2,18 +2,10 @@
 
 import drjit as dr
 import mitsuba as mi
-import torch
-from torch import Tensor
-from torch.nn import functional as F
 
-from mi_ring import bridge
 from mi_ring.integrator import Photometric, next_2d, pixel_rays
-from mi_ring.losses import blur
 
 BOUNCES = 3  # after the first surface
-WIDTH = 64  # of the pictures of interreflection, at most [px]: it varies slowly
-SPP = 4
-BLUR = 1.0  # [px]: smoothes the few samples
 
 
 def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES):
@@ -53,29 +45,3 @@ def reflect(scene, si, view, photographs, bounces, seed):
         lit = Photometric.shade(scene, si, lambda si: photographs.light(view, si), random, True)
         radiance += dr.select(active, throughput * lit, 0)
     return radiance
-
-
-def interreflection(surface, photographs, coverage: Tensor, seed: int) -> Tensor:
-    """What interreflection adds to pictures of the surface as last written: linear radiance (N, H, W, 3).
-
-    `photographs`: as they were rendered; `coverage` (N, H, W): of that picture, through which alone gradients flow: the
-    outline feels this light too, shape and material do not (they are corrected for it, as in "Shape from
-    Interreflections", Nayar, Ikeuchi and Kanade, IJCV 1991). It is rendered small, smoothed, and spread over what the
-    object covers, so that its edges are those of the picture.
-    """
-    factor = -(-max(photographs.size) // WIDTH)
-    small = photographs.select(photographs.index, photographs.size, factor)
-    rgb, alpha = bridge.pictures(render_indirect(surface.scene, small, SPP, seed), small)
-    images = torch.cat([rgb, alpha[..., None]], -1).movedim(-1, 1)
-    images = blur(images.flatten(0, 1), BLUR).reshape(images.shape)
-    images = F.interpolate(images, scale_factor=factor, mode="bilinear", align_corners=False)
-    height, width = coverage.shape[1:]
-    images = F.pad(images, (0, width - images.shape[3], 0, height - images.shape[2]), mode="replicate")
-    return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
-
-
-def draw(surface, photographs, spp=16, seed=0, shadows=True):
-    """Like `bridge.draw`, interreflection included."""
-    rgb, coverage = bridge.draw(surface, photographs, spp, seed, shadows)
-    channels = render_indirect(surface.scene, photographs, spp, seed + 1)
-    return rgb + bridge.pictures(channels, photographs)[0], coverage

@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
     for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
-        rgb, _ = bridge.draw(surface, scene.photograph(k), spp=config.spp, shadows=scene.shadows)
+        rgb, _ = bridge.draw(surface, scene.photograph(k), config.spp, 0, scene.shadows, ring.indirect)
         write_picture(rgb[0].numpy(), config.out / sensor.filename.name)
     print(f"{len(scene.sensors)} photographs in {config.out}/")
 

@@ -16,7 +16,8 @@ FORMAT = 2  #: version of the file `ring.pt`
 class Ring(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
 
-    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
+    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
+    `indirect`: was interreflection part of the fit, so that it belongs into pictures?
     """
 
     def __init__(
@@ -25,6 +26,7 @@ class Ring(nn.Module):
     ):  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net, self.bsdf = ShapeNet(), BRDFNet(scale, parameters), bsdf
+        self.indirect = False
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.domain = domain or Sphere()
@@ -40,7 +42,7 @@ class Ring(nn.Module):
         parameters = [tuple(p) for p in self.brdf_net.bsdf_parameters]
         return {
             "format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {},
-            "parameters": parameters, "bsdf": self.bsdf,
+            "parameters": parameters, "bsdf": self.bsdf, "indirect": self.indirect,
         }  # fmt: skip
 
     @classmethod
@@ -48,6 +50,7 @@ class Ring(nn.Module):
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
         ring = cls(torch.zeros(3), 1.0, domain=domain, parameters=state["parameters"], bsdf=state["bsdf"])
         ring.load_state_dict(state["networks"])
+        ring.indirect = state["indirect"]
         return ring
 
     @classmethod

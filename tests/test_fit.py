@@ -160,7 +160,7 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
     def glare(surface, photographs, coverage, seed):
         return 1000 * coverage[..., None].expand(*coverage.shape, 3)
 
-    monkeypatch.setattr(fit.indirect, "interreflection", glare)
+    monkeypatch.setattr(fit.bridge, "interreflection", glare)
     for options, bright in (([], True), (["--no-indirect"], False)):
         first = fit.Fit(fit.capture.load(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
         assert (first.step()["rgb"] > 100) == bright

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mi_ring import indirect
+from mi_ring import bridge, indirect
 from mi_ring.integrator import Photographs, render_photographs
 
 WIDTH, HEIGHT = 70, 49  # [px]
@@ -152,14 +152,12 @@ def test_a_convex_object_has_none():
 
 
 @pytest.mark.parametrize("width", [20, 64])
-def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cup, monkeypatch):
+def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cup):
     """Of an evenly lit cup it is even up to the rim, whatever the size at which it is rendered (49 is no multiple)."""
-    monkeypatch.setattr(indirect, "WIDTH", width)
-    monkeypatch.setattr(indirect, "SPP", 1024)
     scene, photographs = diffuse_cup
     photographs = photographs.select([1, 0], (WIDTH, HEIGHT))
     coverage = torch.from_numpy(pictures(render_photographs(scene, photographs, 16, 0))[..., 3]).requires_grad_()
-    added = indirect.interreflection(SimpleNamespace(scene=scene), photographs, coverage, seed=5)
+    added = bridge.interreflection(SimpleNamespace(scene=scene), photographs, coverage, 5, width, 1024)
     assert added.shape == (2, HEIGHT, WIDTH, 3)
     for k, expected in zip((0, 1), series(indirect.BOUNCES)[::-1]):
         even = expected * coverage[k, ..., None].detach().numpy()

@@ -12,7 +12,7 @@ from mi_ring import bridge, capture, fit, reflectance
 from mi_ring.errors import InputError
 from mi_ring.results import load_ring
 
-QUICK = "--levels 3 --widths 56 --shares 1 --iterations 12 --batch 4 --subdivisions 3".split()
+QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
 PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
   <float name="roughness" value="0.6"/><float name="spec_tint" value="0.2"/><float name="eta" value="1.4"/></bsdf>"""
 PREDICT = {"base_color": (0.0, 0.9), "roughness": (0.2, 1.0)}
