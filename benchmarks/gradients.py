@@ -28,7 +28,7 @@ WIDTH, HEIGHT = 96, 80  # [px]
 CAMERA, TARGET = np.array([0.7, 0.4, 4.4]), np.array([0.05, 0.1, 0.0])
 LAMP, DIRECTION = np.array([3.0, 1.4, 2.6]), [-1.0, -0.5, -1.1]
 BESIDE_LENS = np.array([0.25, 0.1, 0.02])
-SHIFT, AXIS = [1.0, 0.3, -0.2], [0.3, 1.0, 0.1]  #: along which things are moved, about which they are turned
+SHIFT, AXIS = [1.0, 0.3, -0.2], [0.48, 0.8, 0.36]  #: along which things are moved, about which they are turned
 
 #: What moves, and by how much to either side in the finite difference.
 STEPS = {
@@ -72,7 +72,7 @@ class Picture:
             },
         }  # fmt: skip
         if wall:
-            place = mi.ScalarTransform4f().translate([0, 0, -1.7 * unit]).rotate([0.3, 1, 0], 9).scale(20 * unit)
+            place = mi.ScalarTransform4f().translate([0, 0, -1.7 * unit]).rotate([0.28, 0.96, 0], 9).scale(20 * unit)
             paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}
             scene["wall"] = {"type": "rectangle", "to_world": place, "bsdf": paint}
         self.scene = mi.load_dict(scene)

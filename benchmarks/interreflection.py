@@ -14,15 +14,15 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "scenes"))
 
+from mi_ring import bridge, capture, results  # before Mitsuba, for it chooses LLVM
+
+# isort: split
 import make_pot2
+import mitsuba as mi
 import numpy as np
 import trimesh
 from accuracy import COLUMNS, measure, processor
 from scipy.interpolate import CubicSpline
-
-from mi_ring import bridge, capture, results  # chooses LLVM before Mitsuba is imported
-
-import mitsuba as mi  # isort: skip
 
 CENTER = np.array([-21.0, 33.0, 95.0])  # of the bowl's bounding box, scene units [mm]
 VIEWS, NOVEL_VIEWS = 28, 8

@@ -115,13 +115,14 @@ def draw(surface, photographs, spp=16, seed=0, shadows=True, indirect=False):
     return rgb + interreflection(surface, photographs, coverage, seed + 1, 128, 32) if indirect else rgb, coverage
 
 
-def interreflection(surface, photographs, coverage: Tensor, seed: int, width: int = 64, spp: int = 4) -> Tensor:
+def interreflection(surface, photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16) -> Tensor:
     """What interreflection adds to pictures of the surface as last written: linear radiance (N, H, W, 3).
 
     `photographs`: as they were rendered; `coverage` (N, H, W): of that picture, through which alone gradients flow: the
     outline feels this light too, shape and material do not (they are corrected for it, as in "Shape from
     Interreflections", Nayar, Ikeuchi and Kanade, IJCV 1991). It varies slowly: it is rendered at most `width` pixels
-    wide, smoothed, and spread over what the object covers, so that its edges are those of the picture.
+    wide (a few good pixels did better than many noisy ones), smoothed, and spread over what the object covers, so that
+    its edges are those of the picture.
     """
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)

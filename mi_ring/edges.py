@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 SMOOTH, CREASE, BORDER = 0, 1, 2  # edges of a mesh where the normals of both sides agree or differ, or where it ends
-SAMPLES = 4  #: samples per edge of a mesh
+SAMPLES, SAMPLES_IN_ALL = 4, 1024  #: per edge of a mesh, and at least in all
 CURVE_SAMPLES = 256  #: samples per curve of any other shape
 LEAVE = 2.0**-19  #: see `leave`
 
@@ -47,10 +47,11 @@ class Edges:
 
     def __init__(self, scene):
         self.shapes = list(scene.shapes())
-        self.meshes = [shape for shape in self.shapes if shape.is_mesh()]
-        self.others = [shape for shape in self.shapes if not shape.is_mesh()]
-        for shape in self.others:
-            if shape.class_name() not in CURVES:
+        # Mitsuba's rectangle is a mesh as well, whose vertices are not attached to its `to_world`.
+        self.others = [shape for shape in self.shapes if shape.class_name() in CURVES]
+        self.meshes = [shape for shape in self.shapes if shape not in self.others]
+        for shape in self.meshes:
+            if not shape.is_mesh():
                 raise ValueError(
                     f'photometric: no gradients with shape "{shape.id()}", a {shape.class_name()}: '
                     f"use meshes or {', '.join(CURVES)}"
@@ -104,16 +105,17 @@ class Edges:
         return edge, first, second
 
     def sample(self, lanes, seed, offset=ROOT) -> Curve:
-        """`SAMPLES` stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
+        """Stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
         count, n = dr.width(self.kind), dr.width(lanes)
-        lane = dr.arange(mi.UInt32, n * SAMPLES)
-        chosen = dr.gather(mi.UInt32, lanes, lane // SAMPLES)
-        t = (mi.Float(lane % SAMPLES) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / SAMPLES
+        each = max(SAMPLES, SAMPLES_IN_ALL // n)
+        lane = dr.arange(mi.UInt32, n * each)
+        each = dr.opaque(mi.UInt32, each)  # it changes: no part of the kernel
+        chosen = dr.gather(mi.UInt32, lanes, lane // each)
+        t = (mi.Float(lane % each) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / mi.Float(each)
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
-        return Curve(
-            chosen // count, dr.lerp(a, b, t), dr.detach(b - a) / SAMPLES, self.middle(edge), mi.Bool(True), offset
-        )
+        piece = dr.detach(b - a) / mi.Float(each)
+        return Curve(chosen // count, dr.lerp(a, b, t), piece, self.middle(edge), mi.Bool(True), offset)
 
     def middle(self, edge):
         """The centre of the two triangles at an edge, detached."""
@@ -221,8 +223,8 @@ def paired(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
     return np.stack([start[h0], end[h0], triangle[h0], np.where(pair, triangle[h1], triangle[h0]), kind])
 
 
-# Curves of the other shapes: local coordinates (p, dp/dt) as functions of t in [0, 1), and of the eye: a point for
-# w = 1, a direction for w = 0.
+# Curves of the other shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in
+# [0, 1), and of the eye: a point for w = 1, a direction for w = 0.
 
 
 def circle(u, v, t):
@@ -238,13 +240,19 @@ def square_border(e, w, t):
     y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
     dx = dr.select(side == 0, 8, dr.select(side == 2, -8, 0))
     dy = dr.select(side == 1, 8, dr.select(side == 3, -8, 0))
-    return mi.Point3f(x, y, 0), mi.Vector3f(dx, dy, 0)
+    return mi.Point3f(x, y, 0), mi.Vector3f(dx, dy, 0), mi.Point3f(0)
 
 
-def disk_border(e, w, t, z=0.0):
-    """Border of the unit disk, at the height `z`."""
+def disk_border(e, w, t):
+    """Border of the unit disk."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
-    return mi.Point3f(p) + mi.Vector3f(0, 0, z), dp
+    return mi.Point3f(p), dp, mi.Point3f(0)
+
+
+def cylinder_border(e, w, t, z):
+    """Border of the cylinder at its end `z`."""
+    p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
+    return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
 
 
 def sphere_outline(e, w, t):
@@ -253,14 +261,15 @@ def sphere_outline(e, w, t):
     frame = mi.Frame3f(e * dr.rsqrt(e2))
     p, dp = circle(frame.s, frame.t, t)
     r = dr.sqrt(dr.maximum(1 - w * w / e2, 0))
-    return mi.Point3f(e * (w / e2) + r * p), r * dp
+    return mi.Point3f(e * (w / e2) + r * p), r * dp, mi.Point3f(0)
 
 
 def cylinder_outline(e, w, t, side=1.0):
     """A line along the cylinder x² + y² = 1, 0 < z < 1, where its normal is at right angles to the view."""
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
-    return mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t), mi.Vector3f(0, 0, 1)
+    p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)
+    return p, mi.Vector3f(0, 0, dr.full(mi.Float, 1, dr.width(t))), mi.Point3f(0, 0, t)
 
 
 CURVES = {
@@ -268,8 +277,8 @@ CURVES = {
     "Disk": [disk_border],
     "Sphere": [sphere_outline],
     "Cylinder": [
-        disk_border,
-        lambda e, w, t: disk_border(e, w, t, z=1.0),
+        lambda e, w, t: cylinder_border(e, w, t, z=0.0),
+        lambda e, w, t: cylinder_border(e, w, t, z=1.0),
         cylinder_outline,
         lambda e, w, t: cylinder_outline(e, w, t, side=-1.0),
     ],
@@ -289,9 +298,9 @@ def outline_of(shape, eye, views, seed) -> list[Curve]:
             where, finite = eye(view)
             inverse = dr.detach(to_world).inverse()
             e = dr.select(finite, mi.Vector3f(inverse @ mi.Point3f(where)), inverse @ where)
-            p, tangent = curve(e, dr.select(finite, mi.Float(1), 0), t)
+            p, tangent, inside = curve(e, dr.select(finite, mi.Float(1), 0), t)
             tangent = dr.detach(to_world) @ mi.Vector3f(tangent) / CURVE_SAMPLES
-            dr.eval(p, tangent)
-        middle = dr.detach(to_world) @ mi.Point3f(0, 0, 0.5 if shape.class_name() == "Cylinder" else 0)
-        curves.append(Curve(view, to_world @ p, tangent, middle, dr.isfinite(p.x), ROOT))
+            inside = dr.detach(to_world) @ inside
+            dr.eval(p, tangent, inside)
+        curves.append(Curve(view, to_world @ p, tangent, inside, dr.isfinite(p.x), ROOT))
     return curves

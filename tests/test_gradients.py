@@ -1,0 +1,131 @@
+"""Gradients through plain `mi.render` against finite differences: what moves, under which light, before what.
+
+`benchmarks/gradients.py` holds the whole table; here every row and column of it occurs, at smaller cost.
+"""
+
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_ring.edges import Edges
+from mi_ring.integrator import Photographs, render_photographs
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from gradients import COVERAGE, HEIGHT, RADIANCE, STEPS, WIDTH, Picture, compare
+
+mi.set_log_level(mi.LogLevel.Error)
+
+CELLS = [  # moved, light, wall, shape, unit, channels
+    ("translate", "lamp", True, "bumpy", 1000.0, RADIANCE),
+    ("translate", "flash", False, "sphere", 1.0, COVERAGE),
+    ("scale", "directional", True, "sphere", 1000.0, RADIANCE),
+    ("scale", "flash", False, "bumpy", 0.001, RADIANCE),
+    ("bump", "flash", True, "sphere", 1.0, RADIANCE),
+    ("bump", "directional", True, "bumpy", 0.001, RADIANCE),
+    ("camera moves", "flash", True, "bumpy", 1000.0, RADIANCE),
+    ("camera moves", "lamp", False, "sphere", 1.0, COVERAGE),
+    ("camera turns", "directional", True, "bumpy", 1.0, RADIANCE),
+    ("focal length", "lamp", True, "sphere", 1000.0, RADIANCE),
+    ("focal length", "flash", False, "bumpy", 1.0, COVERAGE),
+    ("light moves", "lamp", True, "bumpy", 1000.0, RADIANCE),
+    ("light moves", "directional", True, "sphere", 1.0, RADIANCE),
+    ("light moves", "flash", True, "bumpy", 1.0, RADIANCE),
+    ("intensity", "flash", False, "sphere", 1.0, RADIANCE),
+    ("intensity", "directional", True, "bumpy", 1000.0, RADIANCE),
+]
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda c: f"{c[0]}, {c[1]}, {c[3]}")
+def test_gradient_equals_finite_difference(cell):
+    """Within 1 %, 3 % where edges of shadows take part, or four standard errors, which must be small."""
+    *what, channels = cell
+    a, b, error = compare(Picture(*what, level=4), channels, 4, 256)
+    shadows = what[2] and what[1] != "flash"
+    assert error < 0.06 * abs(b), f"too noisy to tell: {a:.5g} and {b:.5g} ± {error:.2g}"
+    assert abs(a - b) < max((0.03 if shadows else 0.01) * abs(b), 4 * error), f"{a:.5g}, not {b:.5g} ± {error:.2g}"
+
+
+def test_every_row_of_the_table_is_here():
+    assert {cell[0] for cell in CELLS} == set(STEPS)
+
+
+def test_soft_filter_of_a_cropped_film():
+    """The film's reconstruction filter spreads edges over several pixels."""
+    picture = Picture("translate", "lamp", True, "sphere", level=4, rfilter="gaussian")
+    film = mi.traverse(picture.scene.sensors()[0])
+    film["film.crop_size"], film["film.crop_offset"] = [40, 52], [31, 17]
+    film.update()
+    picture.params.update()
+    picture.weights = picture.weights[17:69, 31:71]
+    assert np.array(picture.at(mi.Float(0), 0, 4)).shape == (52, 40, 4)
+    a, b, error = compare(picture, RADIANCE, 4, 256)
+    assert error < 0.03 * abs(b)
+    assert abs(a - b) < max(0.03 * abs(b), 4 * error), f"{a:.5g}, not {b:.5g} ± {error:.2g}"
+
+
+def test_forward_mode_equals_reverse_mode():
+    picture = Picture("camera moves", "lamp", True, "bumpy", level=3)
+    reverse = picture.gradient(3, 16, RADIANCE)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    image = picture.at(t, 3, 16)
+    dr.forward(t)
+    forward = (np.array(dr.grad(image)) * picture.weights)[..., RADIANCE].sum()
+    assert abs(forward) > 10
+    assert forward == pytest.approx(reverse, rel=1e-3)
+
+
+def test_many_photographs_in_one_launch_have_the_same_gradient():
+    picture = Picture("focal length", "lamp", True, "bumpy", level=4)
+    weights = [mi.Float(w.astype(np.float32).ravel()) for w in np.moveaxis(picture.weights, -1, 0)]
+    many = []
+    for seed in range(12):
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        picture.at(t, seed, 1)
+        photographs = Photographs.attached(picture.scene.sensors()[0])
+        channels = render_photographs(picture.scene, photographs, 64, seed, True, Edges.of(picture.scene))
+        dr.backward(sum(dr.sum(w * c) for w, c in zip(weights[:3], channels)))
+        many.append(dr.grad(t)[0])
+    one = [picture.gradient(50 + seed, 64, RADIANCE) for seed in range(12)]
+    error = np.hypot(np.std(many, ddof=1), np.std(one, ddof=1)) / np.sqrt(12)
+    assert error < 0.03 * abs(np.mean(one))
+    assert abs(np.mean(many) - np.mean(one)) < 4 * error
+
+
+@pytest.mark.parametrize("name", ["diffuse", "specular", "roughness"])
+def test_material_constants(name):
+    """The samples of the gradient are those of the difference."""
+    picture = Picture("intensity", "lamp", True, "bumpy", level=3)
+    key = next(k for k, _ in picture.params if k.endswith(f"bsdf.{name}.value"))
+    before = type(picture.params[key])(picture.params[key])
+
+    def loss(t, seed):
+        picture.params[key] = before * (1 + t)
+        picture.params.update()
+        image = mi.render(picture.scene, picture.params, spp=64, seed=seed, seed_grad=5)
+        return dr.sum(image * mi.TensorXf(picture.weights.astype(np.float32)), axis=None)
+
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    dr.backward(loss(t, 4))
+    gradient = dr.grad(t)[0]
+    high, low = (float(loss(mi.Float(d), 5).array[0]) for d in (0.02, -0.02))
+    assert abs(high - low) > 1
+    assert gradient == pytest.approx((high - low) / 0.04, rel=0.01)
+
+
+def test_stock_sensors_are_refused():
+    picture = Picture("intensity", "lamp", False, "sphere", level=2)
+    sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
+    key = next(k for k, _ in picture.params if k.endswith("vertex_positions"))
+    dr.enable_grad(picture.params[key])
+    picture.params.update()
+    image = mi.render(picture.scene, picture.params, sensor=sensor, spp=1)
+    with pytest.raises(Exception) as caught:
+        dr.backward(dr.sum(image, axis=None))
+    assert "gradients need an RGB variant and a photograph sensor" in str(caught.value) + str(caught.value.__cause__)
