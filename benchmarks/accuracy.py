@@ -2,8 +2,9 @@
 
     python benchmarks/accuracy.py scenes/pot2.xml [MORE.xml …] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
 
-The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, or in <scene name>/truth/. Each fit is a process of
-its own: wall time and peak memory are the whole process's, start-up and report included; fit time is the iterations'.
+The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/, or where --truth says. Each
+fit is a process of its own: wall time and peak memory are the whole process's, start-up and report included; fit time
+is the iterations'.
 """
 
 import argparse
@@ -39,14 +40,14 @@ def processor() -> str:
     return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
-def measure(scene: Path, out: Path, options: list[str]) -> dict:
+def measure(scene: Path, out: Path, options: list[str], truth: Path | None = None) -> dict:
     """Fit one scene and evaluate it."""
     command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]
     started = time.perf_counter()
     subprocess.run(command, check=True, stdout=sys.stderr)
     wall = time.perf_counter() - started
     memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # KiB → GiB; the largest child so far
-    truth = truth_of(scene)
+    truth = truth or truth_of(scene)
     evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply"),
                 "--novel", str(truth / "scene.xml")]  # fmt: skip
     numbers = json.loads(subprocess.run(evaluate, check=True, capture_output=True, text=True).stdout)
@@ -59,16 +60,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"))
+    parser.add_argument("--truth", type=Path)
     arguments, options = parser.parse_known_args()
     for scene in arguments.scenes:
-        truth_of(scene)
+        arguments.truth or truth_of(scene)
     print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
     heads = [c.replace("_", " ") for c in COLUMNS]
     print("| scene | " + " | ".join(heads) + " | fit s | wall s | GiB, at most |")
     print("|---" * (len(heads) + 4) + "|", flush=True)
     for scene in arguments.scenes:
         name = scene.stem if scene.stem != "scene" else scene.parent.name
-        row = measure(scene, arguments.out / name, options)
+        row = measure(scene, arguments.out / name, options, arguments.truth)
         cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in COLUMNS]
         cells += [f"{row['fit_seconds']:.0f}", f"{row['wall_seconds']:.0f}", f"{row['memory']:.1f}"]
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)

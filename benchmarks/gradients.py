@@ -88,7 +88,7 @@ class Picture:
         movable = (*MOVABLE, self.vertices)
         self.before = {name: type(value)(value) for name, value in self.params if name.startswith(movable)}
         v, u = np.mgrid[:HEIGHT, :WIDTH]
-        waves = [1.2 + np.sin(0.06 * u + 0.03 * v + k) + 0.4 * np.cos(0.07 * v - 0.02 * k * u) for k in range(4)]
+        waves = [1.2 + np.sin(0.03 * u + 0.015 * v - 2.1 + 0.1 * k) for k in range(4)]
         self.weights = np.stack(waves, -1)
 
     def change(self, t):
