@@ -105,7 +105,10 @@ class Photometric(ADIntegrator):
         ADIntegrator._splat_to_block(block, film, where, radiance * weight, 1.0, coverage, [], ray.wavelengths)
         film.put_block(block)
         one = Photographs.attached(sensor)
-        for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows):
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        low = mi.Point2f(film.crop_offset()) - border
+        window = low, low + mi.Point2f(film.crop_size()) + 2 * border  # where `sample_rays` puts its samples
+        for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows, window):
             block = film.create_block()
             block.set_coalesce(False)
             # The film divides by the sum of the weights, `spp` per pixel.
@@ -316,14 +319,15 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None):
     return channels
 
 
-def boundaries(scene, photographs, edges, seed, shadows=True):
+def boundaries(scene, photographs, edges, seed, shadows=True, window=None):
     """What edges add to the gradient of photographs: (where [px], view, step, active) of samples along each curve.
 
     An edge that moves by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square pixels:
     dI = (L_before − L_beyond) · n·dq · length. Rays to either side of the edge see occlusion, background, coverage and
     shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative is dI, to be added to the pixel at
-    `where`.
+    `where`. Edges count within `window`, the (lowest, highest) corner [px] of what is rendered, the whole by default.
     """
+    window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views = len(photographs)
     curves, fronts = edges.outlines(photographs.eye, views, seed)
     sources = [photographs.source] if shadows and not photographs.colocated else []
@@ -332,10 +336,10 @@ def boundaries(scene, photographs, edges, seed, shadows=True):
     for k, source in enumerate(sources, 1):
         casters, terminators = edges.shadow_casters(source, views, seed + k, fronts)
         curves += terminators + [cast(scene, curve, source, photographs.eye) for curve in casters]
-    return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows)) is not None]
+    return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows, window)) is not None]
 
 
-def boundary(scene, photographs, curve: Curve, seed, shadows):
+def boundary(scene, photographs, curve: Curve, seed, shadows, window):
     """`boundaries` of one curve; None if nothing moves it."""
     camera = photographs.camera(curve.view)
     where, depth = project(*camera, curve.point)
@@ -343,12 +347,11 @@ def boundary(scene, photographs, curve: Curve, seed, shadows):
         return None
     with dr.suspend_grad():
         q = dr.detach(where)
-        width, height = photographs.size
-        active = curve.active & (depth > 0) & (q.x > 0) & (q.x < width) & (q.y > 0) & (q.y < height)
+        active = curve.active & (depth > 0) & dr.all((q > window[0]) & (q < window[1]))
         along = project_tangent(camera[0], camera[1], curve.point, curve.tangent)
         across = mi.Vector2f(-along.y, along.x)
         active &= dr.isfinite(dr.squared_norm(across)) & (dr.squared_norm(across) > 0)
-        offset = max(curve.offset, EDGE_ROUNDINGS * 2.0**-24 * max(width, height))
+        offset = max(curve.offset, EDGE_ROUNDINGS * 2.0**-24 * max(photographs.size))
         shift = dr.select(active, offset * dr.rsqrt(dr.squared_norm(across)), 0) * across
         dr.eval(q, shift, across, active)
         n = dr.width(q)
