@@ -82,14 +82,15 @@ class Picture:
         x, y, z = sphere.T
         bumps = 0.22 * np.sin(5 * x + 1) * np.cos(4 * y - 2 * z) + 0.12 * np.cos(7 * z + 2 * x)
         radius = 1 + (shape == "bumpy") * bumps
-        self.bump = mi.Float((unit * sphere * np.exp(-9 * ((sphere - [0.6, 0.7, 0.4]) ** 2).sum(1))[:, None]).ravel())
+        self.bump = mi.Float((unit * sphere * np.exp(-9 * ((sphere - [0.75, 0.2, 0.65]) ** 2).sum(1))[:, None]).ravel())
         self.params[self.vertices] = mi.Float((unit * sphere * radius[:, None]).ravel())
         self.params.update()
         movable = (*MOVABLE, self.vertices)
         self.before = {name: type(value)(value) for name, value in self.params if name.startswith(movable)}
         v, u = np.mgrid[:HEIGHT, :WIDTH]
-        waves = [1.2 + np.sin(0.03 * u + 0.015 * v - 2.1 + 0.1 * k) for k in range(4)]
-        self.weights = np.stack(waves, -1)
+        # Brighter to the one side or the other, so that no derivative is a small difference of large parts.
+        sign = 1 if moved in ("scale", "bump", "focal length", "intensity") else -1
+        self.weights = np.stack([1.2 + sign * np.sin(0.03 * u + 0.015 * v - 2.1 + 0.1 * k) for k in range(4)], -1)
 
     def change(self, t):
         """The parameters, by the names of their ends, when the thing has moved by `t`."""

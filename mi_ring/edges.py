@@ -186,10 +186,16 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
     # it falls on.
     tangent = curve.tangent - d * (dr.dot(n, curve.tangent) / slope)
     tangent *= dr.select(finite, 1 + t / away, 1)
-    # Whether a point is in shadow is asked a little above the surface.
-    above = dr.mulsign(leave(dr.detach(si.p), dr.norm(dr.detach(si.p - camera(curve.view)[0]))), -slope)
-    shift = d * (above / slope) - n * above
-    active &= si.is_valid() & (dr.abs(slope) > 1e-4)
+    with dr.suspend_grad():
+        to_camera = dr.detach(camera(curve.view)[0] - si.p)
+        above = leave(dr.detach(si.p), dr.norm(to_camera))
+        # What hides the shadow from the camera would not jump, but its shading differs between the two sides as well.
+        start = dr.detach(si.p) + n * dr.mulsign(above, dr.dot(n, to_camera))
+        active &= si.is_valid() & (dr.abs(slope) > 1e-4)
+        active &= ~scene.ray_test(mi.Ray3f(start, to_camera, 1 - 2.0**-10, 0, []), active)
+        # Whether a point is in shadow is asked a little above the surface.
+        above = dr.mulsign(above, -slope)
+        shift = d * (above / slope) - n * above
     return Curve(curve.view, si.p + shift, tangent, curve.inside, active, JUMP)
 
 
