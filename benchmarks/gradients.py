@@ -1,6 +1,6 @@
 """Compare the gradients of `photometric` with finite differences and print the deviations as Markdown tables.
 
-    python benchmarks/gradients.py [--seeds 6] [--spp 256] > table.md
+    python benchmarks/gradients.py [--seeds 4] [--spp 256] > table.md
 
 Each cell is the derivative of a weighted sum of the pixels of one picture, by `dr.backward` through plain `mi.render`
 and by central differences of `mi.render` with the same seeds on both sides: deviation ± standard error of the two
@@ -9,9 +9,7 @@ together, in % of the finite difference.
 
 import argparse
 import datetime
-import sys
 from itertools import product
-from pathlib import Path
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 
@@ -19,10 +17,8 @@ import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
-
-sys.path.insert(0, str(Path(__file__).parent))
 from accuracy import processor
+from tqdm import tqdm
 
 WIDTH, HEIGHT = 96, 80  # [px]
 CAMERA, TARGET = np.array([0.7, 0.4, 4.4]), np.array([0.05, 0.1, 0.0])
@@ -32,8 +28,8 @@ SHIFT, AXIS = [1.0, 0.3, -0.2], [0.48, 0.8, 0.36]  #: along which things are mov
 
 #: What moves, and by how much to either side in the finite difference.
 STEPS = {
-    "translate": 0.004, "scale": 0.004, "bump": 0.01, "camera moves": 0.004, "camera turns": 0.001,
-    "focal length": 0.002, "light moves": 0.01, "intensity": 0.05,
+    "translate": 0.016, "scale": 0.016, "bump": 0.03, "camera moves": 0.016, "camera turns": 0.004,
+    "focal length": 0.008, "light moves": 0.03, "intensity": 0.05,
 }  # fmt: skip
 MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.light")
 LIGHTS, SHAPES = ("flash", "lamp", "directional"), ("sphere", "bumpy")
@@ -160,18 +156,23 @@ def compare(picture, channels, seeds, spp):
     return np.mean(a), np.mean(b), error
 
 
-def cell(a, b, error):
-    """Deviation ± standard error in %, marked if it is above 1 % and hardly noise."""
+def allowed(light, wall):
+    """The largest relative deviation: more where a shadow's edge falls on the wall."""
+    return 0.03 if wall and light != "flash" else 0.01
+
+
+def cell(a, b, error, limit):
+    """Deviation ± standard error in %, marked if it is above the limit and hardly noise."""
     if a == b == 0:
         return "0"
-    mark = " **!**" if abs(a - b) > max(0.01 * abs(b), 3 * error) else ""
+    mark = " **!**" if abs(a - b) > max(limit * abs(b), 3 * error) else ""
     return f"{100 * (a - b) / abs(b):+.2f} ± {100 * error / abs(b):.2f}{mark}"
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--spp", type=int, default=256, help="of the finite differences")
     parser.add_argument("--units", type=float, nargs="+", default=[1.0, 1000.0])
     options = parser.parse_args()
@@ -189,7 +190,7 @@ def main() -> None:
                 row = []
                 for shape, wall, light in columns:
                     picture = Picture(moved, light, wall, shape, unit)
-                    row.append(cell(*compare(picture, channels, options.seeds, options.spp)))
+                    row.append(cell(*compare(picture, channels, options.seeds, options.spp), allowed(light, wall)))
                     bar.update()
                 print(f"| {moved} | " + " | ".join(row) + " |", flush=True)
             print(flush=True)
