@@ -40,14 +40,13 @@ def processor() -> str:
     return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
-def measure(scene: Path, out: Path, options: list[str], truth: Path | None = None) -> dict:
+def measure(scene: Path, out: Path, options: list[str], truth: Path) -> dict:
     """Fit one scene and evaluate it."""
     command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]
     started = time.perf_counter()
     subprocess.run(command, check=True, stdout=sys.stderr)
     wall = time.perf_counter() - started
     memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # KiB → GiB; the largest child so far
-    truth = truth or truth_of(scene)
     evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply"),
                 "--novel", str(truth / "scene.xml")]  # fmt: skip
     numbers = json.loads(subprocess.run(evaluate, check=True, capture_output=True, text=True).stdout)
@@ -60,17 +59,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"))
-    parser.add_argument("--truth", type=Path)
+    parser.add_argument("--truth", type=Path, help="folder of mesh.ply and scene.xml, of a single scene")
     arguments, options = parser.parse_known_args()
-    for scene in arguments.scenes:
-        arguments.truth or truth_of(scene)
+    if arguments.truth and len(arguments.scenes) > 1:
+        parser.error("--truth goes with one scene")
+    truths = [arguments.truth or truth_of(scene) for scene in arguments.scenes]
     print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
     heads = [c.replace("_", " ") for c in COLUMNS]
     print("| scene | " + " | ".join(heads) + " | fit s | wall s | GiB, at most |")
     print("|---" * (len(heads) + 4) + "|", flush=True)
-    for scene in arguments.scenes:
+    for scene, truth in zip(arguments.scenes, truths):
         name = scene.stem if scene.stem != "scene" else scene.parent.name
-        row = measure(scene, arguments.out / name, options, arguments.truth)
+        row = measure(scene, arguments.out / name, options, truth)
         cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in COLUMNS]
         cells += [f"{row['fit_seconds']:.0f}", f"{row['wall_seconds']:.0f}", f"{row['memory']:.1f}"]
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)

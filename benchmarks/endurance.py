@@ -3,7 +3,7 @@
     python benchmarks/endurance.py [--iterations 500]
 
 Every iteration turns the domain at random, writes 10,242 vertices and their material, renders eight photographs of 128²
-pixels under lamps off the camera, shadows included, and takes the gradient with respect to all of it.
+pixels under lamps off the camera, with shadows and interreflection, and takes the gradient with respect to all of it.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 from accuracy import processor
-from render import METHODS, SIZE, VIEWS, Scene
+from render import METHODS, Scene
 from scipy.spatial.transform import Rotation
 
 from mi_ring.domain import Sphere
@@ -54,11 +54,11 @@ def main() -> None:
             rgb, coverage = bridge.render(
                 surface, scene.photographs, tensors[0], dict(zip(material, tensors[1:])), 1, iteration
             )
+            rgb = rgb + bridge.interreflection(surface, scene.photographs, coverage, iteration)
             ((rgb * weights).sum() + coverage.sum()).backward()
             compiled += sum(not kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
         if iteration in (1, 10) or iteration % 50 == 0:
             print(f"| {iteration} | {resident():.0f} | {compiled} |", flush=True)
-    assert rgb.shape == (VIEWS, SIZE, SIZE, 3)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,7 @@ median over the vertices that have a gradient; and of all vertices together, roo
 
 import argparse
 import datetime
-import sys
 import time
-from pathlib import Path
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 
@@ -25,12 +23,10 @@ import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from accuracy import processor
 
 from mi_ring.edges import Edges
 from mi_ring.integrator import Photographs, render_photographs
-
-sys.path.insert(0, str(Path(__file__).parent))
-from accuracy import processor
 
 SIZE, SPP, VIEWS, FOV = 128, 4, 8, 40.0
 INTENSITY = 12.0

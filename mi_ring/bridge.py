@@ -47,7 +47,7 @@ class Surface:
     def write(self, vertices: Tensor, attributes: dict[str, Tensor], gradients: bool = False):
         """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes. Returns the Dr.Jit arrays, in that order.
 
-        All attributes that the shape has must be written when the number of vertices changes.
+        Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
         """
         tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
         arrays = {name: mi.Float(t.detach().contiguous().numpy().ravel()) for name, t in tensors.items()}
@@ -74,8 +74,10 @@ class _Render(torch.autograd.Function):
     def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *attributes):
         gradients = any(t.requires_grad for t in (vertices, *attributes))
         arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
-        surface.edges = Edges.of(surface.scene, surface.edges)
-        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, surface.edges)
+        if gradients:
+            surface.edges = Edges.of(surface.scene, surface.edges)
+        edges = surface.edges if gradients else None
+        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, edges)
         dr.eval(channels)
         ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *attributes)])
         return pictures(channels, photographs)
@@ -112,7 +114,9 @@ def draw(surface, photographs, spp=16, seed=0, shadows=True, indirect=False):
     channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
     dr.eval(channels)
     rgb, coverage = pictures(channels, photographs)
-    return rgb + interreflection(surface, photographs, coverage, seed + 1, 128, 32) if indirect else rgb, coverage
+    if indirect:
+        rgb = rgb + interreflection(surface, photographs, coverage, seed + 1, width=128, spp=32)
+    return rgb, coverage
 
 
 def interreflection(surface, photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16) -> Tensor:
@@ -130,8 +134,8 @@ def interreflection(surface, photographs, coverage: Tensor, seed: int, width: in
     images = torch.cat([rgb, alpha[..., None]], -1).movedim(-1, 1)
     images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
     images = F.interpolate(images, scale_factor=factor, mode="bilinear", align_corners=False)
-    height, width = coverage.shape[1:]
-    images = F.pad(images, (0, width - images.shape[3], 0, height - images.shape[2]), mode="replicate")
+    below, right = coverage.shape[1] - images.shape[2], coverage.shape[2] - images.shape[3]
+    images = F.pad(images, (0, right, 0, below), mode="replicate")
     return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
 
 

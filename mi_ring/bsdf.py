@@ -154,14 +154,18 @@ class CookTorrance(mi.BSDF):
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
 
 
+def attributes_of(bsdf) -> set[str]:
+    """The mesh attributes that a BSDF reads."""
+    return set(re.findall(r'MeshAttribute\[\s*name = "([^"]+)"', str(bsdf)))
+
+
 def check_attributes(shape):
     """Raise ValueError if a BSDF asks `shape` for a mesh attribute that it lacks or has with other channels.
 
     Mitsuba renders such a surface black without a word. Attributes work with 1 or 3 channels only.
     """
     bsdf = shape.bsdf()
-    asked = re.findall(r'MeshAttribute\[\s*name = "([^"]+)"', str(bsdf))
-    for name in asked:
+    for name in sorted(attributes_of(bsdf)):
         if not shape.is_mesh() or not shape.has_attribute(name):
             raise ValueError(
                 f'shape "{shape.id()}": its BSDF reads the mesh attribute "{name}", which the shape does not have'
@@ -169,15 +173,14 @@ def check_attributes(shape):
     if not isinstance(bsdf, CookTorrance):
         return
     for name, texture in bsdf.textures.items():
-        attribute = re.match(r'MeshAttribute\[\s*name = "([^"]+)"', str(texture))
-        if attribute:
-            count = shape.face_count() if attribute[1].startswith("face_") else shape.vertex_count()
-            found = dr.width(mi.traverse(shape)[attribute[1]]) // count
+        for attribute in attributes_of(texture):
+            count = shape.face_count() if attribute.startswith("face_") else shape.vertex_count()
+            found = dr.width(mi.traverse(shape)[attribute]) // count
             expected = ATTRIBUTES[f"vertex_{name}"]
             if found != expected:
                 raise ValueError(
                     f'shape "{shape.id()}": {name} of its BSDF needs a mesh attribute of {expected} channel(s), '
-                    f'"{attribute[1]}" has {found}'
+                    f'"{attribute}" has {found}'
                 )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring import mesh, photograph
+from mi_ring.edges import Edges
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, check_attributes
 
@@ -210,6 +211,8 @@ def load(path: str | Path, images: bool = True) -> Capture:
     try:
         for shape in scene.shapes():
             check_attributes(shape)
+        if images:
+            Edges(scene)  # refuses shapes without gradients
         pixels = [read_image(s, path) for s in sensors] if images else []
         linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
         masks = [read_mask(s, path) for s in sensors] if images else []

@@ -133,7 +133,7 @@ class Edges:
             fronts = self.fronts(eye, views)
             edge, first, second = self.sides(fronts, views=views)
             kind = dr.gather(mi.UInt32, self.kind, edge)
-            lanes = dr.compress((first != second) | ((kind == CREASE) & first) | (kind == BORDER))
+            lanes = dr.compress((first != second) | (kind != SMOOTH))
             if dr.width(lanes):
                 curves.append(self.sample(lanes, seed))
         return curves, fronts

@@ -39,10 +39,10 @@ class Fit:
         self.exposure = scene.exposure()
         parameters, bsdf = reflectance.predicted(scene.path, scene.shape, config.parameters)
         scale = scene.reflectance(center, self.exposure)
-        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf)
         #: Of the light it gets, how much the object reflects: more than all where the lights' intensities are not true.
         self.albedo = math.pi * scale
-        self.ring.indirect = config.indirect and self.albedo < 1
+        indirect = config.indirect and self.albedo < 1
+        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf, indirect)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
         self.optimizers = optimizers(self.ring, config)
         self.stages = config.stages()

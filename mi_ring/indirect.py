@@ -23,7 +23,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES):
         channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3)]
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
-            si = scene.ray_intersect(ray)
+            si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
             for channel, value in zip(channels, reflect(scene, si, view, photographs, bounces, seed)):
                 dr.scatter(channel, value, lane)
         channels.append(covered)

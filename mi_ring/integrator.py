@@ -59,10 +59,11 @@ class Photometric(ADIntegrator):
 
     def check(self, scene):
         """Refuse a scene that would silently render black, once per scene."""
-        if self.checked is not scene:
-            for shape in scene.shapes():
+        shapes = scene.shapes()  # not the scene, which holds this integrator: nobody would free the two
+        if shapes != self.checked:
+            for shape in shapes:
                 check_attributes(shape)
-            self.checked = scene
+            self.checked = shapes
 
     @staticmethod
     def shade(scene, si, light, next_2d, shadows):
@@ -290,6 +291,7 @@ def next_2d(seed, lanes, stream=None):
 
 def trace(scene, ray, view, photographs, shadows, next_2d):
     """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph."""
+    shadows = shadows and not photographs.colocated
     hit = scene.ray_intersect_preliminary(ray, coherent=True)
     dr.eval(hit)  # one traversal serves the image and its gradient
     si = hit.compute_surface_interaction(ray)
@@ -303,7 +305,6 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None):
     Box-filtered linear radiance. Without `edges` the gradient is that of shading between the edges.
     """
     ray, view = pixel_rays(photographs, spp, seed)
-    shadows = shadows and not photographs.colocated
     channels = trace(scene, ray, view, photographs, shadows, next_2d(seed, dr.width(ray)))
     dr.schedule(channels)  # together: block_sum would otherwise render once per channel
     channels = [dr.block_sum(c, spp) / spp for c in channels]

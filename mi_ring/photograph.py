@@ -33,11 +33,8 @@ def camera_ray(to_world, focal, centre, pixel):
 
 def camera_coordinates(to_world, vector):
     """A direction in the world in the axes of a camera: the inverse of the upper left 3 × 3 of `to_world`."""
-    a, b, c = (mi.Vector3f(to_world[0, k], to_world[1, k], to_world[2, k]) for k in range(3))
-    across = dr.cross(a, b)
-    return mi.Vector3f(dr.dot(dr.cross(b, c), vector), dr.dot(dr.cross(c, a), vector), dr.dot(across, vector)) / dr.dot(
-        across, c
-    )
+    # Not its transpose, though it is a rotation: its entries are differentiated one by one.
+    return dr.rcp(mi.Matrix3f([[to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
 
 def project(to_world, focal, centre, point):

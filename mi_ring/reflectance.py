@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.bsdf import ATTRIBUTES, CookTorrance
+from mi_ring.bsdf import CookTorrance, attributes_of
 from mi_ring.errors import InputError
 
 
@@ -16,43 +16,58 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
     """The parameters of the shapenet's BSDF that BRDF-Net is to predict, and the BSDF that reads them, as XML.
 
     `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where
-    there is none. Empty: the five numbers of `cooktorrance`. Raises InputError, naming what the BSDF has.
+    there is none. Empty: those of the five numbers of `cooktorrance` that have no constant. Raises InputError, naming
+    what the BSDF has.
     """
     bsdf = shape.bsdf()
-    element = bsdf_element(scene)
+    element = bsdf_element(ElementTree.parse(scene).getroot(), scene)[1]
     kind = element.get("type")
-    textures = {name: value for key, value in mi.traverse(bsdf) if (name := texture_name(key))}
-    if isinstance(bsdf, CookTorrance):
-        textures |= {p.name: None for p in COOK_TORRANCE if p.name not in textures}
-    names = ", ".join(textures)
+    for inner in element.iter():
+        inner.attrib.pop("id", None)  # else it would be there twice in scenes that have it by reference
+        if inner.tag == "ref" or inner.get("name") == "filename":
+            raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
+                             "without files and references; use constants")  # fmt: skip
+    textures = {}
+    for key, value in mi.traverse(bsdf):
+        head, _, tail = key.rpartition(".")
+        if tail == "value":
+            textures.setdefault(head.rpartition(".")[2], []).append(value)
+    own = {p.name: p for p in COOK_TORRANCE if isinstance(bsdf, CookTorrance) and p.name not in textures}
+    names = ", ".join([*textures, *own])
     if not ranges and not isinstance(bsdf, CookTorrance):
         raise InputError(f"{scene}: bsdf: --parameters must say which parameters of {kind} to predict, and their "
                          f"ranges, for instance --parameters {next(iter(textures), 'reflectance')} 0 1; "
                          f"it has {names}")  # fmt: skip
-    if not ranges:
-        return COOK_TORRANCE, ElementTree.tostring(element, "unicode")
     parameters = []
-    for name, (low, high) in ranges.items():
+    for name, (low, high) in (ranges or {p.name: (p.low, p.high) for p in own.values()}).items():
         if not -math.inf < low < high:
             raise InputError(f"--parameters: {name}: range is {low:g} to {high:g}, must be from lower to higher")
-        if name not in textures:
-            raise InputError(f"{scene}: bsdf: --parameters: {kind} has no texture {name}; it has {names}")
-        given = next((e for e in element.iter() if e.get("name") == name), None)
-        if given is None and textures[name] is not None:
+        if name in own:
+            parameters.append(own[name]._replace(low=low, high=high))
+            continue
+        if len(textures.get(name, [])) != 1:
+            found = "more than one" if name in textures else "no"
+            raise InputError(f"{scene}: bsdf: --parameters: {kind} has {found} texture {name}; it has {names}")
+        texture = next((e for e in element.iter() if e.get("name") == name), None)
+        if texture is None:
             raise InputError(f"{scene}: bsdf: {name}: has no value; --parameters needs one to start from, an <rgb> "
                              "for a colour, a <float> for a number")  # fmt: skip
-        channels = ATTRIBUTES[f"vertex_{name}"] if textures[name] is None else min(3, np.size(textures[name]))
-        parameters.append(Parameter(name, channels, low, high, start(textures[name], low, high)))
-        parent = element if given is None else next(e for e in element.iter() if given in list(e))
-        if given is not None:
-            parent.remove(given)
-        texture = ElementTree.SubElement(parent, "texture", name=name, type="mesh_attribute")
+        value = np.array(textures[name][0])
+        parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, start(value, low, high)))
+        texture.clear()
+        texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}
         ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{name}")
     xml = ElementTree.tostring(element, "unicode")
     try:
-        load(xml)
+        left = attributes_of(load(xml)) - {f"vertex_{p.name}" for p in parameters}
     except RuntimeError as error:
         raise InputError(f"{scene}: bsdf: --parameters: {' '.join(str(error).split())}") from error
+    if left:
+        raise InputError(f"{scene}: bsdf: nothing writes {min(left)}, which {kind} reads; give that parameter a "
+                         "constant, or a range with --parameters")  # fmt: skip
+    if not parameters:
+        raise InputError(f"{scene}: bsdf: every parameter of {kind} is a constant; --parameters must say which of "
+                         f"{names} to predict")  # fmt: skip
     return tuple(parameters), xml
 
 
@@ -63,28 +78,28 @@ def load(xml: str) -> mi.BSDF:
     return mi.load_string(ElementTree.tostring(element, "unicode"))
 
 
-def bsdf_element(scene: Path) -> ElementTree.Element:
-    """The XML of the shapenet's BSDF."""
-    root = ElementTree.parse(scene).getroot()
+def bsdf_element(root: ElementTree.Element, scene: Path) -> tuple[ElementTree.Element, ElementTree.Element]:
+    """The shapenet's <bsdf>, or its <ref> to one, and the BSDF meant, in the XML of a scene.
+
+    Raises InputError if there is none, and where a part of the scene is not in the file.
+    """
+    for tag in ("include", "default", "path"):
+        if root.find(f".//{tag}") is not None:
+            raise InputError(f"{scene}: <{tag}>: a fit needs a scene without it; write out what it stands for")
     shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
-    element = shape.find("bsdf")
-    for reference in shape.findall("ref"):
-        element = next((e for e in root.iter("bsdf") if e.get("id") == reference.get("id")), element)
-    if element is None:
-        raise InputError(f'{scene}: shapenet: has no <bsdf>; add for instance <bsdf type="cooktorrance"/>')
-    return element
+    known = {e.get("id"): e for e in root.iter("bsdf")}
+    for child in shape:
+        if child.tag == "bsdf":
+            return child, child
+        if child.tag == "ref" and child.get("id") in known:
+            return child, known[child.get("id")]
+    raise InputError(f'{scene}: shapenet: has no <bsdf>; add for instance <bsdf type="cooktorrance"/>')
 
 
-def texture_name(key: str) -> str | None:
-    """The name of a BSDF's texture from the name of what `mi.traverse` lists of it."""
-    head, _, tail = key.rpartition(".")
-    return head.rpartition(".")[2] if tail in ("value", "data") else None
-
-
-def start(value, low: float, high: float) -> float:
-    """What BRDF-Net's output must begin with for the parameter to begin with `value`, which the XML says."""
-    if value is None or math.isinf(high):
+def start(value: np.ndarray, low: float, high: float) -> float:
+    """What BRDF-Net's output must begin with for the parameter to begin with the mean of `value`; 0 without an end."""
+    if math.isinf(high):
         return 0.0
-    share = (float(np.mean(np.array(value))) - low) / (high - low)
+    share = (float(value.mean()) - low) / (high - low)
     share = min(max(share, 0.05), 0.95)
     return math.log(share / (1 - share))

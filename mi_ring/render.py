@@ -56,7 +56,8 @@ def main(arguments: Sequence[str]) -> None:
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
     for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
-        rgb, _ = bridge.draw(surface, scene.photograph(k), config.spp, 0, scene.shadows, ring.indirect)
+        photograph = scene.photograph(k)
+        rgb, _ = bridge.draw(surface, photograph, spp=config.spp, shadows=scene.shadows, indirect=ring.indirect)
         write_picture(rgb[0].numpy(), config.out / sensor.filename.name)
     print(f"{len(scene.sensors)} photographs in {config.out}/")
 

@@ -59,8 +59,9 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
     """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
     capture = fit.capture
     observed, _, mask, masked = capture.observe([k])
-    photograph, shadows = capture.photograph(k), fit.config.shadows and capture.shadows
-    predicted, coverage = bridge.draw(fit.surface, photograph, 4, 0, shadows, fit.ring.indirect)
+    predicted, coverage = bridge.draw(
+        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
+    )
     photo, guess = linear_to_srgb(observed[0].numpy()), linear_to_srgb(predicted[0].numpy())
     small = capture.photograph(k, max(1, max(capture.sensors[k].size) // THUMBNAIL))
     parameters = fit.ring.brdf_net.bsdf_parameters

@@ -15,6 +15,7 @@ from mi_ring import bridge, report
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.config import Config
 from mi_ring.errors import InputError
+from mi_ring.reflectance import bsdf_element
 from mi_ring.ring import Ring
 
 
@@ -112,9 +113,7 @@ def scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes
     Raises InputError for a scene that cannot be rewritten, and for a shapenet that a fit has no use for.
     """
     tree = ElementTree.parse(source)
-    for tag in ("include", "default", "path"):
-        if tree.find(f".//{tag}") is not None:
-            raise InputError(f"{source}: <{tag}>: a fit needs a scene without it; write out what it stands for")
+    old_bsdf, _ = bsdf_element(tree.getroot(), source)
     for element in tree.iter("string"):
         file = source.parent / element.get("value", "")
         if element.get("value") and file.is_file():
@@ -125,8 +124,7 @@ def scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes
             raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
         if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
             shape.remove(element)
-    for element in shape.findall("bsdf") + shape.findall("ref"):
-        shape.remove(element)
+    shape.remove(old_bsdf)
     shape.append(ElementTree.fromstring(bsdf))
     ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
     ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")

@@ -22,11 +22,11 @@ class Ring(nn.Module):
 
     def __init__(
         self, center, radius: float, scale: float = 1.0, domain: Domain | None = None, parameters=COOK_TORRANCE,
-        bsdf: str = '<bsdf type="cooktorrance"/>',
+        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False,
     ):  # fmt: skip
         super().__init__()
-        self.shape_net, self.brdf_net, self.bsdf = ShapeNet(), BRDFNet(scale, parameters), bsdf
-        self.indirect = False
+        self.shape_net, self.brdf_net = ShapeNet(), BRDFNet(scale, parameters)
+        self.bsdf, self.indirect = bsdf, indirect
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.domain = domain or Sphere()
@@ -48,9 +48,9 @@ class Ring(nn.Module):
     @classmethod
     def from_state(cls, state: dict) -> "Ring":
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
-        ring = cls(torch.zeros(3), 1.0, domain=domain, parameters=state["parameters"], bsdf=state["bsdf"])
+        properties = {name: state[name] for name in ("parameters", "bsdf", "indirect")}
+        ring = cls(torch.zeros(3), 1.0, domain=domain, **properties)
         ring.load_state_dict(state["networks"])
-        ring.indirect = state["indirect"]
         return ring
 
     @classmethod

@@ -29,7 +29,6 @@ BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
 LANES = 1 << 21  #: rays per launch, at most
 ROUNDING = 1e-6  #: two ways to compute the same radiance in float32 may differ by this much, relative
 THUMBNAIL = 128  #: width and height of the contact sheet's pictures, at most [px]
-NOTABLE = 0.01  #: share of the light from which on a cause is worth a word
 
 
 @dataclass(frozen=True)
@@ -279,11 +278,10 @@ def verdict(rows: list[Comparison], everything: Comparison, significance: float)
         way = "brighter" if worst.unexplained > 0 else "darker"
         direct = (f"direct light DISAGREES with path ({p}), most of all in {worst.name}: "
                   f"photometric is {percent(abs(worst.unexplained))} {way} on average")  # fmt: skip
-    advice = ": consider --indirect" if everything.interreflection > NOTABLE else ""
     return [
         direct,
         f"shadows take away {percent(everything.shadows)} of the light",
-        f"interreflection is {percent(everything.interreflection)} of the light{advice}",
+        f"interreflection is {percent(everything.interreflection)} of the light",
     ]
 
 

@@ -101,7 +101,7 @@ def mean_and_error(values):
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_gradients_of_vertices_equal_finite_differences(name):
-    """Of shading and outline together, for radiance and for coverage: within 3 % or 4 standard errors.
+    """Of shading and outline together, for radiance and for coverage: within 1 %, beyond three standard errors.
 
     The step of 0.005 units is about 0.05 px: smaller ones are noisier, larger ones feel the weights of the next pixels.
     """
@@ -124,8 +124,8 @@ def test_gradients_of_vertices_equal_finite_differences(name):
     error = np.hypot(a_error, b_error)
     report = f"gradients\n{a}\nfinite differences\n{b}\nstandard errors\n{error}"
     print(report)
-    assert (error < 0.05 * np.abs(b)).all(), f"too noisy to tell: {report}"
-    assert (np.abs(a - b) < np.maximum(0.03 * np.abs(b), 4 * error)).all(), report
+    assert (error < 0.035 * np.abs(b)).all(), f"too noisy to tell: {report}"
+    assert (np.abs(a - b) < 0.01 * np.abs(b) + 3 * error).all(), report
 
 
 def test_long_edges_seen_from_a_slant():
@@ -245,7 +245,9 @@ def test_nothing_is_compiled_and_nothing_kept_after_the_first_iterations():
             vertices = (setting.vertices + tensor(random.normal(scale=0.01, size=(642, 3)))).requires_grad_()
             material = {key: m.clone().requires_grad_() for key, m in setting.material.items()}
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-                sum(setting.losses(vertices, material, 1, seed)).backward()
+                rgb, alpha = bridge.render(setting.surface, setting.photographs, vertices, material, 1, seed)
+                rgb = rgb + bridge.interreflection(setting.surface, setting.photographs, alpha, seed)
+                (rgb.sum() + alpha.sum()).backward()
                 compiled += sum(not k["cache_hit"] for k in dr.kernel_history([dr.KernelType.JIT]))
         return compiled
 

@@ -181,6 +181,12 @@ def dark(path, edit):
     path.write_text(re.sub(r'(<rgb name="intensity" value=")[^"]*', r"\g<1>0", path.read_text(), count=1))
 
 
+def wire(path, edit):
+    (path.parent / "wire.txt").write_text("".join(f"{x} 0 0 0.1\n" for x in range(5)))
+    curve = '<shape type="bsplinecurve" id="wire"><string name="filename" value="wire.txt"/></shape>'
+    edit('<shape type="shapenet"', curve + '<shape type="shapenet"')
+
+
 BROKEN = {
     "missing image": (rename, ["images/004.png", 'photograph "004"', "filename"]),
     "truncated image": (lambda path, edit: (path.parent / "images/004.png").write_bytes(b"\x89PNG"), ["004.png"]),
@@ -202,6 +208,7 @@ BROKEN = {
                         '</texture></bsdf>'), ["small.xml", "vertex_color"]),
     "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["000", "fy is 0"]),
     "black photographs": (black, ["small.xml", "black"]),
+    "shape without gradients": (wire, ["small.xml", '"wire"', "BSplineCurve", "meshes"]),
     "empty mask": (empty_mask, ["005.png", "mask"]),
 }  # fmt: skip
 

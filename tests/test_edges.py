@@ -154,18 +154,18 @@ def test_outlines_lie_on_the_shape_where_it_turns_away(name, eye):
 GROUND = {"type": "rectangle", "id": "ground", "to_world": mi.ScalarTransform4f().rotate([0.96, 0.28, 0], 12).scale(30)}
 
 
-@pytest.mark.parametrize("eye", EYES)
-def test_a_shadow_is_the_projection_of_its_edge(eye):
+@pytest.mark.parametrize("eye_name", EYES)
+def test_a_shadow_is_the_projection_of_its_edge(eye_name):
     board = {"type": "rectangle", "id": "board", "to_world": mi.ScalarTransform4f().translate([0.3, 0.2, 1]).scale(0.3)}
     scene = mi.load_dict({"type": "scene", "board": board, "ground": GROUND})
     shape = next(s for s in scene.shapes() if s.id() == "board")
-    (edge,) = outline_of(shape, EYES[eye], 1, seed=1)
-    camera = lambda view: (mi.Vector3f(2, 1, 4), mi.Bool(True))  # noqa: E731
-    shadow = cast(scene, edge, EYES[eye], camera)
+    (edge,) = outline_of(shape, EYES[eye_name], 1, seed=1)
+    camera = lambda view: (mi.Vector3f(4, -3, 2.5), mi.Bool(True))  # noqa: E731
+    shadow = cast(scene, edge, EYES[eye_name], camera)
     assert np.array(shadow.active).all()
     matrix = np.array(GROUND["to_world"].matrix)
     normal = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
-    where, finite = (np.array(v).ravel() for v in EYES[eye](0))
+    where, finite = (np.array(v).ravel() for v in EYES[eye_name](0))
 
     def project(p):
         d = p - where if finite[0] else np.broadcast_to(-where, p.shape)
@@ -175,6 +175,15 @@ def test_a_shadow_is_the_projection_of_its_edge(eye):
     np.testing.assert_allclose(np.array(shadow.point).T, project(p), atol=1e-4)
     step = (project(p + 1e-4 * v) - project(p - 1e-4 * v)) / 2e-4
     np.testing.assert_allclose(np.array(shadow.tangent).T, step, atol=1e-3 * np.abs(step).max())
+    # What the board hides from another camera is left out.
+    eye = np.array([2, 1, 4.0])
+    shadow = cast(scene, edge, EYES[eye_name], lambda view: (mi.Vector3f(eye), mi.Bool(True)))
+    q = project(p)
+    crossing = eye + (q - eye) * ((1 - eye[2]) / (q[:, 2] - eye[2]))[:, None]
+    beside = np.abs(crossing[:, :2] - [0.3, 0.2]).max(1) - 0.3
+    assert (beside < 0).any() == (eye_name == "distant")
+    clear = np.abs(beside) > 1e-3
+    np.testing.assert_array_equal(np.array(shadow.active)[clear], beside[clear] > 0)
 
 
 # How the pictures of these shapes change when they move.
@@ -214,7 +223,7 @@ def derivative(scene, name, channels):
         params.update()
         return mi.render(scene, params, spp=spp, seed=seed, seed_grad=seed + 1000)
 
-    gradients, differences, step = [], [], 0.004
+    gradients, differences, step = [], [], 0.012
     for seed in range(16):
         t = mi.Float(0)
         dr.enable_grad(t)
@@ -227,6 +236,13 @@ def derivative(scene, name, channels):
     return np.mean(gradients), np.mean(differences), error
 
 
+def check(a, b, error):
+    """Gradient `a` is difference `b` within 1 %, beyond three standard errors. Single curves contribute hundreds."""
+    scale = max(abs(b), 100)
+    assert error < 0.03 * scale, f"too noisy to tell: {a:.5g} and {b:.5g} ± {error:.2g}"
+    assert abs(a - b) < 0.01 * scale + 3 * error, f"{a:.5g}, not {b:.5g} ± {error:.2g}"
+
+
 @pytest.mark.parametrize("name", [*SHAPES, "cube"])
 def test_outline_moves_with_the_shape(name):
     """Coverage: nothing but the outline moves it."""
@@ -234,8 +250,7 @@ def test_outline_moves_with_the_shape(name):
                           "shape": (SHAPES | CUBE)[name]})  # fmt: skip
     param = "shape.vertex_positions" if name == "cube" else "shape.to_world"
     a, b, error = derivative(scene, param, slice(3, 4))
-    assert error < 7, f"too noisy to tell: {a:.5g} and {b:.5g} ± {error:.2g}"  # single curves contribute hundreds
-    assert abs(a - b) < max(0.01 * abs(b), 4 * error), f"{a:.5g}, not {b:.5g} ± {error:.2g}"
+    check(a, b, error)
 
 
 @pytest.mark.parametrize("param", ["shape.to_world", "ground.to_world", "000.to_world"])
@@ -247,5 +262,22 @@ def test_shadow_moves_with_the_shape_the_ground_and_the_camera(name, param):
                           "shape": SHAPES[name] | {"bsdf": white}, "ground": ground | {"bsdf": white},
                           "flash": {"type": "flash"}}, optimize=False)  # fmt: skip
     a, b, error = derivative(scene, param, slice(0, 3))
-    assert error < 7, f"too noisy to tell: {a:.5g} and {b:.5g} ± {error:.2g}"
-    assert abs(a - b) < max(0.03 * abs(b), 4 * error), f"{a:.5g}, not {b:.5g} ± {error:.2g}"
+    check(a, b, error)
+
+
+@pytest.mark.parametrize("kind", ["point", "spot", "directional"])
+def test_shadows_of_the_scenes_own_lamps_move_with_them(kind):
+    lamps = {
+        "point": {"type": "point", "position": [2.4, 1.5, 3.0], "intensity": 20.0},
+        "spot": {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([2.4, 1.5, 3.0], [0, 0, -0.5], [0, 1, 0]),
+                 "intensity": 20.0, "cutoff_angle": 60.0},
+        "directional": {"type": "directional", "direction": [-0.5, -0.3, -0.8], "irradiance": 1.5},
+    }  # fmt: skip
+    dim = {"type": "point", "position": [0.9, -0.6, 4.0], "intensity": 1e-6}
+    ground = GROUND | {"to_world": mi.ScalarTransform4f().translate([0, 0, -0.9]).rotate([0.96, 0.28, 0], 12).scale(30)}
+    white = {"type": "diffuse", "reflectance": 0.8}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "photometric"}, "sensor": SENSOR | {"light": dim},
+                          "shape": {"type": "sphere", "radius": 0.5, "bsdf": white}, "ground": ground | {"bsdf": white},
+                          "lamp": lamps[kind]}, optimize=False)  # fmt: skip
+    a, b, error = derivative(scene, "lamp.position" if kind == "point" else "lamp.to_world", slice(0, 3))
+    check(a, b, error)

@@ -10,7 +10,7 @@ from mi_ring.command import COMMANDS
 
 PACKAGE = Path(mi_ring.__file__).parent
 NETWORKS = {"encoding", "shapenet", "brdfnet"}
-PLUGINS = {"photograph", "bsdf", "mesh", "integrator"}
+PLUGINS = {"photograph", "bsdf", "mesh", "integrator", "edges", "indirect"}
 TRAINING = {"losses", "config", "results", "report", "command", "capture", "bridge"} | set(COMMANDS)
 
 

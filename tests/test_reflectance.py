@@ -113,10 +113,14 @@ def test_part_of_cooktorrance(broken_capture):
     """What the XML leaves to mesh attributes needs no starting value."""
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="specular" value="0.05"/></bsdf>')
-    ranges = {"diffuse": (0, math.inf), "roughness": (0.1, 1)}
-    parameters, xml = reflectance.predicted(path, capture.load(path).shape, ranges)
+    shape = capture.load(path).shape
+    parameters, xml = reflectance.predicted(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
     assert "vertex_specular" not in str(reflectance.load(xml))
+    # Without ranges: all but the constant.
+    assert [p.name for p in reflectance.predicted(path, shape, {})[0]] == ["diffuse", "roughness"]
+    with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
+        reflectance.predicted(path, shape, {"diffuse": (0, 1)})
 
 
 WRONG = {
@@ -137,8 +141,35 @@ def test_wrong_parameters_are_refused_in_one_line(scene, ranges, message):
     assert "\n" not in str(caught.value)
 
 
-def test_shape_without_a_bsdf_is_refused(broken_capture):
+REFUSED = {
+    "": "has no <bsdf>",
+    """<bsdf type="principled"><rgb name="base_color" value="0.5"/>
+    <texture name="roughness" type="bitmap"><string name="filename" value="images/000.png"/></texture></bsdf>""":
+        "<string> images/000.png: a fit takes BSDFs without files and references",
+    """<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse" name="a"/><bsdf type="diffuse"
+    name="b"/></bsdf>""": "blendbsdf has more than one texture reflectance",
+    """<bsdf type="cooktorrance"><rgb name="diffuse" value="0.5"/><float name="specular" value="0"/>
+    <float name="roughness" value="0.5"/></bsdf>""": "every parameter of cooktorrance is a constant",
+    """<include filename="other.xml"/><bsdf type="cooktorrance"/>""": "<include>: a fit needs a scene without it",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("xml", REFUSED, ids=REFUSED.values())
+def test_unfit_bsdfs_are_refused_in_one_line(broken_capture, xml):
     path, edit = broken_capture
-    edit('<bsdf type="cooktorrance"/>', "")
-    with pytest.raises(InputError, match="has no <bsdf>"):
-        reflectance.predicted(path, capture.load(path).shape, {})
+    (path.parent / "other.xml").write_text('<scene version="3.0.0"/>')
+    edit('<bsdf type="cooktorrance"/>', xml)
+    shape = capture.load(path).shape
+    with pytest.raises(InputError, match=REFUSED[xml]) as caught:
+        reflectance.predicted(path, shape, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
+    assert "\n" not in str(caught.value)
+
+
+def test_bsdf_by_reference(broken_capture, tmp_path):
+    """The result opens, though the BSDF is now there twice."""
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>', '<ref id="paint"/>')
+    edit('<shape type="shapenet"', PRINCIPLED.replace("<bsdf", '<bsdf id="paint"') + '<shape type="shapenet"')
+    assert fit.main(arguments(path, tmp_path / "run")) == 0
+    (shape,) = mi.load_file(str(tmp_path / "run" / "scene.xml")).shapes()
+    assert '"vertex_base_color"' in str(shape.bsdf())
