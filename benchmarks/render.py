@@ -111,6 +111,20 @@ class Scene:
         return np.array(dr.grad(arrays[0])).reshape(-1, 3)
 
 
+    def mean(self, spp=256, seed=1):
+        """Mean radiance of the pictures."""
+        if self.photographs is not None:
+            pixels = render_photographs(self.scene, self.photographs, spp, seed)[:3]
+            return np.mean([np.array(channel, np.float64).mean() for channel in pixels])
+        means = []
+        for k, lamp in enumerate(LAMPS):
+            self.params["light.position"] = mi.Point3f(lamp)
+            self.params.update()
+            picture = mi.render(self.scene, sensor=k, integrator=self.integrator, spp=spp, seed=seed + k)
+            means.append(np.array(picture, np.float64)[..., :3].mean())
+        return np.mean(means)
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -142,6 +156,9 @@ def main() -> None:
         ratio = np.median(cpu[name]) / np.median(cpu["`photometric`"])
         print(f"| {name} | {np.median(times):.0f} ({times.min():.0f} … {times.max():.0f}) | {ratio:.1f} | "
               f"{np.median(each):.2f} | {np.sqrt(power.sum() / variance.sum()):.2f} |", flush=True)  # fmt: skip
+    ours, direct = (methods[name].mean() for name in ("`photometric`", "`direct`, no outlines"))
+    print(f"\nMean radiance of the pictures: `photometric` {ours:.6f}, `direct` {direct:.6f}, "
+          f"relative difference {abs(ours - direct) / direct:.1e}")  # fmt: skip
 
 
 if __name__ == "__main__":
