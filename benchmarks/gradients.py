@@ -28,7 +28,7 @@ SHIFT, AXIS = [1.0, 0.3, -0.2], [0.48, 0.8, 0.36]  #: along which things are mov
 
 #: What moves, and by how much to either side in the finite difference.
 STEPS = {
-    "translate": 0.016, "scale": 0.016, "bump": 0.03, "camera moves": 0.016, "camera turns": 0.004,
+    "translate": 0.016, "scale": 0.016, "bump": 0.01, "camera moves": 0.016, "camera turns": 0.004,
     "focal length": 0.008, "light moves": 0.03, "intensity": 0.05,
 }  # fmt: skip
 MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.light")
@@ -60,7 +60,7 @@ class Picture:
                          "specular": 0.1, "roughness": 0.4},
             },
             "sensor": {
-                "type": "photograph", "filename": "nowhere.png", "fx": 121.0, "fy": 109.0, "cx": 45.0, "cy": 43.0,
+                "type": "photograph", "filename": "nowhere.png", "fx": 121.0, "fy": 109.0, "cx": 51.0, "cy": 42.0,
                 "to_world": pose,
                 "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba",
                          "component_format": "float32", "rfilter": {"type": rfilter}},
