@@ -26,10 +26,19 @@ def parse(config_type: type, arguments: Sequence[str], program: str, default=tyr
 
 
 def complaint_in(box: str) -> str:
-    """The complaint, in one line, of the box that tyro draws: a title, the complaint, a rule, advice."""
-    lines = [line.strip("│ ") for line in box.splitlines() if line.startswith("│")]
-    rules = [number for number, line in enumerate(lines) if set(line) == {"─"}]
-    return " ".join(lines[: rules[0]] if rules else lines) or " ".join(box.split())
+    """The complaint, in one line, of the box that tyro draws: a title, the complaint, rules and advice between them.
+
+    Of the advice, which options are spelled alike is kept.
+    """
+    parts = [[]]
+    for line in (line.strip("│ ") for line in box.splitlines() if line.startswith("│")):
+        if set(line) == {"─"}:
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
+    complaint = " ".join(parts[0]) or " ".join(box.split())
+    return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:

@@ -41,6 +41,10 @@ class Fit:
         scale = scene.reflectance(center, self.exposure)
         #: Of the light it gets, how much the object reflects: more than all where the lights' intensities are not true.
         self.albedo = math.pi * scale
+        if self.albedo >= 1 and all(math.isfinite(p.high) for p in parameters):
+            raise InputError(f"{scene.path}: emitter: by the lights' intensities the object reflects {self.albedo:.3g} "
+                             "times the light that it gets, which the ranges of --parameters do not reach; give "
+                             "the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and self.albedo < 1
         self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf, indirect)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)

@@ -30,10 +30,10 @@ class Photometric(ADIntegrator):
 
     Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
 
-    Gradients, through `mi.render` and through `render_photographs`, are those with respect to everything that
-    `mi.traverse` lists: shading by automatic differentiation, and the motion of outlines, creases and edges of cast
-    shadows, of all meshes, rectangles, disks, spheres and cylinders, by sampling these edges (Li et al. 2018,
-    "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
+    Gradients, through `mi.render` and through `render_photographs`, are those with respect to vertices, BSDFs, cameras,
+    lights and the placement of other shapes: shading by automatic differentiation, and the motion of outlines, creases
+    and edges of cast shadows, of all meshes, rectangles, disks, spheres and cylinders, by sampling these edges (Li et
+    al. 2018, "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
 
     What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
     about the photographs' own lights, others always cast shadows. Gradients need an RGB variant and a `photograph`

@@ -53,6 +53,9 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
             raise InputError(f"{scene}: bsdf: {name}: has no value; --parameters needs one to start from, an <rgb> "
                              "for a colour, a <float> for a number")  # fmt: skip
         value = np.array(textures[name][0])
+        if not low <= value.mean() <= high:
+            raise InputError(f"{scene}: bsdf: {name}: is {value.mean():g}, must be within the range of --parameters, "
+                             f"{low:g} to {high:g}")  # fmt: skip
         parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, start(value, low, high)))
         texture.clear()
         texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}

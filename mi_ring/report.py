@@ -51,7 +51,7 @@ def html(fit, log: list[dict]) -> str:
     template = resources.files("mi_ring").joinpath("report.html.jinja").read_text()
     environment = jinja2.Environment(autoescape=True)
     return environment.from_string(template).render(
-        name=fit.config.name, rows=rows, numbers=numbers, curve=loss_curve(log), settings=fit.config.settings()
+        name=fit.config.name, rows=rows, numbers=numbers, curve=loss_curve(log, fit), settings=fit.config.settings()
     )
 
 
@@ -97,20 +97,22 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def loss_curve(log: list[dict]) -> str:
-    """The terms of the loss over the iterations as an SVG data URI."""
+def loss_curve(log: list[dict], fit) -> str:
+    """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
     for term in ("loss", "rgb", "mask", "velocity"):
-        points = [(entry["iteration"], entry[term]) for entry in log if entry.get(term, 0) > 0]
+        weight = fit.config.weights.get(term, 0) if term != "loss" else 1
+        points = [(entry["iteration"], weight * entry[term]) for entry in log if weight * entry.get(term, 0) > 0]
         if points:
-            axes.semilogy(*zip(*points), label=term, linewidth=2 if term == "loss" else 1)
-    for before, after in zip(log, log[1:]):
-        if before["stage"] != after["stage"]:
-            axes.axvline(before["iteration"], color="0.7", linewidth=1, linestyle=":")
+            label = f"{weight:g} · {term}" if term != "loss" else term
+            axes.semilogy(*zip(*points), label=label, linewidth=2 if term == "loss" else 1)
+    for stage in fit.stages[1:]:
+        if stage.first < fit.iteration:
+            axes.axvline(stage.first, color="0.7", linewidth=1, linestyle=":")
     axes.set_xlabel("iteration (dotted: next stage)")
     axes.grid(alpha=0.3)
     if log:
-        axes.legend()
+        axes.legend(loc="upper right")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg")
     plt.close(figure)

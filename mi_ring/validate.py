@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 from mi_ring import capture, command, photograph
-from mi_ring.bsdf import check_attributes
+from mi_ring.bsdf import attributes_of, check_attributes
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, pixel_rays, render_photographs
@@ -28,12 +27,19 @@ BATCHES = 16  #: independent pictures of each photograph; their spread is the Mo
 BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
 LANES = 1 << 21  #: rays per launch, at most
 ROUNDING = 1e-6  #: two ways to compute the same radiance in float32 may differ by this much, relative
+IMPLAUSIBLE = 0.75  #: share of interreflection that hardly any object has
 THUMBNAIL = 128  #: width and height of the contact sheet's pictures, at most [px]
 
 
 @dataclass(frozen=True)
 class ValidateConfig:
     """Compare `photometric` with Mitsuba's path tracer on every photograph: shadows, interreflection, disagreement.
+
+    Prints a line for each photograph and one for all. In % of path's mean radiance: the mean difference of the two, the
+    mean of its absolute value and how much of that Monte Carlo noise explains, what shadows take away, what
+    interreflection adds, and what is left unexplained, the difference of direct light. "p direct" is how likely so
+    large a difference is if both renderers' direct light is the same, "p path" likewise of photometric and all light of
+    path: tiny where there is interreflection.
 
     Writes validate.png, a contact sheet, and validate.json, all numbers. Exit status: 1 if the direct light of the two
     differs by more than Monte Carlo noise, 2 if there is nothing to compare.
@@ -42,7 +48,7 @@ class ValidateConfig:
     scene: Positional[Path]
     """Mitsuba XML file with photographs, or results folder of a fit."""
     out: Path | None = None
-    """Folder of the results. Default: RUN/validate, for a scene file out/<name>/validate."""
+    """Folder of the results. Default: RUN/validate, for a scene file out/validate/<name>."""
     photographs: tuple[str, ...] = ()
     """Only these, by id or name of the image file. Default: all."""
     width: int = 128
@@ -102,6 +108,8 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     try:
         for shape in scene.shapes():
             check_attributes(shape)
+            if isinstance(shape, ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
+                raise ValueError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(sensors)
         return with_flash(scene), sensors
     except ValueError as error:
@@ -255,9 +263,9 @@ def probability(p: float) -> str:
 
 
 def table(rows: list[Comparison]) -> str:
-    """The numbers as text, one line each; all but radiance, PSNR and p are in % of the radiance."""
-    cells = [("in %", "radiance", "difference", "absolute", "of it noise", "PSNR", "shadows", "interreflection",
-              "unexplained", "p direct", "p path")]  # fmt: skip
+    """The numbers as text, one line each; shares are of the radiance of `path`."""
+    cells = [("", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
+              "unexplained %", "p direct", "p path")]  # fmt: skip
     cells += [(
         r.name, f"{r.radiance:.4g}", f"{100 * r.difference:+.2f}", f"{100 * r.absolute_difference:.2f}",
         f"{100 * r.noise:.2f}", f"{r.psnr:.1f} dB", f"{100 * r.shadows:.2f}", f"{100 * r.interreflection:.2f}",
@@ -278,14 +286,16 @@ def verdict(rows: list[Comparison], everything: Comparison, significance: float)
         way = "brighter" if worst.unexplained > 0 else "darker"
         direct = (f"direct light DISAGREES with path ({p}), most of all in {worst.name}: "
                   f"photometric is {percent(abs(worst.unexplained))} {way} on average")  # fmt: skip
+    doubt = ": are the lights' intensities true?" if everything.interreflection > IMPLAUSIBLE else ""
     return [
         direct,
         f"shadows take away {percent(everything.shadows)} of the light",
-        f"interreflection is {percent(everything.interreflection)} of the light",
+        f"interreflection is {percent(everything.interreflection)} of the light{doubt}",
     ]
 
 
 COLUMNS = ("path", "photometric", "8 x difference", "shadows", "4 x interreflection", "32 x unexplained")
+LEGEND = "Each photograph by its own exposure. Differences: red where photometric is brighter, blue where it is darker."
 
 
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
@@ -314,7 +324,7 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
     text = "   ".join([
         row.name, f"difference {percent(row.difference)}", f"shadows {percent(row.shadows)}",
         f"interreflection {percent(row.interreflection)}", f"unexplained {percent(row.unexplained)}",
-        probability(row.p_direct),
+        f"({probability(row.p_direct)})",
     ])  # fmt: skip
     ImageDraw.Draw(line).text((2, 2), text, fill=(255, 255, 255))
     return line
@@ -326,13 +336,14 @@ def sheet(strips: list[Image.Image]) -> bytes:
     stacks = max(1, round(np.sqrt(len(strips) * height / width)))
     rows = -(-len(strips) // stacks)
     stacks = -(-len(strips) // rows)
-    page = Image.new("RGB", (stacks * width - 12, rows * height + 16))
+    page = Image.new("RGB", (stacks * width - 12, rows * height + 32))
     draw = ImageDraw.Draw(page)
     for k, title in enumerate(COLUMNS * stacks):
         stack, column = divmod(k, len(COLUMNS))
-        draw.text((stack * width + column * (THUMBNAIL + 4) + 2, 2), title, fill=(255, 220, 120))
+        draw.text((stack * width + column * (THUMBNAIL + 4) + 2, 18), title, fill=(255, 220, 120))
+    draw.text((2, 2), LEGEND, fill=(255, 220, 120))
     for k, line in enumerate(strips):
-        page.paste(line, (k // rows * width, 16 + k % rows * height))
+        page.paste(line, (k // rows * width, 32 + k % rows * height))
     buffer = io.BytesIO()
     page.save(buffer, "PNG")
     return buffer.getvalue()
@@ -356,7 +367,7 @@ def main(arguments: Sequence[str]) -> int:
             raise InputError(f"{config.scene}: has no scene.xml; give the folder of a finished fit or a scene file")
     elif name == "scene":
         name = path.resolve().parent.name
-    out = config.out or (config.scene if config.scene.is_dir() else Path("out") / name) / "validate"
+    out = config.out or (config.scene / "validate" if config.scene.is_dir() else Path("out/validate") / name)
     scene, sensors = open_scene(path)
     chosen = choose(sensors, config.photographs)
     try:
@@ -364,9 +375,6 @@ def main(arguments: Sequence[str]) -> int:
     except OSError as error:
         raise InputError(f"{out}: --out: cannot be written ({error.strerror}); choose another folder") from error
 
-    for shape in scene.shapes():
-        if isinstance(shape, ShapeNetMesh) and shape.ring is None:
-            print(f"{path}: {shape.id()} has no weights: this is the surface that a fit begins with", file=sys.stderr)
     photographs, spp = Photographs.of(sensors), -(-config.spp // BATCHES)
     names = [sensor.filename.name for sensor in sensors]
     rows, strips = [], []

@@ -392,9 +392,9 @@ def test_mistakes_are_answered_in_one_line(tmp_path, complaint, path, options):
     assert complaint in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_surface_that_a_fit_begins_with_is_named(tmp_path, capsys):
-    run(write(tmp_path, ELLIPSOID, CONVEX[0]))
-    assert "object has no weights" in capsys.readouterr().err
+def test_a_scene_that_was_not_fitted_yet_is_refused(small_capture):
+    with pytest.raises(InputError, match="object: has no weights.*give the folder of its fit"):
+        validate.main([str(small_capture)])
 
 
 def test_capture_with_interreflection(shared, tmp_path):
