@@ -34,6 +34,7 @@ class Curve:
     inside: mi.Point3f  # detached: what the curve bounds lies on this side of it
     active: mi.Bool
     offset: float  # how far to both sides of it one has to look [px]
+    shadow: bool = False  # is it an edge of light and not of a shape?
 
 
 class Edges:
@@ -104,7 +105,7 @@ class Edges:
         )
         return edge, first, second
 
-    def sample(self, lanes, seed, offset=ROOT) -> Curve:
+    def sample(self, lanes, seed, shadow=False) -> Curve:
         """Stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
         count, n = dr.width(self.kind), dr.width(lanes)
         each = max(SAMPLES, SAMPLES_IN_ALL // n)
@@ -115,7 +116,7 @@ class Edges:
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
         piece = dr.detach(b - a) / mi.Float(each)
-        return Curve(chosen // count, dr.lerp(a, b, t), piece, self.middle(edge), mi.Bool(True), offset)
+        return Curve(chosen // count, dr.lerp(a, b, t), piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
 
     def middle(self, edge):
         """The centre of the two triangles at an edge, detached."""
@@ -156,7 +157,7 @@ class Edges:
                 edge, first, second = self.sides(seen, lanes)
                 both = dr.compress(first & second & (dr.gather(mi.UInt32, self.kind, edge) == SMOOTH))
                 if dr.width(both):
-                    terminators.append(self.sample(dr.gather(mi.UInt32, lanes, both), seed + 1))
+                    terminators.append(self.sample(dr.gather(mi.UInt32, lanes, both), seed + 1, shadow=True))
         return casters, terminators
 
 
@@ -196,7 +197,7 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
         # Whether a point is in shadow is asked a little above the surface.
         above = dr.mulsign(above, -slope)
         shift = d * (above / slope) - n * above
-    return Curve(curve.view, si.p + shift, tangent, curve.inside, active, JUMP)
+    return Curve(curve.view, si.p + shift, tangent, curve.inside, active, JUMP, shadow=True)
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:

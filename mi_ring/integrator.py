@@ -366,7 +366,9 @@ def boundary(scene, photographs, curve: Curve, seed, shadows, window):
         dr.eval(sides)
         before = 2 * dr.arange(mi.UInt32, n)
         jumps = [dr.gather(mi.Float, s, before, active) - dr.gather(mi.Float, s, before + 1, active) for s in sides]
-        dr.eval(jumps)
+        if curve.shadow:  # no edge of light covers more: between the two sides there is an outline, which is not meant
+            active &= jumps[3] == 0
+        dr.eval(jumps, active)
     moved = dr.dot(dr.select(active, across, 0), where)
     return q, curve.view, [dr.replace_grad(mi.Float(0), jump * moved) for jump in jumps], active
 

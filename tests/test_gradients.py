@@ -117,6 +117,12 @@ def test_material_constants(name):
     assert dr.grad(t)[0] == pytest.approx(((high - low) * picture.weights).sum() / 0.04, rel=0.01)
 
 
+def test_lights_do_not_move_coverage():
+    """Though the edges of shadows come as near to an outline as they like."""
+    picture = Picture("light moves", "flash", True, "bumpy", level=5)
+    assert all(picture.gradient(seed, 1, COVERAGE) == 0 for seed in range(3))
+
+
 def test_stock_sensors_are_refused():
     picture = Picture("intensity", "lamp", False, "sphere", level=2)
     sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}})
