@@ -23,10 +23,10 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
     element = bsdf_element(ElementTree.parse(scene).getroot(), scene)[1]
     kind = element.get("type")
     for inner in element.iter():
-        inner.attrib.pop("id", None)  # else it would be there twice in scenes that have it by reference
         if inner.tag == "ref" or inner.get("name") == "filename":
             raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
                              "without files and references; use constants")  # fmt: skip
+        inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
     textures = {}
     for key, value in mi.traverse(bsdf):
         head, _, tail = key.rpartition(".")
