@@ -27,11 +27,7 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
             raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
-    textures = {}
-    for key, value in mi.traverse(bsdf):
-        head, _, tail = key.rpartition(".")
-        if tail == "value":
-            textures.setdefault(head.rpartition(".")[2], []).append(value)
+    textures = constants(bsdf)
     own = {p.name: p for p in COOK_TORRANCE if isinstance(bsdf, CookTorrance) and p.name not in textures}
     names = ", ".join([*textures, *own])
     if not ranges and not isinstance(bsdf, CookTorrance):
@@ -72,6 +68,16 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
         raise InputError(f"{scene}: bsdf: every parameter of {kind} is a constant; --parameters must say which of "
                          f"{names} to predict")  # fmt: skip
     return tuple(parameters), xml
+
+
+def constants(bsdf) -> dict[str, list]:
+    """The values of a BSDF's constant textures, by the texture's name; of several where BSDFs are nested."""
+    values = {}
+    for key, value in mi.traverse(bsdf):
+        head, _, tail = key.rpartition(".")
+        if tail == "value":
+            values.setdefault(head.rpartition(".")[2], []).append(value)
+    return values
 
 
 def load(xml: str) -> mi.BSDF:
