@@ -116,7 +116,8 @@ class Edges:
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
         piece = dr.detach(b - a) / mi.Float(each)
-        return Curve(chosen // count, dr.lerp(a, b, t), piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
+        p = a * (1 - t) + b * t  # dr.lerp would add its two gradients of `a` in an order that is not always the same
+        return Curve(chosen // count, p, piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
 
     def middle(self, edge):
         """The centre of the two triangles at an edge, detached."""
