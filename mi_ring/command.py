@@ -5,6 +5,7 @@ import importlib
 import io
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import tyro
 
@@ -39,6 +40,11 @@ def complaint_in(box: str) -> str:
     alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
     complaint = " ".join(parts[0]) or " ".join(box.split())
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
+
+
+def name_of(scene: Path) -> str:
+    """The name of a scene: that of the file, or of its folder where the file is just called scene.xml."""
+    return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from tyro.conf import Positional
 
+from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
 
@@ -103,8 +104,8 @@ class Config:
 
     @property
     def name(self) -> str:
-        """Of the scene: that of the file, or of its folder where the file is just called scene.xml."""
-        return self.scene.stem if self.scene.stem != "scene" else self.scene.resolve().parent.name
+        """Of the scene."""
+        return name_of(self.scene)
 
     @property
     def folder(self) -> Path:

@@ -100,8 +100,7 @@ def data_uri(picture: np.ndarray) -> str:
 def loss_curve(log: list[dict], fit) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
-    for term in ("loss", "rgb", "mask", "velocity"):
-        weight = fit.config.weights.get(term, 0) if term != "loss" else 1
+    for term, weight in ({"loss": 1.0} | fit.config.weights).items():
         points = [(entry["iteration"], weight * entry[term]) for entry in log if weight * entry.get(term, 0) > 0]
         if points:
             label = f"{weight:g} · {term}" if term != "loss" else term

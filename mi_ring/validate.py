@@ -360,14 +360,12 @@ def choose(sensors: list, names: Sequence[str]) -> list[int]:
 def main(arguments: Sequence[str]) -> int:
     """The command."""
     config = command.parse(ValidateConfig, arguments, "mi_ring.validate")
-    path, name = config.scene, config.scene.stem
+    path, out = config.scene, Path("out/validate") / command.name_of(config.scene)
     if path.is_dir():
-        path = path / "scene.xml"
+        path, out = path / "scene.xml", path / "validate"
         if not path.is_file():
             raise InputError(f"{config.scene}: has no scene.xml; give the folder of a finished fit or a scene file")
-    elif name == "scene":
-        name = path.resolve().parent.name
-    out = config.out or (config.scene / "validate" if config.scene.is_dir() else Path("out/validate") / name)
+    out = config.out or out
     scene, sensors = open_scene(path)
     chosen = choose(sensors, config.photographs)
     try:
