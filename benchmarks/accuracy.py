@@ -1,15 +1,21 @@
-"""Fit captures with known truth and print the paper's columns as a Markdown table, with machine and date.
+"""Fit captures with known truth and print, as Markdown with machine and date, how near they come and what it costs.
 
-    python benchmarks/accuracy.py scenes/pot2.xml [MORE.xml …] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
+    python benchmarks/accuracy.py SCENE.xml [MORE.xml …] [--seeds 0 1 2] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
 
-The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/, or where --truth says. Each
-fit is a process of its own: wall time and peak memory are the whole process's, start-up and report included; fit time
-is the iterations'.
+For each scene, and seed, the curve of the normals' mean error against fit time, then a table of the paper's columns and
+one of where the time went; the worst of several seeds, column by column, is a line of its own. The truth of SCENE.xml
+is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/, or where --truth says. Each fit is a process of its
+own. Fit time is the iterations' alone; wall time and peak memory are the whole process's, start-up and report included;
+the time of the evaluations for the curve is taken off, their memory is not.
 """
 
 import argparse
+import collections
+import contextlib
 import datetime
+import functools
 import json
+import multiprocessing
 import os
 import platform
 import resource
@@ -19,6 +25,9 @@ import time
 from pathlib import Path
 
 COLUMNS = ("normal_mean", "normal_median", "depth_mean", "depth_median", "iou", "psnr_input", "psnr_novel")
+HIGHER_IS_BETTER = ("iou", "psnr_input", "psnr_novel")
+COSTS = ("fit s", "wall s", "GiB, at most")
+POINTS = 8  #: of the curve
 
 
 def truth_of(scene: Path) -> Path:
@@ -40,18 +49,108 @@ def processor() -> str:
     return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
-def measure(scene: Path, out: Path, options: list[str], truth: Path) -> dict:
-    """Fit one scene and evaluate it."""
-    command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]
+def watch() -> dict[str, float]:
+    """Seconds by part of all fits of this process, from now on."""
+    from mi_ring import bridge, shapenet  # here, not in the parent: a process begins with its parent's peak memory
+
+    # isort: split
+    import torch
+
+    seconds = {"flow": 0.0, "rendering": 0.0, "optimiser": 0.0}
+
+    def timed(part, function):
+        @functools.wraps(function)
+        def run(*args, **kwargs):
+            before = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                seconds[part] += time.perf_counter() - before
+
+        return run
+
+    for part, cls in (("flow", shapenet._Flow), ("rendering", bridge._Render)):
+        cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
+    bridge.interreflection = timed("rendering", bridge.interreflection)
+    for cls in (torch.optim.Adam, torch.optim.Muon):
+        cls.step = timed("optimiser", cls.step)
+    return seconds
+
+
+def peak_memory() -> float:
+    """Of this process [GiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB → GiB
+
+
+def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
+    """Run `mi_ring.fit` in this process and look on: the curve, seconds by part, wall seconds, memory [GiB]."""
     started = time.perf_counter()
-    subprocess.run(command, check=True, stdout=sys.stderr)
-    wall = time.perf_counter() - started
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # KiB → GiB; the largest child so far
+    seconds, parts = watch(), collections.Counter()
+    from mi_ring import evaluate, fit
+
+    # isort: split
+    import numpy as np
+    import torch
+
+    curve, apart = [], 0.0
+
+    class Watched(fit.Fit):
+        def step(self):
+            nonlocal apart
+            before = dict(seconds)
+            terms = super().step()
+            parts.update({part: seconds[part] - before[part] for part in seconds})
+            if self.iteration * points // self.config.iterations > len(curve):
+                paused = time.perf_counter()
+                curve.append((self.seconds, self.error()))
+                apart += time.perf_counter() - paused
+            return terms
+
+        @functools.cached_property
+        def truth(self):
+            return evaluate.load_mesh(truth / "mesh.ply")
+
+        def error(self):
+            s, faces = self.ring.domain.sample(self.config.subdivisions)
+            with torch.no_grad():
+                vertices = self.ring.surface(s.to(self.device)).cpu().numpy()
+            mesh, scene = self.truth
+            guess = evaluate.scene_of(vertices, faces)
+            diagonal = np.linalg.norm(mesh.extents)
+            return evaluate.compare_surfaces(self.capture, guess, scene, diagonal)["normal_mean"]
+
+    fit.Fit = Watched
+    with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
+        fit.main(arguments)
+    wall = time.perf_counter() - started - apart
+    return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": peak_memory()}
+
+
+def alone(function, *arguments):
+    """Call a function in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(function, arguments)
+
+
+def measure(scene: Path, out: Path, options: list[str], truth: Path, points: int = 0) -> dict:
+    """Fit one scene in a new process and evaluate it."""
+    watched = alone(watched_fit, [str(scene), "--out", str(out), *options], truth, points)
     evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply"),
                 "--novel", str(truth / "scene.xml")]  # fmt: skip
     numbers = json.loads(subprocess.run(evaluate, check=True, capture_output=True, text=True).stdout)
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return {**numbers, "fit_seconds": log[-1]["seconds"], "wall_seconds": wall, "memory": memory}
+    return numbers | watched | {"fit_seconds": log[-1]["seconds"]}
+
+
+def table(heads, rows) -> str:
+    """Markdown."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in [heads, ["---"] * len(heads), *rows])
+
+
+def cells(values) -> list[str]:
+    """Of one line of the table: COLUMNS, then COSTS."""
+    formats = ["{:.4f}" if c == "iou" else "{:.2f}" for c in COLUMNS] + ["{:.0f}", "{:.0f}", "{:.1f}"]
+    return [f.format(v) for f, v in zip(formats, values)]
 
 
 def main() -> None:
@@ -59,21 +158,35 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--truth", type=Path, help="folder of mesh.ply and scene.xml, of a single scene")
     arguments, options = parser.parse_known_args()
     if arguments.truth and len(arguments.scenes) > 1:
         parser.error("--truth goes with one scene")
     truths = [arguments.truth or truth_of(scene) for scene in arguments.scenes]
     print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
-    heads = [c.replace("_", " ") for c in COLUMNS]
-    print("| scene | " + " | ".join(heads) + " | fit s | wall s | GiB, at most |")
-    print("|---" * (len(heads) + 4) + "|", flush=True)
+    results, parts = [], []
     for scene, truth in zip(arguments.scenes, truths):
-        name = scene.stem if scene.stem != "scene" else scene.parent.name
-        row = measure(scene, arguments.out / name, options, truth)
-        cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in COLUMNS]
-        cells += [f"{row['fit_seconds']:.0f}", f"{row['wall_seconds']:.0f}", f"{row['memory']:.1f}"]
-        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+        name, rows = scene.stem if scene.stem != "scene" else scene.parent.name, []
+        for seed in arguments.seeds:
+            label = name if len(arguments.seeds) == 1 else f"{name}, seed {seed}"
+            out = arguments.out / (name if seed == 0 else f"{name}_{seed}")
+            row = measure(scene, out, [*options, "--seed", str(seed)], truth, POINTS)
+            seconds, errors = zip(*row["curve"])
+            print(table([f"{label}, fit time s", *(f"{s:.0f}" for s in seconds)],
+                        [["normals, mean error °", *(f"{e:.2f}" for e in errors)]]), flush=True)  # fmt: skip
+            print()
+            rows.append([*(row[c] for c in COLUMNS), row["fit_seconds"], row["wall"], row["memory"]])
+            results.append([label, *cells(rows[-1])])
+            print(f"{label}: {', '.join(results[-1][1:])}", file=sys.stderr)  # lest a failure later lose it
+            rest = row["fit_seconds"] - sum(row["parts"].values())
+            parts.append([label, *(f"{s:.0f}" for s in [*row["parts"].values(), rest])])
+        if len(rows) > 1:
+            worst = [min(v) if c in HIGHER_IS_BETTER else max(v) for c, v in zip([*COLUMNS, *COSTS], zip(*rows))]
+            results.append([f"**{name}, worst**", *cells(worst)])
+    print(table(["scene", *(c.replace("_", " ") for c in [*COLUMNS, *COSTS])], results))
+    print("\nSeconds of the fit:\n")
+    print(table(["scene", *row["parts"], "rest"], parts))
 
 
 if __name__ == "__main__":

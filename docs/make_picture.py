@@ -31,8 +31,8 @@ def main() -> None:
     surface.set_faces(faces)
     flow = []
     with torch.no_grad():
-        for step in (0, 5, 10, 15, 20):
-            vertices = ring.center + ring.radius * ring.shape_net.flow(s, step)
+        for quarter in range(5):
+            vertices = ring.center + ring.radius * ring.shape_net.flow(s, quarter * ring.shape_net.steps // 4)
             surface.write(vertices, ring.brdf_net(s))
             flow.append(linear_to_srgb(bridge.draw(surface, photograph, spp=64)[0][0].numpy()))
     maps = {name: m[0] for name, m in bridge.maps(surface, photograph).items()}

@@ -17,6 +17,21 @@ from mi_ring.losses import blur
 from mi_ring.mesh import FACES, POSITIONS
 
 
+def device() -> torch.device:
+    """Where torch must keep its tensors: where the current variant of Mitsuba computes. Nothing is copied then."""
+    return torch.device("cuda" if mi.variant().startswith("cuda") else "cpu")
+
+
+def to_drjit(tensor: Tensor):
+    """A tensor, flattened, as a Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
+    return mi.Float(tensor.detach().contiguous().ravel())
+
+
+def to_torch(array) -> Tensor:
+    """A Dr.Jit Float as a tensor (n,) of the same memory (DLPack). Neither side may write to it."""
+    return dr.detach(array).torch()
+
+
 class Surface:
     """The `shapenet` shape of a loaded scene, as something that torch tensors are written to.
 
@@ -50,7 +65,7 @@ class Surface:
         Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
         """
         tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
-        arrays = {name: mi.Float(t.detach().contiguous().numpy().ravel()) for name, t in tensors.items()}
+        arrays = {name: to_drjit(t) for name, t in tensors.items()}
         if gradients:
             dr.enable_grad(*arrays.values())
         if self.faces is not None:
@@ -66,6 +81,7 @@ class Surface:
         """Write a `Ring` at domain points (V, 3) with these triangles."""
         with torch.no_grad():
             self.set_faces(faces)
+            s = s.to(ring.center.device)
             self.write(ring.surface(s), ring.brdf_net(s))
 
 
@@ -89,10 +105,11 @@ class _Render(torch.autograd.Function):
             raise RuntimeError("the surface was written again since this picture: call backward before the next one")
         for channel, grad in zip(channels, (*rgb_grad.unbind(-1), alpha_grad)):
             if dr.grad_enabled(channel):
-                dr.set_grad(channel, mi.Float(grad.contiguous().numpy().ravel()))
+                dr.set_grad(channel, to_drjit(grad))
                 dr.enqueue(dr.ADMode.Backward, channel)
         dr.traverse(dr.ADMode.Backward)
-        grads = [torch.from_numpy(np.array(dr.grad(a))).reshape(shape) for a, shape in zip(arrays, shapes)]
+        # Copied: torch may add to a gradient in place.
+        grads = [to_torch(dr.grad(a)).clone().reshape(shape) for a, shape in zip(arrays, shapes)]
         return None, None, None, None, None, None, *grads
 
 
@@ -110,13 +127,16 @@ def render(surface, photographs, vertices, attributes, spp=4, seed=0, shadows=Tr
 
 
 def draw(surface, photographs, spp=16, seed=0, shadows=True, indirect=False):
-    """Like `render`, of the surface as last written and without gradients; `indirect`: with interreflection."""
+    """Like `render`, of the surface as last written, without gradients, in the processor's memory.
+
+    `indirect`: with interreflection.
+    """
     channels = render_photographs(surface.scene, photographs, spp, seed, shadows)
     dr.eval(channels)
     rgb, coverage = pictures(channels, photographs)
     if indirect:
         rgb = rgb + interreflection(surface, photographs, coverage, seed + 1, width=128, spp=32)
-    return rgb, coverage
+    return rgb.cpu(), coverage.cpu()
 
 
 def interreflection(surface, photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16) -> Tensor:
@@ -143,8 +163,8 @@ def pictures(channels, photographs):
     """The renderer's four Floats as tensors ((N, H, W, 3), (N, H, W))."""
     width, height = photographs.size
     shape = (len(photographs), height, width)
-    picture = [torch.from_numpy(np.array(dr.detach(c)).reshape(shape)) for c in channels]
-    return torch.stack(picture[:3], dim=-1), picture[3]
+    picture = [to_torch(c).reshape(shape) for c in channels]
+    return torch.stack(picture[:3], dim=-1), picture[3].clone()
 
 
 def maps(surface, photographs, parameters=COOK_TORRANCE) -> dict[str, np.ndarray]:

@@ -9,11 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+from tqdm import tqdm
 
 from mi_ring import mesh, photograph
 from mi_ring.edges import Edges
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, check_attributes
+
+#: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
+REMEMBERED_PIXELS = 2**23
 
 
 @dataclass
@@ -32,6 +36,7 @@ class Capture:
     def __post_init__(self):
         self.photographs = Photographs.of(self.sensors)
         sizes = [sensor.size for sensor in self.sensors]
+        self._decoded, self._remembered = {}, 0  # (scale, result of `decoded`) by photograph, and their pixels
         #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
         self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
 
@@ -41,6 +46,11 @@ class Capture:
     @property
     def names(self) -> list[str]:
         return [sensor.filename.name for sensor in self.sensors]
+
+    def spread(self, most: int = 200) -> list[int]:
+        """Indices of at most so many photographs, evenly spread: enough to look at."""
+        count = min(most, len(self))
+        return [k * len(self) // count for k in range(count)]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
         """Photograph `k` alone, to be rendered `scale` times smaller."""
@@ -53,17 +63,29 @@ class Capture:
         bright; the object's coverage (n, H, W) in [0, 1]; and which photographs have a mask (n,) bool, coverage being 0
         where there is none.
         """
-        decoded, clipped, covered = [], [], []
-        for k in index:
-            linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
-            decoded.append(torch.from_numpy(linear))
-            clipped.append(torch.from_numpy(saturated))
-            mask = np.zeros(linear.shape[:2], np.uint8) if self.masks[k] is None else self.masks[k]
-            covered.append(torch.from_numpy(mask))
-        rgb = shrink(torch.stack(decoded), scale)
-        saturated = shrink(torch.stack(clipped).float(), scale) > 0
-        mask = shrink(torch.stack(covered).float()[..., None] / 255, scale)[..., 0]
-        return rgb, saturated, mask, torch.tensor([self.masks[k] is not None for k in index])
+        rgb, saturated, mask = zip(*(self.decoded(k, scale) for k in index))
+        masked = torch.tensor([self.masks[k] is not None for k in index])
+        return torch.stack(rgb), torch.stack(saturated), torch.stack(mask), masked
+
+    def decoded(self, k: int, scale: int) -> tuple[Tensor, Tensor, Tensor]:
+        """One photograph of `observe`. If smaller than the file and if it fits, it is remembered, at its last scale."""
+        if k in self._decoded:
+            before, result = self._decoded[k]
+            if before == scale:
+                return result
+            self._remembered -= self._decoded.pop(k)[1][2].numel()
+        linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
+        mask = np.zeros(linear.shape[:2], np.uint8) if self.masks[k] is None else self.masks[k]
+        result = (
+            shrink(torch.from_numpy(linear), scale),
+            shrink(torch.from_numpy(saturated).float(), scale) > 0,
+            shrink(torch.from_numpy(mask).float()[..., None] / 255, scale)[..., 0],
+        )
+        pixels = result[2].numel()
+        if scale > 1 and self._remembered + pixels <= REMEMBERED_PIXELS:
+            self._decoded[k] = scale, result
+            self._remembered += pixels
+        return result
 
     def exposure(self) -> float:
         """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks)."""
@@ -122,11 +144,11 @@ def to_bytes(encoded: np.ndarray) -> np.ndarray:
     return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def shrink(images: Tensor, scale: int) -> Tensor:
-    """(n, H, W, C) → (n, H // scale, W // scale, C), the mean over blocks."""
+def shrink(image: Tensor, scale: int) -> Tensor:
+    """(H, W, C) → (H // scale, W // scale, C), the mean over blocks."""
     if scale == 1:
-        return images
-    return F.avg_pool2d(images.permute(0, 3, 1, 2), scale).permute(0, 2, 3, 1)
+        return image
+    return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
 
 
 def pixel_directions(matrix, focal, centre, pixels):
@@ -158,18 +180,19 @@ def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -
     A start surface that is a little too large shrinks onto the object, which goes faster than growing limbs.
     """
     cameras = [camera_of(capture.sensors[k]) for k in masked]
-    pixels = []
-    for k in masked:
+
+    def pixels(k):  # found anew each time: those of thousands of masks would fill the memory
         rows, columns = np.nonzero(capture.masks[k] > 127)
         if not len(rows):
             raise InputError(f"{capture.sensors[k].mask}: mask: no object in it (no pixel above 127)")
-        pixels.append(np.stack([columns, rows], 1) + 0.5)
+        return np.stack([columns, rows], 1) + 0.5
+
     origins = np.stack([matrix[:3, 3] for matrix, _, _ in cameras])
-    axes = np.stack([pixel_directions(*c, p.mean(0, keepdims=True))[0] for c, p in zip(cameras, pixels)])
-    center = nearest_point(origins, axes, str(capture.path))
+    axes = [pixel_directions(*c, pixels(k).mean(0, keepdims=True))[0] for c, k in zip(cameras, masked)]
+    center = nearest_point(origins, np.stack(axes), str(capture.path))
     reach = max(
-        np.linalg.norm(np.cross(pixel_directions(*c, p), center - o), axis=1).max()
-        for c, p, o in zip(cameras, pixels, origins)
+        np.linalg.norm(np.cross(pixel_directions(*c, pixels(k)), center - o), axis=1).max()
+        for c, k, o in zip(cameras, masked, origins)
     )
     axis = np.linspace(-reach, reach, resolution)
     grid = center + np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -213,7 +236,8 @@ def load(path: str | Path, images: bool = True) -> Capture:
             check_attributes(shape)
         if images:
             Edges(scene)  # refuses shapes without gradients
-        pixels = [read_image(s, path) for s in sensors] if images else []
+        reading = tqdm(sensors if images else [], desc="reading", unit="photograph", leave=False, disable=None)
+        pixels = [read_image(s, path) for s in reading]
         linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
         masks = [read_mask(s, path) for s in sensors] if images else []
         shadows = getattr(scene.integrator(), "shadows", True)

@@ -36,16 +36,18 @@ class Config:
     """Settings that go together; each can be overridden. paper: the paper's own, days on a CPU."""
     seed: int = 0
     """Of every random choice."""
-    iterations: int = 260
+    iterations: int = 500
     """In all, shared out among the stages."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
     widths: tuple[int, ...] = (128, 256, 512)
     """Width of the photographs in each stage, at most [px]."""
-    shares: tuple[float, ...] = (0.5, 0.4, 0.1)
+    shares: tuple[float, ...] = (0.45, 0.43, 0.12)
     """Share of the iterations of each stage."""
     batch: int = 8
     """Photographs per iteration."""
+    steps: int = 8
+    """Euler steps of the flow, the paper's T."""
     spp: int = 1
     """Samples per pixel."""
     loss: Literal["l2", "l1", "log"] = "l1"
@@ -59,6 +61,9 @@ class Config:
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
+    velocity_decay: float = 0.03
+    """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
+    while it finds its place, weak at the end, for details."""
     laplacian_scale: float = 0.01
     """The paper's alpha: how much the regulariser smoothes the velocity field."""
     blur: float = 0.06
@@ -72,9 +77,11 @@ class Config:
     decay: float = 0.1
     """The learning rates fall exponentially to this share."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Of the networks' matrix products. auto: bfloat16 where the processor has instructions for it."""
+    """Of the networks' matrix products. auto: bfloat16 where there are instructions for it."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
+    """Of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
     threads: int = 0
     """Processor threads; 0: all."""
     deterministic: bool = False
@@ -85,12 +92,14 @@ class Config:
             if not condition:
                 raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
 
-        for name in ("iterations", "batch", "spp"):
+        for name in ("iterations", "steps", "batch", "spp"):
             require(getattr(self, name) >= 1, name, "at least 1")
+        if self.deterministic and self.variant != "llvm_ad_rgb":
+            raise InputError("--deterministic: needs --variant llvm_ad_rgb; a GPU adds numbers in an order of its own")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
         for name in ("threads", "blur", "laplacian_scale"):
             require(0 <= getattr(self, name) < math.inf, name, "0 or more")
-        for name in ("learning_rate", "muon_rate", "decay"):
+        for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
@@ -122,10 +131,16 @@ class Config:
             first = last
         return [stage for stage in stages if stage.last > stage.first]
 
+    def weights_at(self, progress: float) -> dict[str, float]:
+        """Weight of each term of the loss when this share of the iterations is done."""
+        relax = {"velocity": self.velocity_decay**progress}
+        return {term: weight * relax.get(term, 1.0) for term, weight in self.weights.items()}
+
     def settings(self) -> dict:
-        """What defines the result, as plain data: all but where it goes and how many threads make it."""
+        """What defines the result, as plain data: all but where it goes and what computes it."""
         plain = json.loads(self.to_json())
-        return {key: value for key, value in plain.items() if key not in ("scene", "out", "resume", "threads")}
+        elsewhere = ("scene", "out", "resume", "variant", "threads")
+        return {key: value for key, value in plain.items() if key not in elsewhere}
 
     def to_json(self) -> str:
         """Every option as used."""
@@ -133,13 +148,13 @@ class Config:
 
 
 PRESETS = {
-    "fast": {"iterations": 120, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5},
+    "fast": {"iterations": 180, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5},
     "default": {},
-    "fine": {"iterations": 1200, "shares": (0.3, 0.4, 0.3)},
+    "fine": {"iterations": 1800, "shares": (0.3, 0.4, 0.3)},
     "paper": {
-        "iterations": 6000, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
+        "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
-        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0,
+        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32",
     },
 }  # fmt: skip

@@ -57,10 +57,12 @@ class Edges:
                     f'photometric: no gradients with shape "{shape.id()}", a {shape.class_name()}: '
                     f"use meshes or {', '.join(CURVES)}"
                 )
-        self.faces = [np.array(mesh.faces_buffer()).reshape(-1, 3) for mesh in self.meshes]
+        # While they are held, no other array can have their indices.
+        self.buffers = [mesh.faces_buffer() for mesh in self.meshes]
+        meshes_faces = [np.array(buffer).reshape(-1, 3) for buffer in self.buffers]
         vertices, triangles = 0, 0  # of the meshes before
         corners, tables = [np.zeros((0, 3))], [np.zeros((5, 0))]
-        for mesh, faces in zip(self.meshes, self.faces):
+        for mesh, faces in zip(self.meshes, meshes_faces):
             corners.append(faces + vertices)
             tables.append(edge_table(mesh, faces) + np.array([[vertices, vertices, triangles, triangles, 0]]).T)
             vertices += mesh.vertex_count()
@@ -73,8 +75,8 @@ class Edges:
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
         """The edges of a scene: `known`, if they are still those."""
         if known is not None and list(scene.shapes()) == known.shapes:
-            now = (np.array(mesh.faces_buffer()).reshape(-1, 3) for mesh in known.meshes)
-            if all(np.array_equal(a, b) for a, b in zip(now, known.faces)):
+            now = (mesh.faces_buffer() for mesh in known.meshes)
+            if all(a.index == b.index for a, b in zip(now, known.buffers)):
                 return known
         return cls(scene)
 

@@ -39,12 +39,17 @@ def load_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
     except Exception as error:
         raise InputError(f"{path}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams split vertices; shading normals are per position
-    shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True)
+    return mesh, scene_of(mesh.vertices, mesh.faces)
+
+
+def scene_of(vertices, faces) -> mi.Scene:
+    """A scene that holds this mesh alone, with smooth normals."""
+    shape = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True)
     params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(mesh.faces, np.uint32).ravel())
+    params["vertex_positions"] = mi.Float(np.asarray(vertices, np.float32).ravel())
+    params["faces"] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
     params.update()
-    return mesh, mi.load_dict({"type": "scene", "mesh": shape})
+    return mi.load_dict({"type": "scene", "mesh": shape})
 
 
 def hits(scene: mi.Scene, photographs: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

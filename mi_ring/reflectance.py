@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.bsdf import CookTorrance, attributes_of
+from mi_ring.bsdf import attributes_of
 from mi_ring.errors import InputError
 
 
@@ -28,9 +28,9 @@ def predicted(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tup
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
     textures = constants(bsdf)
-    own = {p.name: p for p in COOK_TORRANCE if isinstance(bsdf, CookTorrance) and p.name not in textures}
+    own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
     names = ", ".join([*textures, *own])
-    if not ranges and not isinstance(bsdf, CookTorrance):
+    if not ranges and kind != "cooktorrance":
         raise InputError(f"{scene}: bsdf: --parameters must say which parameters of {kind} to predict, and their "
                          f"ranges, for instance --parameters {next(iter(textures), 'reflectance')} 0 1; "
                          f"it has {names}")  # fmt: skip

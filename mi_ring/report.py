@@ -34,13 +34,15 @@ def html(fit, log: list[dict]) -> str:
     """The page for a `Fit` whose surface is shown at its final resolution."""
     capture, ring = fit.capture, fit.ring
     rows, errors = [], []
-    for k, name in enumerate(capture.names):
-        row, error = compare(fit, k, name)
+    for k in capture.spread():
+        row, error = compare(fit, k, capture.names[k])
         rows.append(row)
         errors.append(error)
     masked = [row.iou for row in rows if row.iou is not None]
     s, faces = ring.domain.sample(fit.config.subdivisions)
     numbers = {
+        "Photographs": f"{len(capture)}" + (f"; below are {len(rows)} of them, as are the next two numbers"
+                                             if len(rows) < len(capture) else ""),
         "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels)",
         "Silhouettes": f"{np.mean(masked):.4f} intersection over union with the masks" if masked else "no masks given",
         "Iterations": f"{fit.iteration} of {fit.config.iterations}",
@@ -100,10 +102,15 @@ def data_uri(picture: np.ndarray) -> str:
 def loss_curve(log: list[dict], fit) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
-    for term, weight in ({"loss": 1.0} | fit.config.weights).items():
-        points = [(entry["iteration"], weight * entry[term]) for entry in log if weight * entry.get(term, 0) > 0]
+    for term in ("loss", *fit.config.weights):
+        points = []
+        for entry in log:
+            done = (entry["iteration"] - 1) / fit.config.iterations  # before the iteration that the entry is about
+            weights = {"loss": 1.0} | fit.config.weights_at(done)
+            points.append((entry["iteration"], weights[term] * entry.get(term, 0)))
+        points = [(iteration, value) for iteration, value in points if value > 0]
         if points:
-            label = f"{weight:g} · {term}" if term != "loss" else term
+            label = "loss" if term == "loss" else f"weighted {term}"
             axes.semilogy(*zip(*points), label=label, linewidth=2 if term == "loss" else 1)
     for stage in fit.stages[1:]:
         if stage.first < fit.iteration:

@@ -67,22 +67,23 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, fit) -> None:
-    """inputs.png: the start surface drawn over each photograph, in green, where mask or pose errors show at once."""
+    """inputs.png: the start surface drawn over photographs, in green, where mask or pose errors show at once."""
     s, faces = fit.ring.domain.sample(4)
     fit.surface.show(fit.ring, s, faces)
     fit.stage = None  # the mesh is no longer that of the stage
-    columns = min(10, len(fit.capture))
+    some = fit.capture.spread()
+    columns = min(10, len(some))
     cell = 160
-    sheet = Image.new("RGB", (columns * cell, -(-len(fit.capture) // columns) * cell))
-    for k, name in enumerate(fit.capture.names):
+    sheet = Image.new("RGB", (columns * cell, -(-len(some) // columns) * cell))
+    for place, k in enumerate(some):
         scale = max(1, max(fit.capture.sensors[k].size) // cell)
         observed = fit.capture.observe([k], scale)[0]
         _, coverage = bridge.draw(fit.surface, fit.capture.photograph(k, scale), spp=4, shadows=False)
         tint = 0.35 * coverage[0, ..., None].numpy() * np.array([0.1, 1.0, 0.2])
         picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
         picture.thumbnail((cell, cell))
-        ImageDraw.Draw(picture).text((3, 2), name, fill=(255, 255, 255))
-        sheet.paste(picture, (k % columns * cell, k // columns * cell))
+        ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
+        sheet.paste(picture, (place % columns * cell, place // columns * cell))
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG")
     replace(path, buffer.getvalue())

@@ -10,7 +10,7 @@ from mi_ring.domain import Domain, Sphere
 from mi_ring.errors import InputError
 from mi_ring.shapenet import ShapeNet
 
-FORMAT = 2  #: version of the file `ring.pt`
+FORMAT = 3  #: version of the file `ring.pt`
 
 
 class Ring(nn.Module):
@@ -22,10 +22,10 @@ class Ring(nn.Module):
 
     def __init__(
         self, center, radius: float, scale: float = 1.0, domain: Domain | None = None, parameters=COOK_TORRANCE,
-        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False,
+        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20,
     ):  # fmt: skip
         super().__init__()
-        self.shape_net, self.brdf_net = ShapeNet(), BRDFNet(scale, parameters)
+        self.shape_net, self.brdf_net = ShapeNet(steps), BRDFNet(scale, parameters)
         self.bsdf, self.indirect = bsdf, indirect
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
@@ -42,13 +42,13 @@ class Ring(nn.Module):
         parameters = [tuple(p) for p in self.brdf_net.bsdf_parameters]
         return {
             "format": FORMAT, "networks": self.state_dict(), "domain": domain, "config": config or {},
-            "parameters": parameters, "bsdf": self.bsdf, "indirect": self.indirect,
+            "parameters": parameters, "bsdf": self.bsdf, "indirect": self.indirect, "steps": self.shape_net.steps,
         }  # fmt: skip
 
     @classmethod
     def from_state(cls, state: dict) -> "Ring":
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
-        properties = {name: state[name] for name in ("parameters", "bsdf", "indirect")}
+        properties = {name: state[name] for name in ("parameters", "bsdf", "indirect", "steps")}
         ring = cls(torch.zeros(3), 1.0, domain=domain, **properties)
         ring.load_state_dict(state["networks"])
         return ring

@@ -108,6 +108,40 @@ def test_shrinking_averages_blocks(small_capture):
     torch.testing.assert_close(coverage[0, 5, 7], mask[0, 20:24, 28:32].mean())
 
 
+@pytest.fixture
+def decodes(monkeypatch):
+    """How many photographs have been decoded."""
+    calls, decode = [], capture.decode
+    monkeypatch.setattr(capture, "decode", lambda *args: calls.append(None) or decode(*args))
+    return lambda: len(calls)
+
+
+def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypatch, decodes):
+    monkeypatch.setattr(capture, "REMEMBERED_PIXELS", 3 * 28 * 20 + 7)
+    scene = capture.load(small_capture)
+    first = scene.observe([5, 2, 9, 4], 2)
+    again = scene.observe([4, 9, 5], 2)
+    assert all(torch.equal(a[[3, 2, 0]], b) for a, b in zip(first, again))
+    assert decodes() == 5
+    scene.observe([7], 1)
+    scene.observe([7], 1)
+    assert decodes() == 7
+
+
+def test_each_photograph_is_remembered_at_its_own_scale(small_capture, decodes):
+    scene = capture.load(small_capture)
+    for _ in range(3):
+        half, quarter = scene.observe([5], 2), scene.observe([9], 4)
+    assert decodes() == 2
+    torch.testing.assert_close(scene.observe([5], 4)[0][0], capture.shrink(half[0][0], 2))
+    assert quarter[0].shape == (1, 10, 14, 3) and decodes() == 3
+
+
+def test_photographs_to_look_at_are_evenly_spread(small_capture):
+    scene = capture.load(small_capture)
+    assert scene.spread() == list(range(12)) and scene.spread(5) == [0, 2, 4, 7, 9]
+
+
 def test_sphere_of_masks_finds_the_object(small_capture):
     center, radius = capture.load(small_capture).sphere()
     volume = np.prod(AXES) ** (1 / 3)

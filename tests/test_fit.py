@@ -15,8 +15,9 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
+from PIL import Image
 
-from mi_ring import command, fit, render, results
+from mi_ring import capture, command, fit, render, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.errors import InputError
 
@@ -43,6 +44,27 @@ def distance(mesh_file):
 
 def test_fit_writes_all_results_and_no_other_files(finished):
     assert sorted(p.name for p in finished.iterdir()) == sorted(FILES)
+
+
+def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
+    log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
+    config = fit.parse(["scene.xml", "--iterations", "90"])
+    for entry in log:
+        weights = config.weights_at((entry["iteration"] - 1) / 90)
+        assert entry["loss"] == pytest.approx(sum(w * entry[term] for term, w in weights.items()), rel=1e-4)
+    assert log[-1]["iteration"] == 90
+
+
+def test_steps_of_the_flow_are_part_of_the_result(finished):
+    assert results.load_ring(finished).shape_net.steps == Config("scene.xml").steps != 20
+
+
+def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(capture.Capture.spread, "__defaults__", (5,))
+    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK]) == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "12; below are 5 of them" in page and page.count('class="name"') == 5
+    assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 160)
 
 
 def test_fit_finds_the_ellipsoid(finished):
@@ -313,6 +335,8 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
         (["--seed", str(2**70)], ["--seed", "below 2^63"]),
         (["--iterations", "many"], ["iterations", "many"]),
         (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
+        (["--steps", "0"], ["--steps", "0", "at least 1"]),
+        (["--velocity-decay", "0"], ["--velocity-decay", "0", "above 0"]),
         (["--iteration", "5"], ["iteration"]),
         (["--levels", "4", "9"], ["--levels", "0 to 8"]),
         (["--levels", "4"], ["--widths", "as many"]),
@@ -348,7 +372,15 @@ def test_paper_preset_is_the_papers():
     assert config.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.01} and config.loss == "l2"
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
     assert config.levels == (5, 6) and [s.last - s.first for s in config.stages()] == [2000, 4000]
-    assert config.precision == "float32"
+    assert config.precision == "float32" and config.steps == 20
+    assert config.weights_at(0) == config.weights_at(1) == config.weights
+
+
+def test_regulariser_is_relaxed_and_nothing_else():
+    config = fit.parse(["scene.xml", "--velocity-decay", "0.04"])
+    halfway = config.weights_at(0.5)
+    assert halfway.pop("velocity") == pytest.approx(0.2 * config.weights["velocity"])
+    assert halfway == {name: weight for name, weight in config.weights.items() if name != "velocity"}
 
 
 def test_help_names_every_option(capsys):

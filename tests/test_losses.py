@@ -54,6 +54,12 @@ def test_blur_is_a_gaussian_and_keeps_the_sum():
     torch.testing.assert_close(found[8:21, 16:29], expected[8:21, 16:29], rtol=0.01, atol=0)
 
 
+def test_blur_takes_zero_for_what_is_outside():
+    image = torch.rand(2, 5, 7)
+    padded = torch.nn.functional.pad(image, (9, 9, 9, 9))
+    torch.testing.assert_close(losses.blur(image, 2.5), losses.blur(padded, 2.5)[:, 9:-9, 9:-9])
+
+
 def test_mask_loss_feels_a_mask_it_does_not_touch():
     coverage = torch.zeros(1, 20, 20)
     coverage[0, 10, 5] = 1.0

@@ -1,0 +1,48 @@
+"""Fit captures with one setting changed at a time and print, as Markdown with machine and date, what that does.
+
+    python benchmarks/choices.py SCENE.xml [MORE.xml …] [--out out/choices] [OPTIONS OF mi_ring.fit]
+
+All fits have the same number of iterations, so that a setting which makes them cheaper shows in the seconds. Give
+`--preset fast` for an answer in an hour. The truth is found as in accuracy.py.
+"""
+
+import argparse
+import datetime
+import sys
+from pathlib import Path
+
+from accuracy import measure, processor, table, truth_of
+
+from mi_ring.command import name_of
+
+CHOICES = [
+    "", "--seed 1", "--seed 2", "--velocity-decay 1", "--velocity-decay 0.003", "--weights.velocity 0.001",
+    "--steps 4", "--steps 20", "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3",
+    "--loss l2", "--loss log", "--batch 4", "--batch 16", "--spp 4", "--blur 0", "--precision float32",
+    "--no-indirect",
+]  # fmt: skip
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("out/choices"))
+    arguments, options = parser.parse_known_args()
+    truths = [truth_of(scene) for scene in arguments.scenes]
+    rows = []
+    for choice in CHOICES:
+        row = [f"`{choice}`" if choice else "as it is"]
+        for scene, truth in zip(arguments.scenes, truths):
+            out = arguments.out / name_of(scene) / (choice.strip("-").replace(" ", "_") or "as_it_is")
+            numbers = measure(scene, out, [*options, *choice.split()], truth)
+            row += [f"{numbers['normal_mean']:.2f}°", f"{numbers['depth_mean']:.2f}", f"{numbers['fit_seconds']:.0f}"]
+        rows.append(row)
+        print("; ".join(row), file=sys.stderr)
+    columns = ("normals, mean", "depth, mean %", "fit s")
+    heads = ["changed", *(f"{name_of(scene)}: {column}" for scene in arguments.scenes for column in columns)]
+    print(f"\n{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n\n{table(heads, rows)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Print, as Markdown with machine and date, ways to compute the same thing faster: as it is, and as it was tried.
+
+    python benchmarks/tried.py [--level 5] [--steps 8]
+
+Of settings that change the result, see choices.py.
+"""
+
+import argparse
+import datetime
+import time
+
+from accuracy import alone, processor, table
+from limits import seconds
+
+from mi_ring import fit, losses, shapenet
+
+# isort: split
+import torch
+from torch.nn import functional as F
+
+from mi_ring.domain import Sphere
+from mi_ring.encoding import PosEnc
+
+SLOPE = shapenet.SLOPE
+OMEGA = torch.arange(1, 17.0)
+
+
+def flow(net, s, velocity=None):
+    """Forward and backward pass: by hand as in the fit, or by autograd of Euler steps along `velocity`."""
+
+    def run():
+        with torch.autocast("cpu", torch.bfloat16):
+            x = net(s) if velocity is None else shapenet.euler(velocity, s, 1 / net.steps, net.steps)
+        x.backward(torch.ones_like(x))
+
+    return run
+
+
+def chunked(net, s, points):
+    """The flow in chunks of another size."""
+
+    def run():
+        before, shapenet._Flow.CHUNK = shapenet._Flow.CHUNK, points
+        flow(net, s)()
+        shapenet._Flow.CHUNK = before
+
+    return run
+
+
+def with_returned_memory(level: int, steps: int) -> float:
+    """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
+    fit.set_threads(fit.parse(["scene.xml"]))
+    torch.manual_seed(0)
+    return seconds(flow(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
+
+
+def doubled(x):
+    """PosEnc of (V, 3) points by doubling: cos and sin of (n + k) x from those of n x and of k x."""
+    cosine, sine = x.cos()[:, None], x.sin()[:, None]
+    for _ in range(4):
+        c, s = cosine[:, -1:], sine[:, -1:]
+        more = cosine * c - sine * s, sine * c + cosine * s
+        cosine, sine = torch.cat([cosine, more[0]], 1), torch.cat([sine, more[1]], 1)
+    return torch.cat([cosine.flatten(1), sine.flatten(1)], 1)
+
+
+def convolved(images, sigma):
+    """losses.blur by two convolutions."""
+    radius = int(3 * sigma + 0.5)
+    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    images = F.conv2d(images[:, None], kernel[None, None, :, None], padding=(radius, 0))
+    return F.conv2d(images, kernel[None, None, None, :], padding=(0, radius))[:, 0]
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--level", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=8)
+    arguments = parser.parse_args()
+    returned = alone(with_returned_memory, arguments.level, arguments.steps)
+    fit.set_threads(fit.parse(["scene.xml"]))
+    fit.keep_memory()
+    torch.manual_seed(0)
+    s = Sphere().sample(arguments.level)[0]
+    net = shapenet.ShapeNet(arguments.steps)
+    rows = []
+
+    def compare(idea, as_it_is, tried, note=""):
+        rows.append([idea, *(f"{1000 * t:.3g}" for t in seconds(as_it_is, tried)), note])
+
+    compare("flow: gradient by autograd instead of by hand", flow(net, s), flow(net, s, net.velocity))
+    compare("flow: chunks of 2,048 points instead of 8,192 at most", flow(net, s), chunked(net, s, 2048))
+    rows.append(["flow: freed memory returned to the system", f"{1000 * seconds(flow(net, s))[0]:.3g}",
+                 f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
+
+    def step(x, *parameters):
+        h = torch.cat([torch.cos(phase := (x[:, None] * OMEGA[:, None]).flatten(1)), torch.sin(phase)], 1).bfloat16()
+        for w, b in zip(parameters[:3], parameters[3:]):
+            h = F.leaky_relu(F.linear(h, w, b), SLOPE)
+        return h
+
+    parameters = [w for kind in ("weight", "bias") for w in (getattr(h, kind).detach().bfloat16() for h in net.hidden)]
+    compiled = torch.compile(step, dynamic=False)
+    with torch.no_grad():
+        before = time.perf_counter()
+        compiled(s, *parameters)
+        note = f"compiled in {time.perf_counter() - before:.0f} s; needs a C++ compiler"
+        compare("hidden layers of a step, forward: torch.compile", lambda: step(s, *parameters),
+                lambda: compiled(s, *parameters), note)  # fmt: skip
+        h, w, b = torch.randn(len(s), 256).bfloat16(), parameters[1], parameters[4]
+        compare("a layer, forward: product, bias and leaky ReLU fused by oneDNN",
+                lambda: F.leaky_relu_(F.linear(h, w, b), SLOPE),
+                lambda: torch.ops.mkldnn._linear_pointwise(h, w, b, "leaky_relu", [SLOPE], ""),
+                "not for users of torch")  # fmt: skip
+        encode = PosEnc()
+        compare("encoding by doubling instead of cosines and sines", lambda: encode(s), lambda: doubled(s))
+        images = torch.randn(8, 128, 128)
+        compare("blur of the masks, 8 of 128², σ = 8 px, by convolutions", lambda: losses.blur(images, 8.0),
+                lambda: convolved(images, 8.0))  # fmt: skip
+    print(f"{processor()}; {datetime.date.today()}; {len(s):,} vertices, {arguments.steps} steps, bfloat16, "
+          f"{torch.get_num_threads()} threads\n")  # fmt: skip
+    print(table(["tried", "as it is, ms", "tried, ms", ""], rows))
+
+
+if __name__ == "__main__":
+    main()

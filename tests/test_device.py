@@ -1,0 +1,102 @@
+"""Where things are computed: no copies between torch and Dr.Jit, networks on a GPU, and what happens without one."""
+
+import subprocess
+import sys
+
+import drjit as dr
+import pytest
+import torch
+from test_fit import QUICK, distance
+from torch.nn import functional as F
+
+from mi_ring import bridge, fit, losses
+from mi_ring.brdfnet import BRDFNet
+from mi_ring.config import Config
+from mi_ring.errors import InputError
+from mi_ring.shapenet import ShapeNet
+
+TINY = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2"]
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU and a torch built with CUDA")
+
+
+def test_seam_copies_nothing():
+    tensor = torch.arange(15.0).reshape(5, 3)
+    array = bridge.to_drjit(tensor)
+    assert bridge.to_torch(array).data_ptr() == tensor.data_ptr()
+    assert bridge.to_torch(array).tolist() == tensor.flatten().tolist()
+    doubled = 2 * array
+    dr.eval(doubled)
+    one, other = bridge.to_torch(doubled), bridge.to_torch(doubled)
+    assert one.data_ptr() == other.data_ptr() and one.tolist() == (2 * tensor.flatten()).tolist()
+
+
+def test_networks_and_losses_stay_on_the_device_of_their_input():
+    """On the device that knows shapes but no numbers: torch refuses to mix it with the processor as it would a GPU."""
+    with torch.device("meta"):
+        net, brdf_net, s = ShapeNet(steps=3), BRDFNet(), torch.empty(35, 3)
+        images, masks = (torch.empty(2, 5, 7, *more, requires_grad=True) for more in ((3,), ()))
+    x, material = net(s), brdf_net(s)
+    terms = [
+        losses.velocity_loss(net.velocity, x, 0.01),
+        losses.rgb_loss(images, torch.empty_like(images), torch.empty_like(images, dtype=torch.bool), 1.0, "l1"),
+        losses.mask_loss(masks, torch.empty_like(masks), 1.5),
+    ]
+    assert all(t.is_meta for t in (x, *material.values(), *terms))
+    (x.sum() + sum(m.sum() for m in material.values()) + sum(terms)).backward()
+    assert all(p.grad.is_meta for p in (*net.parameters(), *brdf_net.parameters(), images, masks))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")
+def test_without_a_gpu_the_fit_says_so_and_goes_on(small_capture, tmp_path, capsys):
+    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--variant", "cuda_ad_rgb", *TINY]) == 0
+    said = capsys.readouterr().out
+    assert "--variant cuda_ad_rgb: no GPU to use (" in said and "going on with llvm_ad_rgb, on the processor" in said
+    assert '"variant": "llvm_ad_rgb"' in (tmp_path / "run" / "config.json").read_text()
+
+
+def test_without_a_working_gpu_driver_the_fit_goes_on(monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
+    assert fit.set_variant("cuda_ad_rgb") == "llvm_ad_rgb"
+    assert "(Dr.Jit finds none, or its driver is too old)" in capsys.readouterr().out
+
+
+def test_fit_switches_to_the_variant_asked_for(small_capture, tmp_path):
+    program = (
+        "import sys, mitsuba as mi; from mi_ring import fit; mi.set_variant('scalar_rgb');"
+        "status = fit.main(sys.argv[1:]); assert mi.variant() == 'llvm_ad_rgb'; sys.exit(status)"
+    )
+    command = [sys.executable, "-c", program, str(small_capture), "--out", str(tmp_path / "run"), *TINY]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_determinism_is_refused_on_a_gpu():
+    with pytest.raises(InputError, match="--deterministic: needs --variant llvm_ad_rgb"):
+        Config("scene.xml", deterministic=True, variant="cuda_ad_rgb")
+
+
+@needs_gpu
+def test_flow_on_a_gpu_is_that_of_the_processor():
+    torch.manual_seed(3)
+    net, s = ShapeNet(steps=3), F.normalize(torch.randn(300, 3), dim=1)
+    net.output.weight.data.mul_(100)  # it starts at almost 0
+    expected = net(s)
+    expected.square().sum().backward()
+    gradients = [p.grad.clone() for p in net.parameters()]
+    net.zero_grad()
+    x = net.cuda()(s.cuda())
+    x.square().sum().backward()
+    assert torch.allclose(x.cpu(), expected, atol=1e-5)
+    for p, g in zip(net.parameters(), gradients):
+        assert torch.allclose(p.grad.cpu(), g, rtol=1e-3, atol=1e-4)
+
+
+@needs_gpu
+def test_fit_on_a_gpu_finds_the_ellipsoid(small_capture, tmp_path):
+    command = [sys.executable, "-m", "mi_ring.fit", str(small_capture), "--out", str(tmp_path / "run"),
+               "--variant", "cuda_ad_rgb", "--iterations", "90", *QUICK]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and "no GPU" not in done.stdout, done.stderr
+    assert '"variant": "cuda_ad_rgb"' in (tmp_path / "run" / "config.json").read_text()
+    assert distance(tmp_path / "run" / "mesh.ply") < 0.04
