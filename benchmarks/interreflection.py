@@ -21,7 +21,7 @@ import make_pot2
 import mitsuba as mi
 import numpy as np
 import trimesh
-from accuracy import COLUMNS, measure, processor
+from accuracy import COLUMNS, cells, measure, processor, table
 from scipy.interpolate import CubicSpline
 
 CENTER = np.array([-21.0, 33.0, 95.0])  # of the bowl's bounding box, scene units [mm]
@@ -134,13 +134,11 @@ def main() -> None:
     if not scene.is_file():
         make_capture(scene.parent, arguments.spp)
     print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
-    heads = [*(c.replace("_", " ") for c in COLUMNS), "fit s"]
-    print("| fit | " + " | ".join(heads) + " |")
-    print("|---" * (len(heads) + 1) + "|", flush=True)
+    print(table(["fit", *(c.replace("_", " ") for c in COLUMNS), "fit s"], []), flush=True)
     for option in ("--no-indirect", "--indirect"):
         row = measure(scene, arguments.out / option.strip("-"), [option, *options], scene.parent / "truth")
-        cells = [f"{row[c]:.4f}" if c == "iou" else f"{row[c]:.2f}" for c in COLUMNS]
-        print(f"| `{option}` | " + " | ".join(cells) + f" | {row['fit_seconds']:.0f} |", flush=True)
+        numbers = cells([*(row[c] for c in COLUMNS), row["fit_seconds"]])
+        print(f"| `{option}` | {' | '.join(numbers)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 
 SLOPE = shapenet.SLOPE
-OMEGA = torch.arange(1, 17.0)
 
 
 def flow(net, s, velocity=None):
@@ -95,8 +94,10 @@ def main() -> None:
     rows.append(["flow: freed memory returned to the system", f"{1000 * seconds(flow(net, s))[0]:.3g}",
                  f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
 
+    encode = PosEnc()
+
     def step(x, *parameters):
-        h = torch.cat([torch.cos(phase := (x[:, None] * OMEGA[:, None]).flatten(1)), torch.sin(phase)], 1).bfloat16()
+        h = encode(x).bfloat16()
         for w, b in zip(parameters[:3], parameters[3:]):
             h = F.leaky_relu(F.linear(h, w, b), SLOPE)
         return h
@@ -114,7 +115,6 @@ def main() -> None:
                 lambda: F.leaky_relu_(F.linear(h, w, b), SLOPE),
                 lambda: torch.ops.mkldnn._linear_pointwise(h, w, b, "leaky_relu", [SLOPE], ""),
                 "not for users of torch")  # fmt: skip
-        encode = PosEnc()
         compare("encoding by doubling instead of cosines and sines", lambda: encode(s), lambda: doubled(s))
         images = torch.randn(8, 128, 128)
         compare("blur of the masks, 8 of 128², σ = 8 px, by convolutions", lambda: losses.blur(images, 8.0),
