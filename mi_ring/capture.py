@@ -1,5 +1,6 @@
 """A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,13 @@ class Capture:
 
     @property
     def names(self) -> list[str]:
-        return [sensor.filename.name for sensor in self.sensors]
+        """File names of the photographs, with folders where they would not tell one from another without."""
+        files = [sensor.filename for sensor in self.sensors]
+        names = [file.name for file in files]
+        if len(set(names)) == len(names):
+            return names
+        common = os.path.commonpath([file.absolute().parent for file in files])
+        return [file.absolute().relative_to(common).as_posix() for file in files]
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
@@ -88,9 +95,12 @@ class Capture:
         return result
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks)."""
+        """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks).
+
+        Of thousands of photographs a few hundred tell.
+        """
         total, count = 0.0, 0
-        for k in range(len(self)):
+        for k in self.spread():
             rgb, _, mask, masked = self.observe([k], 4 if min(self.sensors[k].size) >= 16 else 1)
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
@@ -108,7 +118,11 @@ class Capture:
         """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
         if self.shape.center is not None and self.shape.radius is not None:
             return self.shape.center, self.shape.radius
-        masked = [k for k, mask in enumerate(self.masks) if mask is not None]
+        once = {}  # one photograph for all that share camera and mask
+        for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
+            if mask is not None:
+                once.setdefault((id(mask), camera_of(sensor)[0].tobytes()), k)
+        masked = list(once.values())
         center, radius = sphere_of_masks(self, masked) if masked else sphere_of_cameras(self)
         return (
             center if self.shape.center is None else self.shape.center,
@@ -239,7 +253,9 @@ def load(path: str | Path, images: bool = True) -> Capture:
         reading = tqdm(sensors if images else [], desc="reading", unit="photograph", leave=False, disable=None)
         pixels = [read_image(s, path) for s in reading]
         linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
-        masks = [read_mask(s, path) for s in sensors] if images else []
+        files = {(s.mask, s.size, s.mask == s.filename): s for s in sensors if images}  # photographs may share a mask
+        read = {key: read_mask(s, path) for key, s in files.items()}
+        masks = [read[s.mask, s.size, s.mask == s.filename] for s in sensors] if images else []
         shadows = getattr(scene.integrator(), "shadows", True)
         return Capture(path, scene, shapes[0], sensors, pixels, linear, masks, shadows)
     except ValueError as error:
@@ -277,26 +293,39 @@ def read_pixels(path: Path, field: str, sensor, scene: Path) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{scene}: {field}: no such file: {path}")
     try:
-        # imageio reads PNGs of 16 bits as 8, silently; Mitsuba reads no TIFF.
-        tiff = path.suffix.lower() in (".tif", ".tiff")
-        pixels = np.array(imageio.imread(path) if tiff else mi.Bitmap(str(path)), copy=True)
+        pixels = read_file(path)
     except Exception as error:
         raise InputError(f"{path}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
     expected, found = sensor.size, pixels.shape[1::-1]
     if found != expected:
         found, expected = ("{} x {}".format(*size) for size in (found, expected))
         raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
+    if not np.isfinite(pixels).all():
+        raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
+    return pixels
+
+
+def read_file(path: Path) -> np.ndarray:
+    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32."""
+    # imageio reads PNGs of 16 bits as 8, silently; Mitsuba reads no TIFF.
+    tiff = path.suffix.lower() in (".tif", ".tiff")
+    pixels = np.array(imageio.imread(path) if tiff else mi.Bitmap(str(path)), copy=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
-        if not np.isfinite(pixels).all():
-            raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
 
 
 def read_image(sensor, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph; one without colours is grey."""
+    """Encoded pixels (H, W, 3) of a photograph; one without colours is grey, and what is transparent is black."""
     pixels = read_pixels(sensor.filename, "filename", sensor, scene)
-    return pixels[:, :, :3] if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
+    channels = pixels.shape[2]
+    rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
+    if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files have the product already
+        return rgb
+    full = np.iinfo(pixels.dtype).max
+    linear = is_linear(sensor, pixels)
+    radiance = decode(rgb, linear, 1.0)[0] * (pixels[:, :, -1:] / np.float32(full))
+    return ((radiance if linear else linear_to_srgb(radiance)) * full + 0.5).astype(pixels.dtype)
 
 
 def is_linear(sensor, pixels: np.ndarray) -> bool:
@@ -305,9 +334,13 @@ def is_linear(sensor, pixels: np.ndarray) -> bool:
 
 
 def read_mask(sensor, scene: Path) -> np.ndarray | None:
-    """Mask (H, W) uint8 of a photograph, None if it has none."""
+    """Mask (H, W) uint8 of a photograph, None if it has none. A photograph that is its own mask: its alpha channel."""
     if sensor.mask is None:
         return None
-    pixels = read_pixels(sensor.mask, "mask", sensor, scene)[:, :, 0]
+    pixels = read_pixels(sensor.mask, "mask", sensor, scene)
+    if sensor.mask == sensor.filename and pixels.shape[2] not in (2, 4):
+        raise InputError(f'{sensor.mask}: photograph "{sensor.id()}", mask: is the photograph itself, which has no '
+                         "alpha channel")  # fmt: skip
+    channel = pixels[:, :, -1 if sensor.mask == sensor.filename else 0]
     full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
-    return (pixels.astype(np.float32) * (255 / full)).round().astype(np.uint8)
+    return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)

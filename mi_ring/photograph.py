@@ -57,7 +57,8 @@ class Photograph(mi.Sensor):
     parameter        type         meaning
     ================ ============ ==========================================================================
     ``filename``     string       image file, relative to the XML; read by the fit, never by an integrator
-    ``mask``         string       optional mask file of the same size: 0 background, 255 object
+    ``mask``         string       optional mask file of the same size: 0 background, 255 object. If it is
+                                  ``filename`` itself: its alpha channel
     ``fx``, ``fy``   float        focal lengths [px]
     ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the centre of the
                                   first pixel is (0.5, 0.5). Default: the middle of the film

@@ -41,24 +41,26 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
     ring = load_ring(config.run)
     scene = capture.load(config.scene, images=False)
-    doubles = {name for name in scene.names if scene.names.count(name) > 1}
-    if doubles:
-        raise InputError(f"{config.scene}: filename: {min(doubles)} occurs twice; pictures would overwrite each other")
-    for sensor in scene.sensors:
+    names = scene.names
+    if len(set(names)) < len(names):
+        double = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{config.scene}: filename: {double} occurs twice; pictures would overwrite each other")
+    for sensor, name in zip(scene.sensors, names):
         if sensor.filename.suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):
             raise InputError(f"{config.scene}: filename: {sensor.filename.name} must end in .png, .jpg or .exr")
-        if (config.out / sensor.filename.name).resolve() == sensor.filename.resolve():
+        if (config.out / name).resolve() == sensor.filename.resolve():
             raise InputError(f"{config.out}: holds the scene's own photographs; choose another folder")
     try:
-        config.out.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            (config.out / name).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{config.out}: cannot be written ({error.strerror}); choose another folder") from error
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
-    for k, sensor in enumerate(tqdm(scene.sensors, desc="rendering", unit="photograph")):
+    for k, name in enumerate(tqdm(names, desc="rendering", unit="photograph")):
         photograph = scene.photograph(k)
         rgb, _ = bridge.draw(surface, photograph, spp=config.spp, shadows=scene.shadows, indirect=ring.indirect)
-        write_picture(rgb[0].numpy(), config.out / sensor.filename.name)
+        write_picture(rgb[0].numpy(), config.out / name)
     print(f"{len(scene.sensors)} photographs in {config.out}/")
 
 

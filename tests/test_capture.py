@@ -54,13 +54,29 @@ def test_tiff_files_are_read_with_all_bits(broken_capture):
 
 
 def test_grey_pictures_and_those_with_alpha_are_read(broken_capture):
-    path, _ = broken_capture
+    path, edit = broken_capture
+    edit("masks/001.png", "images/001.png")
     grey = np.arange(56 * 40, dtype=np.uint8).reshape(40, 56, 1)
     mi.Bitmap(grey).write(str(path.parent / "images/000.png"))
-    mi.Bitmap(np.concatenate([grey, grey // 2, grey // 3, grey * 0], 2)).write(str(path.parent / "images/001.png"))
+    rgb, alpha = np.concatenate([grey, grey // 2, grey // 3], 2), np.zeros_like(grey)
+    alpha[10:20], alpha[20:30] = 255, 51
+    mi.Bitmap(np.concatenate([rgb, alpha], 2)).write(str(path.parent / "images/001.png"))
     scene = capture.load(path)
     assert np.array_equal(scene.images[0], np.repeat(grey, 3, 2))
-    assert np.array_equal(scene.images[1], np.concatenate([grey, grey // 2, grey // 3], 2))
+    assert np.array_equal(scene.images[1][10:20], rgb[10:20])
+    assert not scene.images[1][:10].any() and not scene.images[1][30:].any()  # transparent: black
+    linear = capture.decode(rgb, linear=False, saturation=1.0)[0]
+    np.testing.assert_allclose(scene.observe([1])[0][0, 20:30], 0.2 * linear[20:30], rtol=0.1, atol=2e-4)
+    assert np.array_equal(scene.masks[1], alpha[..., 0])  # the photograph is its own mask
+
+
+def test_a_photograph_without_alpha_is_no_mask(broken_capture):
+    path, edit = broken_capture
+    edit("masks/001.png", "images/001.png")
+    with pytest.raises(
+        InputError, match=r'001.png: photograph "001", mask: is the photograph itself, which has no alp'
+    ):
+        capture.load(path)
 
 
 def test_sixteen_bit_masks_are_read(broken_capture):
@@ -165,8 +181,10 @@ def test_sphere_of_cameras_is_near_the_object(broken_capture):
 
 def test_sphere_of_the_xml_wins(broken_capture):
     path, edit = broken_capture
-    edit('<bsdf type="cooktorrance"/>',
-         '<bsdf type="cooktorrance"/><float name="radius" value="4.5"/><point name="center" x="1" y="2" z="3"/>')
+    edit(
+        '<bsdf type="cooktorrance"/>',
+        '<bsdf type="cooktorrance"/><float name="radius" value="4.5"/><point name="center" x="1" y="2" z="3"/>',
+    )
     center, radius = capture.load(path).sphere()
     assert center.tolist() == [1, 2, 3] and radius == 4.5
 

@@ -1,0 +1,421 @@
+"""Other people's formats: points land on the same pixels before and after, by each format's own formulas."""
+
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pycolmap
+import pytest
+import scipy.io
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mi_ring import capture, command, convert, photograph
+from mi_ring.errors import InputError
+
+SIZE = W, H = 62, 52
+K = np.array([[70.0, 0, 28.5], [0, 76.0, 27.25], [0, 0, 1]])  # fx, fy and the principal point are all different
+POINTS = np.array([5, -8, 110]) + np.random.default_rng(3).uniform(-4, 4, (40, 3))  # in the world [scene units]
+
+
+def cameras(count=3):
+    """World-to-camera rotations and translations, OpenCV's axes, of cameras that see the points."""
+    random = np.random.default_rng(7)
+    for R in Rotation.random(count, rng=random).as_matrix():
+        yield R, np.array([1.0, -2.0, 30.0]) + random.uniform(-1, 1, 3) - R @ POINTS.mean(0)
+
+
+def by_hand(R, t, calibration=K):
+    """Pixels of the points, by the textbook."""
+    x = (POINTS @ R.T + t) @ calibration.T
+    return x[:, :2] / x[:, 2:]
+
+
+def in_scene(sensor):
+    """Pixels of the points in a photograph of ours, corner of the image at the origin."""
+    x, depth = photograph.project(
+        sensor.to_world.matrix, sensor.focal, sensor.centre, mi.Point3f(POINTS.T.astype("f4"))
+    )
+    assert np.array(depth).min() > 0
+    return np.array(x).T
+
+
+def converted(*arguments):
+    """The scene that a conversion writes."""
+    assert convert.main([str(a) for a in arguments]) is None
+    return capture.load(arguments[2])
+
+
+def write(path, pixels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mi.Bitmap(np.ascontiguousarray(pixels)).write(str(path))
+
+
+def noise(dtype, channels=3, seed=0, size=SIZE):
+    full = np.iinfo(dtype).max
+    return np.random.default_rng(seed).integers(0, full, (size[1], size[0], channels), dtype, endpoint=True)
+
+
+def disc():
+    """A mask: a disc off the middle."""
+    y, x = np.mgrid[:H, :W]
+    return np.where((x - 33) ** 2 + (y - 24) ** 2 < 200, 255, 0).astype(np.uint8)[..., None]
+
+
+# DiLiGenT-MV
+
+DIRECTIONS = np.array([[-0.06, -0.45, 0.89], [0.3, 0.2, 0.93], [-0.4, 0.1, 0.91], [0.1, 0.6, 0.79]])
+INTENSITIES = np.array([[1.2, 1.1, 0.9], [0.9, 0.8, 0.7], [0.7, 0.6, 0.5], [1.5, 1.4, 1.3]])
+
+
+@pytest.fixture
+def diligent(tmp_path):
+    folder = tmp_path / "bearPNG"
+    calibration = {"KK": K}
+    for v, (R, t) in enumerate(cameras(), 1):
+        calibration |= {f"Rc_{v}": R, f"Tc_{v}": t[:, None]}
+        view = folder / f"view_{v:02}"
+        for light in range(1, 5):
+            write(view / f"{light:03}.png", noise(np.uint16, seed=10 * v + light))
+        hole = disc()
+        hole[22:26, 30:33] = 0
+        write(view / "mask.png", hole)
+        np.savetxt(view / "light_directions.txt", DIRECTIONS)
+        np.savetxt(view / "light_intensities.txt", INTENSITIES)
+    scipy.io.savemat(folder / "Calib_Results.mat", calibration)
+    (folder / "mesh_Gt.ply").write_bytes(b"ply")
+    return folder
+
+
+def test_diligent_mv(diligent, tmp_path):
+    scene = converted("diligent-mv", diligent, tmp_path / "bear.xml", "--views", 1, 3, "--lights", 2, 4)
+    assert [s.id() for s in scene.sensors] == ["01_002", "01_004", "03_002", "03_004"]
+    poses = list(cameras())
+    for sensor, (view, light) in zip(scene.sensors, [(0, 1), (0, 3), (2, 1), (2, 3)]):
+        R, t = poses[view]
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t) + 0.5, atol=0.01)  # Bouguet: integers are centres
+        # The light in the camera's axes x right, y up, z back, from the surface to the light.
+        towards = R.T @ (DIRECTIONS[light] * [1, -1, -1])
+        ds, irradiance = sensor.light.sample_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0))
+        np.testing.assert_allclose(np.ravel(ds.d), towards / np.linalg.norm(towards), atol=1e-5)
+        np.testing.assert_allclose(np.ravel(irradiance), INTENSITIES[light], rtol=1e-5)
+    # A camera's photographs share one mask; what is called alike is told apart by its folder.
+    assert scene.masks[0] is scene.masks[1] and scene.masks[1] is not scene.masks[2]
+    assert scene.names[1:3] == ["view_01/004.png", "view_03/002.png"]
+    # 16 bits, linear, in RGB order
+    np.testing.assert_allclose(scene.observe([3])[0][0], noise(np.uint16, seed=34) / 65535, rtol=1e-6)
+    assert (tmp_path / "bear/truth/mesh.ply").read_bytes() == b"ply"
+
+
+def test_diligent_mv_takes_all_and_fills_holes_if_asked(diligent, tmp_path):
+    scene = converted("diligent-mv", diligent, tmp_path / "bear.xml", "--fill-holes")
+    assert len(scene) == 12
+    assert (scene.masks[5] == disc()[..., 0]).all()
+    scene = converted("diligent-mv", diligent, tmp_path / "bear2.xml")
+    assert (scene.masks[5] == 0).sum() == (disc() == 0).sum() + 12
+
+
+# transforms.json
+
+
+def transforms(folder, top, frames, pixels):
+    for frame, (R, t) in zip(frames, cameras()):
+        c2w = np.linalg.inv(np.block([[R, t[:, None]], [0, 0, 0, 1]]))
+        frame["transform_matrix"] = (c2w * [1, -1, -1, 1]).tolist()  # OpenGL: y up, z back
+    for k, frame in enumerate(frames):
+        name = frame["file_path"]
+        write(folder / (name if "." in name[-4:] else f"{name}.png"), pixels(k))
+    (folder / "transforms.json").write_text(json.dumps(top | {"frames": frames}))
+    return folder
+
+
+def test_transforms_of_nerf(tmp_path):
+    """One angle, no sizes, no suffixes, a light each, and masks in the alpha channel."""
+    frames = [
+        {"file_path": "./train/r_0", "pl_pos": [1, 2, 3], "pl_intensity": [4, 5, 6]},
+        {"file_path": "./train/r_1", "pl_pos": [3, 2, 1]},
+        {"file_path": "./train/r_2", "pl_intensity": 7},
+    ]
+
+    def pixels(k):
+        rgba = noise(np.uint8, 4, seed=k)
+        rgba[..., 3:] = disc()
+        return rgba
+
+    angle = 0.8
+    source = transforms(tmp_path / "data", {"camera_angle_x": angle}, frames, pixels)
+    scene = converted("transforms", source, tmp_path / "nerf.xml")
+    f = 0.5 * W / np.tan(angle / 2)
+    calibration = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
+    for sensor, (R, t) in zip(scene.sensors, cameras()):
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
+    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    R, t = list(cameras())[2]
+    np.testing.assert_allclose(lights[:, :3], [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
+    np.testing.assert_allclose(lights[:, 4:7], [[4, 5, 6], [1, 1, 1], [7, 7, 7]], rtol=1e-6)
+    rgb, _, mask, masked = scene.observe([1])
+    inside = disc()[..., 0] > 0
+    assert masked.all() and (mask[0].numpy() == inside).all()
+    assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
+    expected = capture.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
+    np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
+
+
+def test_transforms_of_nerfstudio(tmp_path):
+    """Intrinsics in the file, overridden by a frame's own; masks in files; no distortion: nothing is resampled."""
+    top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "w": W, "h": H, "camera_model": "OPENCV",
+           "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}  # fmt: skip
+    frames = [{"file_path": f"images/{k}.png", "mask_path": f"masks/{k}.png"} for k in range(3)]
+    frames[1] |= {"fl_x": 71.0, "cx": 30.0}
+    frames[2]["camera_intrinsics"] = [20, 21, 80, 81]
+    source = transforms(tmp_path / "data", top, frames, lambda k: noise(np.uint8, seed=k))
+    for k in range(3):
+        write(source / f"masks/{k}.png", disc())
+    scene = converted("transforms", source / "transforms.json", tmp_path / "studio.xml", "--encoding", "linear")
+    own = [K, np.array([[71.0, 0, 30], [0, 76, 27.25], [0, 0, 1]]), np.array([[80.0, 0, 20], [0, 81, 21], [0, 0, 1]])]
+    for sensor, (R, t), calibration in zip(scene.sensors, cameras(), own):
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
+    assert (scene.masks[1] == disc()[..., 0]).all()
+    np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
+    assert not (tmp_path / "studio").exists()
+
+
+#: Kannala–Brandt and Brown–Conrady: where rays (x, y, 1) go, written out from OpenCV's documentation.
+def fisheye(x, y, k):
+    r = np.hypot(x, y)
+    theta = np.arctan(r)
+    scale = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8) / r
+    return x * scale, y * scale
+
+
+def brown(x, y, k, p):
+    r2 = x * x + y * y
+    radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+    return (x * radial + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x),
+            y * radial + p[0] * (r2 + 2 * y * y) + 2 * p[1] * x * y)  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "terms"), [
+    ("OPENCV", {"k1": -0.3, "k2": 0.1, "k3": 0.05, "p1": 0.02, "p2": -0.03}),
+    ("OPENCV_FISHEYE", {"k1": 0.1, "k2": -0.05, "k3": 0.02, "k4": 0.01}),
+])  # fmt: skip
+def test_distortion_is_undone(tmp_path, model, terms):
+    """A spot where the lens puts a ray comes to where a pinhole puts it."""
+    size, f, c = (310, 260), np.array([350.0, 380.0]), np.array([150.0, 136.0])
+    ray = np.array([[0.21, -0.17], [-0.3, 0.12], [0.05, 0.28]])
+    k = [terms.get(f"k{i}", 0.0) for i in range(1, 5)]
+    distort = brown(*ray.T, k, [terms.get("p1"), terms.get("p2")]) if model == "OPENCV" else fisheye(*ray.T, k)
+    spots, straight = np.stack(distort, 1) * f + c, ray * f + c
+    assert np.abs(spots - straight).max() > 2
+    y, x = np.mgrid[: size[1], : size[0]] + 0.5
+    picture = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) for u, v in spots)
+    top = {"fl_x": f[0], "fl_y": f[1], "cx": c[0], "cy": c[1], "w": 310, "h": 260, "camera_model": model, **terms}
+    sixteen = (60000 * picture).astype(np.uint16)[..., None].repeat(3, 2)
+    source = transforms(tmp_path / "data", top, [{"file_path": "a.png"}], lambda k: sixteen)
+    write(source / "m.png", (255 * (picture > 0.5)).astype(np.uint8)[..., None])
+    text = (source / "transforms.json").read_text()
+    (source / "transforms.json").write_text(text.replace('"a.png"', '"a.png", "mask_path": "m.png"'))
+    scene = converted("transforms", source, tmp_path / "lens.xml")
+    found = scene.observe([0])[0][0, ..., 1].numpy().astype(float)
+    for u, v in straight:
+        near = found * (np.hypot(x - u, y - v) < 12)
+        assert (near * x).sum() / near.sum() == pytest.approx(u, abs=0.03)
+        assert (near * y).sum() / near.sum() == pytest.approx(v, abs=0.03)
+        assert scene.masks[0][int(v), int(u)] == 255
+    np.testing.assert_allclose(np.ravel(scene.sensors[0].focal), f)
+    assert scene.images[0].dtype == np.uint16  # all bits are kept
+
+
+# COLMAP
+
+
+@pytest.fixture
+def colmap(tmp_path):
+    """A model in both forms, written by COLMAP's own library."""
+    folder = tmp_path / "colmap"
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=W, height=H, params=[70, 76, 28.5, 27.25], camera_id=1)
+    )
+    for k, (R, t) in enumerate(cameras(), 1):
+        pose = pycolmap.Rigid3d(np.hstack([R, t[:, None]]))
+        name = f"sub/{k}.jpg"
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
+        (folder / "images/sub").mkdir(parents=True, exist_ok=True)
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({33434: 1 / (50 * k), 33437: 2.8, 34855: 100 * k * k})
+        Image.fromarray(noise(np.uint8, seed=k)).save(folder / "images" / name, exif=exif)
+        write(folder / f"masks/{name}.png", disc())
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "text").mkdir()
+    model.write_binary(str(folder / "sparse/0"))
+    model.write_text(str(folder / "text"))
+    return folder
+
+
+@pytest.mark.parametrize("model", ["", "text"])
+def test_colmap(colmap, tmp_path, model):
+    offset = [0.3, -0.4, 0.1]
+    scene = converted("colmap", colmap / model, tmp_path / "scan.xml", "--masks", colmap / "masks",
+                      "--flash-offset", *offset, "--copy")  # fmt: skip
+    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    for sensor, light, (R, t) in zip(scene.sensors, lights, cameras()):
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
+        np.testing.assert_allclose(light[:3], R.T @ (offset - t), rtol=1e-4)
+    # exposure time · ISO: 1/50 · 100, 1/100 · 400, 1/150 · 900; brought to the median
+    np.testing.assert_allclose(lights[:, 4], [0.5, 1.0, 1.5], rtol=1e-5)
+    assert (tmp_path / "scan/images/sub_1.jpg").read_bytes() == (colmap / "images/sub/1.jpg").read_bytes()
+    assert (scene.masks[2] == disc()[..., 0]).all()
+
+
+def test_colmap_without_masks_and_exif(colmap, tmp_path):
+    scene = converted("colmap", colmap, tmp_path / "scan.xml", "--no-exif")
+    assert scene.masks == [None] * 3
+    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    np.testing.assert_allclose(lights[:, 4:7], 1)
+    np.testing.assert_allclose(lights[:, :3], [-R.T @ t for R, t in cameras()], rtol=1e-4)
+
+
+# NeuS, IDR, WildLight
+
+
+def neus(folder, scale=6.0, **more):
+    arrays = dict(more)
+    for k, (R, t) in enumerate(cameras()):
+        sign = -2.5 if k == 1 else 1.0  # a projection matrix is known up to a factor
+        arrays[f"world_mat_{k}"] = np.vstack([sign * K @ np.hstack([R, t[:, None]]), [0, 0, 0, 1]])
+        arrays[f"scale_mat_{k}"] = np.block([[scale * np.eye(3), POINTS.mean(0)[:, None]], [0, 0, 0, 1]])
+        write(folder / f"image/{k:03}.png", noise(np.uint8, seed=k))
+        write(folder / f"mask/{k:03}.png", disc())
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    return folder
+
+
+def test_neus(tmp_path):
+    scene = converted("neus", neus(tmp_path / "dtu"), tmp_path / "dtu.xml")
+    for sensor, (R, t) in zip(scene.sensors, cameras()):
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t) + 0.5, atol=0.01)  # integers are pixels' centres
+    assert (scene.masks[0] == disc()[..., 0]).all()
+    assert scene.linear == [False] * 3
+
+
+def test_wildlight(tmp_path):
+    """Energies are for the unit sphere, radiance is linear, photographs without flash are left out."""
+    energies = {"light_energy_0": [2.0, 3.0, 4.0], "light_energy_1": [0.0, 0, 0], "light_energy_2": [1.0, 1.0, 1.0]}
+    scene = converted("neus", neus(tmp_path / "wild", max_intensity=0.9, **energies), tmp_path / "wild.xml")
+    assert [s.id() for s in scene.sensors] == ["000", "002"]
+    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    np.testing.assert_allclose(lights[:, 4:7], 36 * np.array([[2, 3, 4], [1, 1, 1]]), rtol=1e-6)
+    np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
+    assert scene.sensors[0].saturation == pytest.approx(0.9)
+
+
+def test_wildlight_photographs_in_one_array(tmp_path):
+    source = neus(tmp_path / "wild", **{f"light_energy_{k}": [1.0, 1, 1] for k in range(3)}, max_intensity=7.0)
+    stack = np.random.default_rng(1).uniform(0, 7, (3, H, W, 3)).astype(np.float32)
+    np.save(source / "images.npy", stack)
+    scene = converted("neus", source, tmp_path / "wild.xml")
+    np.testing.assert_allclose(scene.observe([2])[0][0], stack[2], rtol=1e-3)
+    assert scene.sensors[0].saturation == pytest.approx(7)
+
+
+# IRON
+
+
+def test_iron(tmp_path):
+    folder, dictionary = tmp_path / "dragon/train", {}
+    for k, (R, t) in enumerate(cameras()):
+        K4, W2C = np.eye(4), np.eye(4)
+        K4[:3, :3], W2C[:3, :3], W2C[:3, 3] = K, R, t
+        dictionary[f"{k}.png"] = {"K": K4.ravel().tolist(), "W2C": W2C.ravel().tolist(), "img_size": [W, H]}
+        write(folder / f"image/{k}.exr", noise(np.uint8, seed=k).astype(np.float32))
+    (folder / "cam_dict_norm.json").write_text(json.dumps(dictionary))
+    scene = converted("iron", folder.parent, tmp_path / "iron.xml")
+    for sensor, (R, t) in zip(scene.sensors, cameras()):
+        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
+    np.testing.assert_allclose(scene.observe([1])[0][0], noise(np.uint8, seed=1), rtol=1e-3)
+
+
+# A user's mistakes
+
+
+def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, capsys):
+    good = neus(tmp_path / "neus")
+    cases = []
+
+    def case(pattern, *arguments):
+        cases.append((pattern, [str(a) for a in arguments]))
+
+    out = tmp_path / "out/scene.xml"
+    case("FORMAT: is nerf; must be one of diligent-mv", "nerf", good, out)
+    case("--views: 9: not in", "diligent-mv", diligent, out, "--views", 9)
+    case("--lights: 0: not in", "diligent-mv", diligent, out, "--lights", 0)
+    case("Calib_Results.mat: MATLAB file: no such file", "diligent-mv", colmap, out)
+    case("transforms.json nor transforms_train.json", "transforms", colmap, out)
+    case("neither images.bin nor images.txt", "colmap", good, out)
+    case("cameras_sphere.npz nor cameras.npz", "neus", colmap, out)
+    case("cam_dict_norm.json", "iron", colmap, out)
+    for pattern, arguments in cases:
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.convert", convert.main, arguments)
+        message = capsys.readouterr().err
+        assert stop.value.code == 2 and message.count("\n") == 1 and pattern in message, message
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda d: d.update(frames=[]), "frames: found none"),
+    (lambda d: d["frames"][1].pop("file_path"), r"frames\[1\].file_path: missing"),
+    (lambda d: d["frames"][1].update(file_path="gone"), r"frames\[1\].file_path: no such file"),
+    (lambda d: d["frames"][2].pop("transform_matrix"), r"frames\[2\].transform_matrix: is missing; must be 4 x 4"),
+    (lambda d: d["frames"][0]["transform_matrix"][1].pop(), r"frames\[0\].transform_matrix"),
+    (lambda d: d["frames"][0]["transform_matrix"].__setitem__(1, [float("nan")] * 4), "NaN"),
+    (lambda d: d["frames"][0]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "no rotation"),
+    (lambda d: [row.__setitem__(0, -row[0]) for row in d["frames"][0]["transform_matrix"]], "left-handed"),
+    (lambda d: d.pop("camera_angle_x"), r"frames\[0\].fl_x: is missing"),
+    (lambda d: d.update(camera_angle_x="wide"), "camera_angle_x: is wide; must be a number"),
+    (lambda d: d.update(fl_x=-3.0), "focal lengths"),
+    (lambda d: d.update(w=99, h=52), "is 62 x 52 pixels, its camera 99 x 52"),
+    (lambda d: d.update(k4=0.1), r"frames\[0\].k4"),
+    (lambda d: d.update(camera_model="FOV"), "camera_model: is FOV"),
+    (lambda d: d["frames"][1].update(pl_pos=[1, 2]), r"frames\[1\].pl_pos: is of shape \(2,\); must be 3 numbers"),
+    (lambda d: d["frames"][1].update(pl_pos=[1, 2, 3], pl_intensity=-2), "not negative"),
+])  # fmt: skip
+def test_mistakes_in_transforms(tmp_path, edit, pattern):
+    frames = [{"file_path": f"{k}"} for k in range(3)]
+    source = transforms(tmp_path / "data", {"camera_angle_x": 0.7}, frames, lambda k: noise(np.uint8))
+    content = json.loads((source / "transforms.json").read_text())
+    edit(content)
+    (source / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=pattern) as error:
+        convert.main(["transforms", str(source), str(tmp_path / "out/scene.xml")])
+    assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+
+def test_truncated_files(diligent, colmap, tmp_path):
+    out = tmp_path / "out/scene.xml"
+    for path in (colmap / "sparse/0/images.bin", colmap / "text/cameras.txt", diligent / "Calib_Results.mat",
+                 diligent / "view_02/mask.png"):  # fmt: skip
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2])
+        kind, source = ("colmap", path.parent) if "colmap" in str(path) else ("diligent-mv", diligent)
+        with pytest.raises(InputError) as error:
+            convert.main(
+                [kind, str(source), str(out), *(["--images", str(colmap / "images")] if kind == "colmap" else [])]
+            )
+        assert "\n" not in str(error.value)
+        path.write_bytes(content)
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("name", ["bunny", "teapot"])
+def test_both_formats_of_a_capture_agree(shared, tmp_path, name):
+    """The captures come as scene.xml and as transforms.json."""
+    folder = shared / "data/captures" / name
+    ours, theirs = converted("transforms", folder, tmp_path / "a.xml"), capture.load(folder / "scene.xml", images=False)
+    for a, b in zip(ours.sensors, theirs.sensors):
+        np.testing.assert_allclose(np.array(a.to_world.matrix), np.array(b.to_world.matrix), rtol=1e-4, atol=1e-5)
+        assert a.filename.resolve() == b.filename.resolve()
+    lights = [np.array(c.photographs.lights).reshape(-1, 8)[:, :7] for c in (ours, theirs)]
+    np.testing.assert_allclose(*lights, rtol=1e-4)
