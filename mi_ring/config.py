@@ -148,7 +148,10 @@ class Config:
 
 
 PRESETS = {
-    "fast": {"iterations": 205, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5},
+    "fast": {
+        "iterations": 180, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
+    },
     "default": {},
     "fine": {"iterations": 1800, "shares": (0.3, 0.4, 0.3)},
     "paper": {
