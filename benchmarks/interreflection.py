@@ -3,8 +3,8 @@
     python benchmarks/interreflection.py [--out out/interreflection] [--spp N] [OPTIONS OF mi_ring.fit]
 
 Makes the capture OUT/bowl/ unless it is there: 28 flash photographs of 256 x 256, path traced by stock Mitsuba with
-another material than ours (`principled`), and 8 novel ones. Prints the table of `accuracy.py`, one line per fit. Needs
-scikit-image, as `scenes/make_pot2.py` does, whose camera it takes.
+another material than ours (`principled`), and 8 novel ones. Prints the table of `accuracy.py`, one line per fit. The
+camera is that of `scenes/make_pot2.py`.
 """
 
 import argparse

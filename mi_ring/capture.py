@@ -1,5 +1,6 @@
 """A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
 
+import functools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
+import scipy.ndimage
 import torch
+from skimage.filters import threshold_otsu
 from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
@@ -15,6 +18,7 @@ from tqdm import tqdm
 from mi_ring import mesh, photograph
 from mi_ring.edges import Edges
 from mi_ring.errors import InputError
+from mi_ring.hull import Hull, OneLine, Silhouette, nearest_point
 from mi_ring.integrator import Photographs, check_attributes
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
@@ -33,6 +37,7 @@ class Capture:
     linear: list[bool]  # are the encoded pixels linear radiance, or sRGB?
     masks: list[np.ndarray | None]  # (H, W) uint8, 0 background, 255 object
     shadows: bool
+    threshold: float | None = None  # radiance by which masks were found in the photographs; None if they were not
 
     def __post_init__(self):
         self.photographs = Photographs.of(self.sensors)
@@ -114,20 +119,35 @@ class Capture:
         distance2 = np.where(lights[:, 3] > 0, 1.0, ((lights[:, :3] - center) ** 2).sum(1))
         return float(exposure / np.median(lights[:, 4:7].mean(1) / distance2))
 
-    def sphere(self) -> tuple[np.ndarray, float]:
-        """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
-        if self.shape.center is not None and self.shape.radius is not None:
-            return self.shape.center, self.shape.radius
+    @functools.cached_property
+    def hull(self) -> Hull | None:
+        """The visual hull of the masks, if there are any and they are seen from more than one side."""
         once = {}  # one photograph for all that share camera and mask
         for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
             if mask is not None:
                 once.setdefault((id(mask), camera_of(sensor)[0].tobytes()), k)
-        masked = list(once.values())
-        center, radius = sphere_of_masks(self, masked) if masked else sphere_of_cameras(self)
-        return (
-            center if self.shape.center is None else self.shape.center,
-            radius if self.shape.radius is None else self.shape.radius,
-        )
+        silhouettes = [Silhouette(self.masks[k], *camera_of(self.sensors[k]), self.outline(k)) for k in once.values()]
+        try:
+            return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
+        except OneLine:
+            return None
+
+    @property
+    def whole(self) -> bool:
+        """Do masks show the whole object? Those that were found do not show what is in shadow."""
+        return self.threshold is None or self.photographs.colocated
+
+    def outline(self, k: int) -> str:
+        """The file that photograph `k` has its mask from."""
+        return str(self.sensors[k].mask or self.sensors[k].filename)
+
+    def sphere(self) -> tuple[np.ndarray, float]:
+        """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
+        center, radius = self.shape.center, self.shape.radius
+        if center is None or radius is None:
+            middle, ball = sphere_of_masks(self.hull) if self.hull else sphere_of_cameras(self)
+            center, radius = middle if center is None else center, ball if radius is None else radius
+        return center, radius
 
 
 def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
@@ -165,65 +185,19 @@ def shrink(image: Tensor, scale: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
 
 
-def pixel_directions(matrix, focal, centre, pixels):
-    """Numpy twin of `photograph.camera_ray`: unit directions (n, 3) in the world of pixel coordinates (n, 2)."""
-    x, y = ((pixels - centre) / focal).T
-    d = np.stack([-x, -y, np.ones_like(x)], 1) @ matrix[:3, :3].T
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
 def camera_of(sensor):
     """(to_world (4, 4), focal (2,), centre (2,)) of a photograph as numpy arrays."""
     matrix = np.array(sensor.to_world.matrix).reshape(4, 4)
     return matrix, np.array(sensor.focal).ravel(), np.array(sensor.centre).ravel()
 
 
-def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
-    """The point (3,) closest in the least-squares sense to lines (n, 3) + t (n, 3)."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
-    if np.linalg.cond(matrix) > 1e6:
-        raise InputError(f"{what}: all cameras look along one line, so the object's place is unknown; "
-                         "give center and radius of the shapenet shape")  # fmt: skip
-    return np.linalg.solve(matrix, right)
-
-
-def sphere_of_masks(capture: Capture, masked: list[int], resolution: int = 48) -> tuple[np.ndarray, float]:
+def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:
     """Centre of the masks' visual hull and 1.3 times the radius of the ball of the same volume [scene units].
 
     A start surface that is a little too large shrinks onto the object, which goes faster than growing limbs.
     """
-    cameras = [camera_of(capture.sensors[k]) for k in masked]
-
-    def pixels(k):  # found anew each time: those of thousands of masks would fill the memory
-        rows, columns = np.nonzero(capture.masks[k] > 127)
-        if not len(rows):
-            raise InputError(f"{capture.sensors[k].mask}: mask: no object in it (no pixel above 127)")
-        return np.stack([columns, rows], 1) + 0.5
-
-    origins = np.stack([matrix[:3, 3] for matrix, _, _ in cameras])
-    axes = [pixel_directions(*c, pixels(k).mean(0, keepdims=True))[0] for c, k in zip(cameras, masked)]
-    center = nearest_point(origins, np.stack(axes), str(capture.path))
-    reach = max(
-        np.linalg.norm(np.cross(pixel_directions(*c, pixels(k)), center - o), axis=1).max()
-        for c, k, o in zip(cameras, masked, origins)
-    )
-    axis = np.linspace(-reach, reach, resolution)
-    grid = center + np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    votes = np.zeros(len(grid))
-    for k, (matrix, focal, centre) in zip(masked, cameras):
-        local = (grid - matrix[:3, 3]) @ matrix[:3, :3]
-        mask = capture.masks[k]
-        column, row = (np.floor(centre - focal * local[:, :2] / local[:, 2:])).astype(int).T
-        height, width = mask.shape
-        seen = (local[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        outside = mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] <= 127
-        votes += seen & outside
-    hull = grid[votes <= 0.02 * len(masked)]
-    if not len(hull):
-        raise InputError(f"{capture.path}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
-    volume = len(hull) * (2 * reach / (resolution - 1)) ** 3
-    return hull.mean(0), float(1.3 * (3 * volume / (4 * np.pi)) ** (1 / 3))
+    center, radius = hull.ball()
+    return center, 1.3 * radius
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
@@ -235,10 +209,11 @@ def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
     return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())
 
 
-def load(path: str | Path, images: bool = True) -> Capture:
+def load(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
     """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later.
 
-    Without `images` only cameras and lights are read: enough to render.
+    Without `images` only cameras and lights are read: enough to render. `masks`: those "given" by the scene; if there
+    are none, "auto" finds them by brightness where the room was dark; "none" does so even if there are.
     """
     path = Path(path)
     scene, sensors = open_scene(path)
@@ -254,12 +229,45 @@ def load(path: str | Path, images: bool = True) -> Capture:
         pixels = [read_image(s, path) for s in reading]
         linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
         files = {(s.mask, s.size, s.mask == s.filename): s for s in sensors if images}  # photographs may share a mask
-        read = {key: read_mask(s, path) for key, s in files.items()}
-        masks = [read[s.mask, s.size, s.mask == s.filename] for s in sensors] if images else []
+        read = {key: read_mask(s, path) for key, s in files.items() if masks != "none"}
+        given = [read.get((s.mask, s.size, s.mask == s.filename)) for s in sensors] if images else []
         shadows = getattr(scene.integrator(), "shadows", True)
-        return Capture(path, scene, shapes[0], sensors, pixels, linear, masks, shadows)
+        capture = Capture(path, scene, shapes[0], sensors, pixels, linear, given, shadows)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{path}: {error}") from error
+    if images and masks != "given" and all(mask is None for mask in given):
+        find_masks(capture)
+    return capture
+
+
+def find_masks(capture: Capture) -> None:
+    """Give the photographs masks of what is brighter than a dark room, if it was dark when they were taken.
+
+    Such a mask shows what the light reaches of the object; the rest of the object may be as dark as the room.
+    """
+    some = [brightness(capture, k) for k in capture.spread(50)]
+    values = np.concatenate([image[::4, ::4].ravel() for image in some])
+    floor = values[values > 0].min(initial=1.0)
+    split = float(np.exp(threshold_otsu(np.log(np.maximum(values, floor)))))
+    dark, bright = values[values <= split], values[values > split]
+    border = np.concatenate([np.concatenate([i[0], i[-1], i[:, 0], i[:, -1]]) for i in some])
+    if np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
+        return
+    # Above the noise of the dark: of what is not near to anything bright.
+    apart = [scipy.ndimage.maximum_filter(image, 1 + 2 * (image.shape[1] // 50)) <= split for image in some]
+    noise = float(np.quantile(np.concatenate([image[a] for image, a in zip(some, apart)]), 0.999))
+    capture.threshold = max(2 * noise, 1e-3 * float(np.median(bright)))
+    for k in range(len(capture)):
+        seen = brightness(capture, k) > capture.threshold
+        pieces, count = scipy.ndimage.label(seen)
+        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+
+
+def brightness(capture: Capture, k: int) -> np.ndarray:
+    """Radiance (H, W) of the brightest colour of each pixel."""
+    return decode(capture.images[k], capture.linear[k], 1.0)[0].max(-1)
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, list]:

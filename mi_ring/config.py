@@ -34,6 +34,12 @@ class Config:
     """Go on from the folder's checkpoint.pt. Give the same settings as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """Settings that go together; each can be overridden. paper: the paper's own, days on a CPU."""
+    domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
+    """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
+    the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
+    masks: Literal["auto", "given", "none"] = "auto"
+    """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
+    room; none: as if it had none."""
     seed: int = 0
     """Of every random choice."""
     iterations: int = 500

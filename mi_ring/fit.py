@@ -15,14 +15,16 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import torch
 import tyro
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from mi_ring import bridge, capture, command, losses, reflectance, results
 from mi_ring.config import PRESETS, Config
+from mi_ring.domain import Domain, Sphere, closed, load
 from mi_ring.errors import InputError
+from mi_ring.hull import genus
 from mi_ring.ring import Ring
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
@@ -39,7 +41,7 @@ class Fit:
         self.capture, self.config = scene, config
         self.random = torch.Generator().manual_seed(config.seed)
         torch.manual_seed(config.seed)
-        center, radius = scene.sphere()
+        domain, center, radius = start(scene, config.domain)
         self.exposure = scene.exposure()
         parameters, bsdf = reflectance.predicted(scene.path, scene.shape, config.parameters)
         scale = scene.reflectance(center, self.exposure)
@@ -50,7 +52,7 @@ class Fit:
                              "times the light that it gets, which the ranges of --parameters do not reach; give "
                              "the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and self.albedo < 1
-        self.ring = Ring(center, radius, scale, scene.shape.domain, parameters, bsdf, indirect, config.steps)
+        self.ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps)
         self.device = bridge.device()
         self.ring.to(self.device)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
@@ -88,9 +90,7 @@ class Fit:
         started = time.perf_counter()
         self.enter_stage()
         progress = self.iteration / config.iterations
-        rotation = Rotation.from_quat(torch.randn(4, generator=self.random).numpy()).as_matrix()
-        s, _ = self.ring.domain.sample(self.stage.level, torch.as_tensor(rotation, dtype=torch.float32))
-
+        s, _ = self.ring.domain.sample(self.stage.level, self.random)
         s = s.to(self.device)
         vertices, material = self.deform(s)
 
@@ -110,6 +110,9 @@ class Fit:
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
         if masked.any() and config.weights.get("mask"):
             sigma = config.blur * (1 - 1.25 * progress) * size[0] / scale
+            if self.capture.threshold is not None:  # of the object, such masks show what is bright
+                lit = torch.maximum(observed, predicted.detach()).amax(-1) > self.capture.threshold
+                coverage = torch.where(lit, coverage, 0)
             terms["mask"] = losses.mask_loss(coverage[masked], mask[masked], max(1.0, sigma))
         if config.weights.get("velocity"):
             terms["velocity"] = self.regulariser(s)
@@ -173,6 +176,24 @@ class Fit:
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.iteration, self.seconds = state["iteration"], state["seconds"]
+
+
+def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
+    """The domain of a fit and the sphere that normalises it: what `--domain` asks for, else what the scene says."""
+    shape = scene.shape
+    if isinstance(choice, tuple):
+        return closed(load(choice[1]), shape.center, shape.radius)
+    if choice == "auto" and shape.domain:
+        return shape.domain, shape.center, shape.radius
+    hull = scene.whole and scene.hull
+    if choice == "hull" and not hull:
+        raise InputError(f"{scene.path}: --domain hull: there are no masks of the whole object from several sides; "
+                         "give them, or --domain sphere")  # fmt: skip
+    if choice != "sphere" and hull:
+        surface = hull.surface()
+        if choice == "hull" or genus(surface):
+            return closed(surface, shape.center, shape.radius)
+    return Sphere(), *scene.sphere()
 
 
 def digest(file: Path) -> str:
@@ -297,7 +318,9 @@ def main(arguments: Sequence[str]) -> int:
     config = dataclasses.replace(config, variant=set_variant(config.variant))
     set_threads(config)
     keep_memory()
-    scene = capture.load(config.scene)
+    scene = capture.load(config.scene, masks=config.masks)
+    if config.masks != "given" and scene.threshold is None and all(mask is None for mask in scene.masks):
+        print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     fit = Fit(scene, config)
     folder = config.folder
     if config.resume:

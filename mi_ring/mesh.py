@@ -3,10 +3,9 @@
 import mitsuba as mi
 import numpy as np
 import torch
-import trimesh
 
 from mi_ring.bsdf import check_attributes
-from mi_ring.domain import Domain, Sphere
+from mi_ring.domain import Sphere, closed, load
 from mi_ring.photograph import beside_scene
 from mi_ring.ring import Ring
 
@@ -61,31 +60,22 @@ class ShapeNetMesh(mi.Mesh):
             # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
-        #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
+        #: What the XML says of normalising sphere and domain, for the fit; None where it says nothing.
         self.center = np.array(given["center"]).ravel() if "center" in given else None
         self.radius = given.get("radius")
         if self.radius is not None and not self.radius > 0:
             raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
-        self.domain = Sphere()
+        self.domain = None
         if "domain" in given:
-            try:
-                mesh = trimesh.load(beside_scene(given["domain"]), force="mesh")
-            except Exception as error:
-                raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is no mesh: {error}') from error
-            if not (mesh.is_watertight and mesh.is_winding_consistent):
-                raise ValueError(f'shapenet "{props.id()}": domain "{given["domain"]}" is not a closed surface')
-            if mesh.volume < 0:
-                mesh.invert()
-            self.center = mesh.bounds.mean(0) if self.center is None else self.center
-            self.radius = self.radius or float(np.linalg.norm(mesh.vertices - self.center, axis=1).mean())
-            self.domain = Domain((mesh.vertices - self.center) / self.radius, mesh.faces)
+            mesh = load(beside_scene(given["domain"]))
+            self.domain, self.center, self.radius = closed(mesh, self.center, self.radius)
         center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         self.ring = Ring.load(beside_scene(given["weights"])) if "weights" in given else None
 
         material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
                     "roughness": torch.tensor(0.5)}  # fmt: skip
         if self.ring is None:
-            s, faces = self.domain.sample(self.subdivisions)
+            s, faces = (self.domain or Sphere()).sample(self.subdivisions)
             vertices = torch.as_tensor(center, dtype=torch.float32) + radius * s
             material = {name: m.expand(len(s), *m.shape) for name, m in material.items()}
         else:

@@ -158,6 +158,33 @@ def test_photographs_to_look_at_are_evenly_spread(small_capture):
     assert scene.spread() == list(range(12)) and scene.spread(5) == [0, 2, 4, 7, 9]
 
 
+def test_masks_are_found_in_a_dark_room(small_capture):
+    given, found = capture.load(small_capture), capture.load(small_capture, masks="none")
+    assert given.threshold is None and 0 < found.threshold < 0.02
+    for mask, guess in zip(given.masks, found.masks):
+        both, either = ((mask > 127) & (guess > 127)).sum(), ((mask > 127) | (guess > 127)).sum()
+        assert both > 0.9 * either  # the lights are beside the cameras: a thin crescent is dark
+    assert capture.load(small_capture, masks="auto").masks[3].tolist() == given.masks[3].tolist()
+
+
+def test_no_masks_are_found_in_a_bright_room(broken_capture):
+    path, _ = broken_capture
+    for file in path.parent.glob("images/*.png"):
+        image = np.array(mi.Bitmap(str(file)))
+        mi.Bitmap(np.maximum(image, 90)).write(str(file))
+    scene = capture.load(path, masks="none")
+    assert scene.threshold is None and scene.masks == [None] * 12
+
+
+def test_specks_are_no_object(broken_capture):
+    path, _ = broken_capture
+    image = np.array(mi.Bitmap(str(path.parent / "images/004.png")))
+    assert not image[2, 3].any()
+    image[2, 3] = 200  # a hot pixel
+    mi.Bitmap(image).write(str(path.parent / "images/004.png"))
+    assert capture.load(path, masks="none").masks[4][2, 3] == 0
+
+
 def test_sphere_of_masks_finds_the_object(small_capture):
     center, radius = capture.load(small_capture).sphere()
     volume = np.prod(AXES) ** (1 / 3)

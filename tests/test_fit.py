@@ -19,6 +19,7 @@ from PIL import Image
 
 from mi_ring import capture, command, fit, render, results
 from mi_ring.config import PRESETS, Config
+from mi_ring.domain import Domain, Sphere
 from mi_ring.errors import InputError
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
@@ -252,6 +253,69 @@ def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
     assert all(np.isfinite(entry["loss"]) for entry in log)
     mesh = trimesh.load(tmp_path / "run" / "mesh.ply", process=False)
     assert mesh.is_watertight and mesh.euler_number == (0 if change is torus_domain else 2)
+
+
+def test_start_from_the_visual_hull(small_capture, tmp_path):
+    run = tmp_path / "run"
+    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "12", "--domain", "hull", *QUICK]) == 0
+    assert distance(run / "mesh.ply") < 0.04  # hardly a fit: it is the start that is near
+    mesh = trimesh.load(run / "mesh.ply", process=False)
+    assert mesh.is_watertight and mesh.euler_number == 2
+    domain = results.load_ring(run).domain
+    assert type(domain) is Domain and np.linalg.norm(domain.points, axis=1).mean() == pytest.approx(1, abs=0.01)
+    again = mi.load_dict({"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 3})
+    vertices = np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)
+    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-3)
+
+
+def test_fits_from_a_hull_are_resumed_bit_for_bit(small_capture, tmp_path):
+    options = ["--domain", "hull", "--deterministic", "--iterations", "6", *QUICK]
+    scene = capture.load(small_capture)
+    whole, part = (fit.Fit(scene, fit.parse([str(small_capture), *options])) for _ in range(2))
+    for _ in range(6):
+        whole.step()
+    for _ in range(3):
+        part.step()
+    results.save(part.state(), tmp_path / "checkpoint.pt")
+    rest = fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), *options]))
+    rest.restore(tmp_path / "checkpoint.pt")
+    for _ in range(3):
+        rest.step()
+    for a, b in zip(whole.ring.parameters(), rest.ring.parameters()):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)  # threads of other tests may have been set
+
+
+def test_start_from_a_mesh(small_capture, tmp_path):
+    trimesh.creation.torus(20, 8).apply_translation(CENTER).export(tmp_path / "torus.ply")
+    run = tmp_path / "run"
+    domain = ["--domain", "mesh", str(tmp_path / "torus.ply")]
+    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "4", *domain, *QUICK]) == 0
+    assert trimesh.load(run / "mesh.ply", process=False).euler_number == 0
+
+
+def test_auto_takes_the_hull_only_where_it_has_handles(small_capture, monkeypatch):
+    scene = capture.load(small_capture)
+    assert type(fit.start(scene, "auto")[0]) is Sphere
+    monkeypatch.setattr(fit, "genus", lambda mesh: 1)
+    domain, center, radius = fit.start(scene, "auto")
+    assert type(domain) is Domain
+    np.testing.assert_allclose(center, CENTER, atol=2)
+    assert radius == pytest.approx(AXES.mean(), rel=0.1)
+    assert type(fit.start(scene, "sphere")[0]) is Sphere
+
+
+def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    no_masks(path)
+    run = tmp_path / "run"
+    assert fit.main([str(path), "--out", str(run), "--iterations", "90", *QUICK]) == 0
+    assert '"mask"' in (run / "log.jsonl").read_text() and distance(run / "mesh.ply") < 0.05
+    with pytest.raises(InputError, match="--domain hull: there are no masks of the whole object"):
+        fit.main([str(path), "--out", str(run), "--domain", "hull", "--masks", "given", *QUICK])
+    for file in path.parent.glob("images/*.png"):
+        mi.Bitmap(np.maximum(np.array(mi.Bitmap(str(file))), 90)).write(str(file))
+    assert fit.main([str(path), "--out", str(tmp_path / "bright"), "--iterations", "1", *QUICK]) == 0
+    assert "the room was not dark enough" in capsys.readouterr().out
 
 
 def test_results_never_go_onto_the_scene_itself(finished, broken_capture):

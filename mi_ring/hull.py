@@ -1,0 +1,175 @@
+"""The visual hull: all points that are inside the masks, where a fit starts."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage
+import skimage.measure
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring.errors import InputError
+
+SHOWN = 0.25  #: share of the photographs that must show a point, else it is outside
+MOST = 128  #: silhouettes; more add little
+
+
+class OneLine(InputError):
+    """All cameras look along one line: they do not say how far the object is."""
+
+
+class Silhouette(NamedTuple):
+    """A mask and its camera."""
+
+    mask: np.ndarray  # (H, W) uint8, object above 127
+    matrix: np.ndarray  # (4, 4) camera-to-world, Mitsuba's axes
+    focal: np.ndarray  # (2,) [px]
+    centre: np.ndarray  # (2,) [px]
+    name: str  # for messages
+
+
+def directions(matrix, focal, centre, pixels) -> np.ndarray:
+    """Numpy twin of `photograph.camera_ray`: unit directions (n, 3) in the world of pixel coordinates (n, 2)."""
+    x, y = ((pixels - centre) / focal).T
+    d = np.stack([-x, -y, np.ones_like(x)], 1) @ matrix[:3, :3].T
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
+    """The point (3,) closest in the least-squares sense to lines (n, 3) + t (n, 3)."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
+    if np.linalg.cond(matrix) > 1e6:
+        raise OneLine(f"{what}: all cameras look along one line, so the object's place is unknown; "
+                      "give center and radius of the shapenet shape")  # fmt: skip
+    return np.linalg.solve(matrix, right)
+
+
+class Hull:
+    """The visual hull of silhouettes. Raises InputError if there is none.
+
+    `center` (3,) and `reach` are those of a ball that holds it [scene units]. `wrong` is the share of the silhouettes
+    that may be wrong about a point.
+    """
+
+    def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02):
+        self.silhouettes = [silhouettes[k * len(silhouettes) // MOST] for k in range(MOST)]
+        if len(silhouettes) <= MOST:
+            self.silhouettes = list(silhouettes)
+        self.what, self.wrong = what, wrong
+        self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
+        origins = np.stack([s.matrix[:3, 3] for s in self.silhouettes])
+        rays = [self.rays(s) for s in self.silhouettes]
+        self.center = nearest_point(origins, np.stack([r.mean(0) / np.linalg.norm(r.mean(0)) for r in rays]), what)
+        across = (np.cross(r, self.center - o) for r, o in zip(rays, origins))
+        self.reach = max(np.linalg.norm(a, axis=1).max() for a in across)
+
+    @staticmethod
+    def rays(silhouette: Silhouette) -> np.ndarray:
+        """Directions (n, 3) through the pixels of a mask."""
+        rows, columns = np.nonzero(silhouette.mask > 127)
+        if not len(rows):
+            raise InputError(f"{silhouette.name}: mask: no object in it (no pixel above 127)")
+        return directions(*silhouette[1:4], np.stack([columns, rows], 1) + 0.5)
+
+    def depth(self, points: Tensor) -> Tensor:
+        """About how deep each point (N, 3) is inside the hull [scene units]; negative outside.
+
+        The distance from the outline, at the depth of the point, in the silhouette where it is smallest. So that a
+        faulty one does no harm some may be wrong. What lies outside a photograph it knows nothing of; but what few
+        photographs show is not the object.
+        """
+        worst = math.floor(self.wrong * len(self.silhouettes)) + 1
+        lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
+        for (mask, *camera, _), distance in zip(self.silhouettes, self.distances):
+            matrix, focal, centre = (torch.tensor(a, dtype=torch.float32) for a in camera)
+            local = (points - matrix[:3, 3]) @ matrix[:3, :3]
+            z = local[:, 2]
+            place = (centre - focal * local[:, :2] / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
+            seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
+            inside = F.grid_sample(distance[None, None], 2 * place[None, None] - 1, align_corners=False)[0, 0, 0]
+            lowest = torch.cat([lowest, torch.where(seen, inside * z / focal.mean(), torch.inf)[None]])
+            lowest = lowest.sort(0).values[:worst]
+            shown += seen
+        return torch.where(shown >= SHOWN * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
+
+    def shortfall(self, pixels: int = 100, samples: int = 64, outline: bool = False) -> np.ndarray:
+        """By how much the hull misses the silhouettes that it is made of: (N, pixels) [px], above 0.
+
+        Of so many pixels of each mask, or of its outline, how far the nearest of the hull is: 0 where the other
+        silhouettes leave something of what is behind the pixel.
+        """
+        random, result = np.random.default_rng(0), []
+        along = torch.linspace(-self.reach, self.reach, samples)[:, None]
+        for silhouette, distance in zip(self.silhouettes, self.distances):
+            rays = self.rays(silhouette)
+            if outline:
+                rays = rays[distance.numpy()[silhouette.mask > 127] < 1]
+            rays = rays[random.integers(len(rays), size=pixels)]
+            origin = silhouette.matrix[:3, 3]
+            middle = origin + rays * (rays @ (self.center - origin))[:, None]
+            middle, rays = (torch.as_tensor(a, dtype=torch.float32) for a in (middle, rays))
+            deepest = self.depth((middle[:, None] + along * rays[:, None]).reshape(-1, 3)).reshape(pixels, samples)
+            pixel = np.linalg.norm(self.center - origin) / silhouette.focal.mean()
+            result.append((-deepest.amax(1).numpy() / pixel).clip(0))
+        return np.array(result)
+
+    def grid(self, low, high, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
+        """Points (N, 3) and the shape of the grid that they form."""
+        axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
+        return torch.cartesian_prod(*axes), tuple(map(len, axes))
+
+    def require(self, inside: int) -> None:
+        """Raise InputError if no point was found inside."""
+        if not inside:
+            raise InputError(f"{self.what}: mask: no point in space is inside all masks; "
+                             "check to_world, fx, fy, cx, cy")  # fmt: skip
+
+    def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
+        """The hull's centre of mass (3,) and the radius of the ball of its volume [scene units]."""
+        spacing = 2 * self.reach / (resolution - 1)
+        points, _ = self.grid(self.center - self.reach, self.center + self.reach, spacing)
+        inside = points[self.depth(points) > 0].double()
+        self.require(len(inside))
+        return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
+
+    def surface(self, resolution: int = 128) -> trimesh.Trimesh:
+        """Closed surface of the largest piece [scene units], by marching cubes, so many along the longest side."""
+        low, high = self.center - self.reach, self.center + self.reach
+        spacing = 2 * self.reach / 64
+        points, shape = self.grid(low, high, spacing)
+        coarse = self.depth(points).reshape(shape).numpy()
+        inside = np.argwhere(coarse > -spacing)
+        self.require(len(inside))
+        low, high = low + spacing * (inside.min(0) - 1), low + spacing * (inside.max(0) + 1)
+        fine = (high - low).max() / resolution
+        points, shape = self.grid(low, high, fine)
+        index = (points.numpy() - (self.center - self.reach)).T / spacing
+        field = torch.from_numpy(scipy.ndimage.map_coordinates(coarse, index, order=1, mode="nearest"))
+        near = field.abs() < 2 * spacing  # elsewhere nothing but the sign matters
+        field[near] = self.depth(points[near])
+        field = field.reshape(shape).numpy().clip(-3 * fine, 3 * fine)
+        field = np.pad(scipy.ndimage.gaussian_filter(field, 1.0), 1, constant_values=-fine)  # closed at the border, too
+        self.require(int((field > 0).sum()))
+        vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
+        mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
+        mesh = max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
+        if mesh.volume < 0:
+            mesh.invert()
+        return mesh
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance of each pixel's centre from the outline of a mask (H, W) [px], above 0 inside."""
+    inside = mask > 127
+    edge = scipy.ndimage.distance_transform_edt
+    return np.where(inside, edge(inside) - 0.5, 0.5 - edge(~inside)).astype(np.float32)
+
+
+def genus(mesh: trimesh.Trimesh) -> int:
+    """Number of handles of a closed surface of one piece."""
+    return 1 - mesh.euler_number // 2

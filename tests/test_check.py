@@ -1,0 +1,126 @@
+"""`mi_ring.check`: a good capture passes, each mistake is named with its mend."""
+
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_ring import check, command
+
+
+def run(path, tmp_path, capsys, *options):
+    """Exit status and what is printed."""
+    status = check.main([str(path), "--out", str(tmp_path / "sheet.png"), *options])
+    return status, capsys.readouterr().out
+
+
+def edit_matrices(path, change):
+    """`change` every to_world matrix (4, 4) of a scene file."""
+
+    def replaced(match):
+        matrix = change(np.array([float(v) for v in match[1].split()]).reshape(4, 4))
+        return '<matrix value="{}"/>'.format(" ".join(f"{v:.9g}" for v in matrix.ravel()))
+
+    path.write_text(re.sub('<matrix value="([^"]*)"/>', replaced, path.read_text()))
+
+
+def edit_images(path, change, folder="images", which="*"):
+    for file in (path.parent / folder).glob(f"{which}.png"):
+        mi.Bitmap(np.ascontiguousarray(change(np.array(mi.Bitmap(str(file)))))).write(str(file))
+
+
+def test_a_good_capture_passes(small_capture, tmp_path, capsys):
+    status, text = run(small_capture, tmp_path, capsys)
+    assert status == 0 and "Nothing to mend found" in text, text
+    rows = [line.split() for line in text.splitlines() if line.split()[:1] and line.split()[0].endswith(".png")]
+    assert len(rows) == 12 and {row[-1] for row in rows} <= {"98%", "99%", "100%"}
+    sheet = Image.open(tmp_path / "sheet.png")
+    assert sheet.width >= 1200
+    red = (np.array(sheet) == [255, 51, 51]).all(-1)
+    assert red.sum() > 12 * 30  # the masks' outlines
+
+
+MATRICES = {
+    "opencv": (lambda m: m @ np.diag([-1.0, -1, 1, 1]), r"axes are OpenCV's .* diag\(-1, -1, 1, 1\)"),
+    "opengl": (lambda m: m @ np.diag([-1.0, 1, -1, 1]), r"axes are OpenGL's .* diag\(-1, 1, -1, 1\)"),
+    "inverse": (np.linalg.inv, "to_world is world-to-camera: invert it"),
+    "inverse and opencv": (lambda m: np.linalg.inv(m @ np.diag([-1.0, -1, 1, 1])), "world-to-camera.*OpenCV's"),
+    "transposed": (lambda m: np.block([[m[:3, :3].T, m[:3, 3:]], [m[3:]]]), "rotation in to_world is transposed"),
+}
+
+
+@pytest.mark.parametrize("case", MATRICES)
+def test_wrong_conventions_are_recognised(case, broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    change, words = MATRICES[case]
+    edit_matrices(path, change)
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and re.search(f"To mend: The masks agree to .*{words}", text), text
+
+
+def test_exchanged_principal_point(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    path.write_text(re.sub(r'name="cx" value="(\S+)"/> <float name="cy" value="(\S+)"/>',
+                           r'name="cx" value="\2"/> <float name="cy" value="\1"/>', path.read_text()))  # fmt: skip
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "cx and cy are exchanged" in text, text
+
+
+def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    count = iter(range(100))
+    turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    edit_matrices(path, lambda m: m @ turn if next(count) == 4 else m)  # the camera upright
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "To mend: 004.png: the others agree to" in text and text.count("To mend") <= 2, text
+
+
+def test_lights_in_other_units(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+
+    def tenth(match):
+        return 'position" ' + re.sub(r'"([^"]*)"', lambda v: f'"{float(v[1]) / 10}"', match[1])
+
+    path.write_text(re.sub('position" (x=[^/]*)', tenth, path.read_text()))
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "lights are in other units than cameras: multiply their positions by 10 " in text, text
+
+
+def test_one_exposure_that_is_wrong(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_images(path, lambda image: image // 4, which="007")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and re.search(r"To mend: 007.png: is 0.0\d+ times as bright as the others", text), text
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda image: np.clip(image.astype(int) * 3, 0, 255).astype(np.uint8), "of the object is over-exposed"),
+    (lambda image: np.maximum(image, 70), "the room was not dark"),
+])  # fmt: skip
+def test_exposure_and_background(change, words, broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_images(path, change)
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and words in text, text
+
+
+def test_without_masks(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    status, text = run(path, tmp_path, capsys, "--masks", "none")
+    assert "Masks: found by brightness" in text
+    path.write_text(re.sub(r'<string name="mask"[^>]*>', "", path.read_text()))
+    status, text = run(path, tmp_path, capsys, "--masks", "given")
+    assert status == 0 and "Masks: 0 of 12 photographs" in text
+
+
+def test_mistakes_of_the_user(tmp_path, small_capture, capsys):
+    for arguments, words in (
+        ([tmp_path / "gone.xml"], "gone.xml: no such file"),
+        ([small_capture, "--out", small_capture / "sheet.png"], "--out: cannot be written"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.check", check.main, [str(a) for a in arguments])
+        message = capsys.readouterr().err
+        assert stop.value.code == 2 and message.count("\n") == 1 and words in message

@@ -1,0 +1,90 @@
+"""Domains: near-uniform samplings of any closed surface, and points that wander on it."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+
+from mi_ring.domain import PLACES, closed, load
+from mi_ring.errors import InputError
+
+MAJOR, MINOR = 1.0, 0.35
+
+
+@pytest.fixture(scope="module")
+def torus():
+    """A torus of very uneven triangles."""
+    mesh = trimesh.creation.torus(MAJOR, MINOR, major_sections=150, minor_sections=24)
+    return closed(mesh, center=[0, 0, 0], radius=1.0)[0]
+
+
+def off_torus(points):
+    """Distance of points (N, 3) from the true torus."""
+    ring = np.hypot(points[:, 0], points[:, 1]) - MAJOR
+    return np.abs(np.hypot(ring, points[:, 2]) - MINOR)
+
+
+@pytest.mark.parametrize("level", [3, 4])
+def test_samplings_are_near_uniform_and_of_the_surfaces_genus(torus, level):
+    points, faces = torus.sample(level)
+    mesh = trimesh.Trimesh(points.numpy(), faces, process=False)
+    assert mesh.is_watertight and mesh.euler_number == 0 and mesh.volume > 0
+    assert len(faces) == pytest.approx(20 * 4**level, rel=0.25)
+    lengths = mesh.edges_unique_length
+    assert lengths.std() < 0.2 * lengths.mean()
+    assert off_torus(points.numpy()).max() < 0.01  # the given mesh is that far off
+    assert torus.sample(level)[0] is points
+
+
+def test_points_wander_over_all_of_the_surface_and_faces_stay_faces(torus):
+    random = torch.Generator().manual_seed(1)
+    still, faces = torus.sample(3)
+    normals = trimesh.Trimesh(still.numpy(), faces, process=False).face_normals
+    drawn = [torus.sample(3, random)[0].numpy() for _ in range(2 * PLACES)]
+    for points in drawn:
+        assert off_torus(points).max() < 0.01
+        turned = trimesh.Trimesh(points, faces, process=False).face_normals
+        assert (turned * normals).sum(1).min() > 0.2  # none is folded over
+    assert np.linalg.norm(drawn[0] - drawn[1], axis=1).mean() > 0.1 * np.sqrt(4 * np.pi**2 * MAJOR * MINOR / len(still))
+    surface = trimesh.sample.sample_surface(trimesh.Trimesh(torus.points, torus.faces), 4000, seed=2)[0]
+    at_rest = cKDTree(still.numpy()).query(surface)[0]
+    wandering = cKDTree(np.concatenate(drawn)).query(surface)[0]
+    assert wandering.mean() < 0.5 * at_rest.mean()  # all of the surface is nearer to some vertex than it was
+
+
+def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
+    monkeypatch.setattr("mi_ring.domain.FINEST", 3)
+    torus.levels.pop(4, None)
+    try:
+        assert len(torus.sample(4)[1]) == 4 * len(torus.sample(3)[1])
+    finally:
+        torus.levels.pop(4)
+
+
+def test_a_level_too_coarse_for_the_handles_keeps_them():
+    """A ring as thin as wire: twenty triangles cannot have its shape."""
+    wire = closed(trimesh.creation.torus(1.0, 0.02, major_sections=90, minor_sections=8))[0]
+    points, faces = wire.sample(0)
+    mesh = trimesh.Trimesh(points.numpy(), faces)
+    assert mesh.is_watertight and mesh.euler_number == 0
+
+
+def test_normalisation_and_orientation():
+    mesh = trimesh.creation.torus(3.0, 1.0)
+    mesh.apply_translation([10, 20, 30])
+    mesh.invert()
+    domain, center, radius = closed(mesh)
+    np.testing.assert_allclose(center, [10, 20, 30], atol=1e-6)
+    assert np.linalg.norm(domain.points, axis=1).mean() == pytest.approx(1)
+    assert trimesh.Trimesh(domain.points, domain.faces).volume > 0 and 2.9 < radius < 3.2
+
+
+def test_a_mesh_with_a_hole_is_no_domain(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.update_faces(np.arange(len(ball.faces)) > 5)
+    ball.export(tmp_path / "open.ply")
+    with pytest.raises(InputError, match=r"open.ply: domain: is not a closed surface"):
+        load(tmp_path / "open.ply")
+    with pytest.raises(InputError, match=r"gone.ply: domain: is no mesh"):
+        load(tmp_path / "gone.ply")

@@ -1,0 +1,121 @@
+"""The visual hull against bodies whose silhouettes are known in closed form."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mi_ring.errors import InputError
+from mi_ring.hull import Hull, Silhouette, directions, genus, signed_distance
+
+CENTER = np.array([12.0, -40.0, 7.0])
+W, H, FOCAL, CENTRE = 120, 90, np.array([130.0, 140.0]), np.array([57.0, 48.0])
+
+
+def cameras(count, distance=20.0):
+    """Camera-to-world matrices, Mitsuba's axes, of cameras about CENTER that do not quite look at it."""
+    for R in Rotation.random(count, rng=np.random.default_rng(4)).as_matrix():
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = R, CENTER - distance * R[:, 2] + [0.3, -0.2, 0.1]
+        yield matrix
+
+
+def silhouettes(hit, count=24):
+    """Masks of a body: `hit(origin, directions)` says which rays meet it."""
+    y, x = np.mgrid[:H, :W] + 0.5
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    for k, matrix in enumerate(cameras(count)):
+        mask = hit(matrix[:3, 3], directions(matrix, FOCAL, CENTRE, pixels)).reshape(H, W)
+        yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), matrix, FOCAL, CENTRE, f"mask {k}")
+
+
+def ball(radius, at=CENTER):
+    def hit(origin, rays):
+        to_center = at - origin
+        return np.linalg.norm(np.cross(rays, to_center), axis=1) < radius
+
+    return hit
+
+
+def ring(major, minor):
+    """A torus in the plane x, y, by small steps along the rays."""
+
+    def hit(origin, rays):
+        t = np.linspace(12, 28, 400)
+        p = origin - CENTER + rays[:, None] * t[:, None]
+        return ((np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) < minor).any(1))
+
+    return hit
+
+
+def test_signed_distance_of_a_half_plane():
+    mask = np.zeros((5, 7), np.uint8)
+    mask[:, 3:] = 255
+    np.testing.assert_allclose(signed_distance(mask)[2], [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5, 3.5])
+
+
+def test_depth_in_a_ball_is_that_of_the_ball():
+    hull = Hull(list(silhouettes(ball(4.0))), "scene.xml")
+    np.testing.assert_allclose(hull.center, CENTER, atol=0.1)
+    assert 4 <= hull.reach < 4.5
+    away = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)))
+    radii, center = torch.linspace(0.5, 3.9, 200), torch.tensor(CENTER, dtype=torch.float32)
+    depth = hull.depth(center + radii[:, None] * away)
+    # A pixel is 0.15 wide there; between the views the hull is a little larger than the ball.
+    assert (depth - (4 - radii) > -0.25).all() and (depth - (4 - radii)).mean() < 0.4
+    assert (hull.depth(center + 5 * away) < 0).all()
+
+
+def test_ball_and_surface_have_the_bodys_place_and_volume():
+    hull = Hull(list(silhouettes(ball(4.0))), "scene.xml")
+    center, radius = hull.ball()
+    np.testing.assert_allclose(center, CENTER, atol=0.15)
+    assert 3.95 < radius < 4.3
+    mesh = hull.surface(48)
+    assert mesh.is_watertight and genus(mesh) == 0
+    assert (3 * mesh.volume / (4 * np.pi)) ** (1 / 3) == pytest.approx(radius, rel=0.02)
+    assert np.linalg.norm(mesh.vertices - CENTER, axis=1).min() > 3.7
+
+
+def test_a_ring_stays_open():
+    mesh = Hull(list(silhouettes(ring(3.0, 0.9))), "scene.xml").surface(64)
+    assert mesh.is_watertight and mesh.body_count == 1 and genus(mesh) == 1
+    p = mesh.vertices - CENTER
+    assert np.hypot(np.hypot(p[:, 0], p[:, 1]) - 3.0, p[:, 2]).mean() == pytest.approx(0.95, abs=0.15)
+
+
+def test_one_faulty_mask_among_many_does_no_harm():
+    views = list(silhouettes(ball(4.0), 60))
+    whole = Hull(views, "scene.xml").ball()[1]
+    half = views[7].mask.copy()
+    half[:, : W // 2] = 0
+    views[7] = views[7]._replace(mask=half)
+    assert Hull(views, "scene.xml").ball()[1] == pytest.approx(whole, rel=0.02)
+
+
+def test_only_the_largest_piece_is_the_object():
+    large, small = ball(3.0), ball(0.5, np.add(CENTER, [0, 0, 5]))
+    mesh = Hull(list(silhouettes(lambda *ray: large(*ray) | small(*ray))), "scene.xml").surface(64)
+    assert mesh.body_count == 1 and np.linalg.norm(mesh.centroid - CENTER) < 0.3
+
+
+def test_what_photographs_do_not_show_is_not_cut_off():
+    """A camera so near that the ball is larger than its photograph says nothing of what is beyond the frame."""
+    near = next(cameras(1, distance=6.0))
+    all_of_it = Silhouette(np.full((H, W), 255, np.uint8), near, FOCAL, CENTRE, "near")
+    views = list(silhouettes(ball(4.0)))
+    alone = Hull(views, "scene.xml").ball()[1]
+    assert Hull([*views, all_of_it], "scene.xml").ball()[1] == pytest.approx(alone, rel=0.02)
+
+
+def test_mistakes():
+    views = list(silhouettes(ball(4.0)))
+    with pytest.raises(InputError, match="mask 3: mask: no object in it"):
+        Hull([*views[:3], views[3]._replace(mask=np.zeros_like(views[3].mask))], "scene.xml")
+    with pytest.raises(InputError, match="scene.xml: all cameras look along one line"):
+        Hull(views[:1], "scene.xml")
+    apart = list(silhouettes(ball(2.0)))
+    for view in apart[::2]:
+        view.matrix[:3, 3] += 3
+    with pytest.raises(InputError, match="scene.xml: mask: no point in space is inside all masks"):
+        Hull(apart, "scene.xml").ball()
