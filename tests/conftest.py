@@ -1,5 +1,6 @@
 """Small captures that the tests make themselves, and where the shared data is, if it is there."""
 
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,13 @@ import pytest
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 
 SHARED = Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture(autouse=True)
+def no_scenes_of_other_tests():
+    """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture
