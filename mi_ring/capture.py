@@ -49,15 +49,15 @@ class Capture:
     def __len__(self) -> int:
         return len(self.sensors)
 
-    @property
+    @functools.cached_property
     def names(self) -> list[str]:
         """File names of the photographs, with folders where they would not tell one from another without."""
-        files = [sensor.filename for sensor in self.sensors]
+        files = [Path(os.path.abspath(sensor.filename)) for sensor in self.sensors]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
             return names
-        common = os.path.commonpath([file.absolute().parent for file in files])
-        return [file.absolute().relative_to(common).as_posix() for file in files]
+        common = os.path.commonpath([file.parent for file in files])
+        return [file.relative_to(common).as_posix() for file in files]
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
@@ -245,24 +245,33 @@ def find_masks(capture: Capture) -> None:
 
     Such a mask shows what the light reaches of the object; the rest of the object may be as dark as the room.
     """
-    some = [brightness(capture, k) for k in capture.spread(50)]
-    values = np.concatenate([image[::4, ::4].ravel() for image in some])
-    floor = values[values > 0].min(initial=1.0)
+    some = [small_brightness(capture, k) for k in capture.spread(50)]
+    values = np.concatenate([image.ravel() for image in some])
+    if values.max() <= 0:
+        return
+    floor = values[values > 0].min()
     split = float(np.exp(threshold_otsu(np.log(np.maximum(values, floor)))))
     dark, bright = values[values <= split], values[values > split]
     border = np.concatenate([np.concatenate([i[0], i[-1], i[:, 0], i[:, -1]]) for i in some])
-    if np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
-        return
     # Above the noise of the dark: of what is not near to anything bright.
-    apart = [scipy.ndimage.maximum_filter(image, 1 + 2 * (image.shape[1] // 50)) <= split for image in some]
-    noise = float(np.quantile(np.concatenate([image[a] for image, a in zip(some, apart)]), 0.999))
-    capture.threshold = max(2 * noise, 1e-3 * float(np.median(bright)))
+    apart = [image[scipy.ndimage.maximum_filter(image, 7) <= split] for image in some]
+    if not sum(map(len, apart)) or np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
+        return
+    noise = float(np.quantile(np.concatenate(apart), 0.999))
+    capture.threshold = max(4 * noise, 1e-3 * float(np.median(bright)))
     for k in range(len(capture)):
         seen = brightness(capture, k) > capture.threshold
-        pieces, count = scipy.ndimage.label(seen)
-        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        pieces, _ = scipy.ndimage.label(seen)
+        sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
-        capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+        if sizes.max() > 0:  # else the light did not reach the object
+            capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+
+
+def small_brightness(capture: Capture, k: int) -> np.ndarray:
+    """`brightness` of about 256 × 256 pixels, the means of blocks."""
+    image = torch.from_numpy(brightness(capture, k))[..., None]
+    return shrink(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 
 
 def brightness(capture: Capture, k: int) -> np.ndarray:

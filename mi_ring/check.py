@@ -16,7 +16,7 @@ from mi_ring import capture, command
 from mi_ring.capture import Capture, brightness, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
-from mi_ring.hull import Hull, Silhouette
+from mi_ring.hull import Hull, Silhouette, thinned
 from mi_ring.results import replace
 
 matplotlib.use("Agg")
@@ -112,27 +112,15 @@ AXES = {
 #: Other mistakes: what a silhouette should have been.
 OTHERS = {
     "cx and cy are exchanged": lambda s: s._replace(centre=s.centre[[1, 0]]),
-    "fx and fy are for photographs of half the size: double them": lambda s: s._replace(focal=2 * s.focal),
-    "fx and fy are for photographs of twice the size: halve them": lambda s: s._replace(focal=s.focal / 2),
+    "fx, fy, cx, cy are for photographs of half the size: double them": lambda s: s._replace(
+        focal=2 * s.focal, centre=2 * s.centre
+    ),
+    "fx, fy, cx, cy are for photographs of twice the size: halve them": lambda s: s._replace(
+        focal=s.focal / 2, centre=s.centre / 2
+    ),
     "photographs or masks are upside down": lambda s: s._replace(mask=s.mask[::-1]),
     "photographs or masks are mirrored": lambda s: s._replace(mask=s.mask[:, ::-1]),
 }
-
-
-def small(silhouette: Silhouette, width: int = 96) -> Silhouette:
-    """With so many pixels, at most."""
-    scale = -(-silhouette.mask.shape[1] // width)
-    height, width = (n // scale for n in silhouette.mask.shape)
-    blocks = silhouette.mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
-    return silhouette._replace(
-        mask=blocks.mean((1, 3)).astype(np.uint8), focal=silhouette.focal / scale, centre=silhouette.centre / scale
-    )
-
-
-def thinned(silhouettes: Sequence[Silhouette], most: int = 32) -> list[Silhouette]:
-    """At most so many of them, evenly."""
-    count = min(most, len(silhouettes))
-    return [silhouettes[k * len(silhouettes) // count] for k in range(count)]
 
 
 def agreement(silhouettes: Sequence[Silhouette]) -> float:
@@ -145,7 +133,7 @@ def agreement(silhouettes: Sequence[Silhouette]) -> float:
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
     """The mistake with the cameras that explains why the masks do not agree, and its mend; None if none does."""
-    some = [small(s) for s in thinned(silhouettes)]
+    some = thinned(silhouettes, 32, 96)
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
         for second, axes in AXES.items():
@@ -161,7 +149,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 def half_pixel(silhouettes: Sequence[Silhouette]) -> str | None:
     """Are all principal points off by half a pixel? Then outlines do not quite meet the hull."""
-    gaps, silhouettes = {}, thinned(silhouettes)
+    gaps, silhouettes = {}, thinned(silhouettes, 32, 512)
     for shift in (-0.5, 0.0, 0.5):
         moved = [s._replace(centre=s.centre + shift) for s in silhouettes]
         gaps[shift] = float(np.mean(Hull(moved, "").shortfall(100, 96, outline=True).clip(max=2)))
@@ -177,7 +165,7 @@ def units(scene: Capture, center: np.ndarray) -> str | None:
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
     cameras = np.stack([camera_of(sensor)[0][:3, 3] for sensor in scene.sensors])
     point = lights[:, 3] == 0
-    if not point.any():
+    if not point.any() or np.ptp(cameras, axis=0).max() == 0:
         return None
     away = np.linalg.norm(cameras[point] - center, axis=1)
 
@@ -195,7 +183,9 @@ def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
     """What is to be mended, each in one line."""
     found = []
     agreements = [row.agreement for row in rows if row.agreement is not None]
-    if agreements and np.median(agreements) < CONFORMS:
+    if not scene.whole:
+        pass  # such masks need not agree
+    elif agreements and np.median(agreements) < CONFORMS:
         why = mistake(scene.hull.silhouettes)
         found.append(f"The masks agree to {np.mean(agreements):.0%} only: " + (why or "cameras or masks are wrong"))
     elif agreements:
@@ -204,8 +194,9 @@ def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
             if row.agreement is not None and row.agreement < CONFORMS:
                 found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
     found += filter(None, [units(scene, center)])
-    typical = np.median([row.albedo for row in rows])
-    for row in rows:
+    lit = [row for row in rows if row.angle < 60 and row.albedo > 0]  # not from behind
+    typical = np.median([row.albedo for row in lit]) if lit else 1.0
+    for row in lit:
         if not typical / 4 < row.albedo < 4 * typical:
             times = f"{row.albedo / typical:.2g} times as bright as the others"
             found.append(f"{row.name}: is {times}, for the light it gets: its exposure or its light is wrong")
@@ -222,12 +213,12 @@ def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
     return found
 
 
-def plan(scene: Capture, center: np.ndarray, radius: float, rows: list[Row]) -> Image.Image:
+def plan(scene: Capture, center: np.ndarray, radius: float) -> Image.Image:
     """Cameras (with the way they look), lights and the normalising sphere from above and from two sides."""
     cameras = np.stack([camera_of(sensor)[0] for sensor in scene.sensors])
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
-    away = center + lights[:, :3] * np.where(lights[:, 3:4] > 0, reach, 1) - np.where(lights[:, 3:4] > 0, 0, center)
+    away = np.where(lights[:, 3:4] > 0, center + reach * lights[:, :3], lights[:, :3])
     figure, panels = plt.subplots(1, 3, figsize=(12, 4), dpi=100)
     for panel, (a, b) in zip(panels, ((0, 1), (0, 2), (1, 2))):
         panel.add_patch(plt.Circle(center[[a, b]], radius, color="tab:green", alpha=0.3))
@@ -248,7 +239,7 @@ def plan(scene: Capture, center: np.ndarray, radius: float, rows: list[Row]) -> 
 
 def sheet(scene: Capture, rows: list[Row], center: np.ndarray, radius: float) -> Image.Image:
     """The contact sheet: where everything is; on photographs the visual hull in green and the mask's outline in red."""
-    top = plan(scene, center, radius, rows)
+    top = plan(scene, center, radius)
     try:
         mesh = scene.hull.surface() if scene.hull else None
     except InputError:
@@ -258,10 +249,11 @@ def sheet(scene: Capture, rows: list[Row], center: np.ndarray, radius: float) ->
     columns = max(1, min(top.width // CELL, len(some)))
     page = Image.new("RGB", (max(top.width, columns * CELL), top.height + -(-len(some) // columns) * (CELL + 16)))
     page.paste(top)
+    white = 3 * scene.exposure()
     for place, k in enumerate(some):
         scale = max(1, max(scene.sensors[k].size) // CELL)
         observed, _, mask, masked = scene.observe([k], scale)
-        picture = linear_to_srgb(observed[0].numpy() / max(3 * scene.exposure(), 1e-9))
+        picture = linear_to_srgb(observed[0].numpy() / white)
         if hull:
             seen = hits(hull, scene.photograph(k, scale))[0].reshape(picture.shape[:2])
             picture = 0.7 * picture + 0.3 * seen[..., None] * np.array([0.1, 1.0, 0.2])

@@ -164,6 +164,6 @@ PRESETS = {
         "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
-        "precision": "float32",
+        "precision": "float32", "domain": "sphere", "masks": "given",
     },
 }  # fmt: skip

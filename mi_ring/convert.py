@@ -16,9 +16,8 @@ import tyro
 from tqdm import tqdm
 
 from mi_ring import command
-from mi_ring.capture import read_file
 from mi_ring.errors import InputError
-from mi_ring.formats import FORMATS, Frame, Source, camera_of, image_size
+from mi_ring.formats import FORMATS, Frame, camera_of, image_size, read
 from mi_ring.results import replace
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
@@ -29,7 +28,7 @@ Formats = Union[tuple(Annotated[source, tyro.conf.subcommand(name)] for name, so
 def check(frames: Sequence[Frame], source: Path) -> None:
     """Raise InputError for cameras and lights that are none, and for files of another size than their camera's."""
     if not frames:
-        raise InputError(f"{source}: SRC: no photograph was taken with the light on")
+        raise InputError(f"{source}: SRC: found no photographs")
     for frame in frames:
         what = f"{frame.image}: camera"
         rotation = frame.pose[:3, :3]
@@ -38,7 +37,8 @@ def check(frames: Sequence[Frame], source: Path) -> None:
         if np.linalg.det(rotation) < 0:
             raise InputError(f"{what}: its rotation is left-handed, a mirror; check the order and signs of its axes")
         if not np.isfinite(frame.camera.params).all() or min(focal(frame)) <= 0:
-            raise InputError(f"{what}: focal lengths are {focal(frame)} px; must be above 0")
+            raise InputError(f"{what}: its parameters are {frame.camera.params_to_string()}; must be finite, with "
+                             "focal lengths above 0")  # fmt: skip
         if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
             raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
                              "must be finite and not negative")  # fmt: skip
@@ -55,6 +55,14 @@ def focal(frame: Frame) -> tuple[float, float]:
 def principal_point(frame: Frame) -> tuple[float, float]:
     """[px]"""
     return frame.camera.principal_point_x, frame.camera.principal_point_y
+
+
+def is_straight(frame: Frame) -> bool:
+    """Is the camera a pinhole? Asked of its corners, for a fisheye without coefficients is none."""
+    fx, fy = focal(frame)
+    rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
+    straight = rays[:, :2] * [fx, fy] + principal_point(frame)
+    return np.allclose(frame.camera.img_from_cam(rays), straight, atol=1e-6)
 
 
 @lru_cache(maxsize=1)
@@ -88,6 +96,7 @@ class Writer:
         self.folder = scene.parent if scene.stem == "scene" else scene.with_suffix("")
         self.staging = Path(tempfile.mkdtemp(prefix=f".{scene.stem}.", dir=scene.parent))
         self.files: list[Path] = []
+        self.masks: dict = {}  # where masks are, by file and camera
 
     def write(self, file: str, write) -> Path:
         """Have `write(path)` write a file and return where it is going to be."""
@@ -104,9 +113,13 @@ class Writer:
 
     def relative(self, path: Path) -> str:
         """As the scene names it."""
-        return Path(os.path.relpath(path.resolve(), self.scene.parent.resolve())).as_posix()
+        return Path(os.path.relpath(path, self.scene.parent)).as_posix()
 
     def finish(self, xml: bytes) -> None:
+        """Move everything to its place. Raises InputError if there are other files, which may be the sources."""
+        for file in self.files:
+            if (self.folder / file).exists():
+                raise InputError(f"{self.folder / file}: exists already; give SCENE.xml another name, or remove it")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)
@@ -117,25 +130,27 @@ class Writer:
         shutil.rmtree(self.staging, ignore_errors=True)
 
 
-def place(writer: Writer, frame: Frame, name: str, source: Source) -> tuple[str, str | None]:
+def place(writer: Writer, frame: Frame, name: str, copy: bool) -> tuple[str, str | None]:
     """Where the photograph and the mask of a frame are, as the scene names them; written anew where they must be."""
-    straight = frame.camera.is_undistorted()
-    fill = getattr(source, "fill_holes", False)
+    straight = is_straight(frame)
 
-    def placed(folder: str, path: Path, pixels: np.ndarray | None, filled: bool = False) -> Path:
-        if pixels is None and straight and not filled:
-            if not source.copy:
+    def placed(folder: str, path: Path, pixels: np.ndarray | None, fill: bool = False) -> Path:
+        if pixels is None and straight and not fill:
+            if not copy:
                 return path
             return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
-        pixels = read_file(path) if pixels is None else pixels
-        if filled:
+        pixels = read(path) if pixels is None else pixels
+        if fill:
             pixels = 255 * scipy.ndimage.binary_fill_holes(pixels[..., 0] > 127)[..., None].astype(np.uint8)
         return writer.image(f"{folder}/{name}", pixels if straight else undistort(pixels, frame))
 
     image = placed("images", frame.image, frame.pixels)
     if frame.mask is None or frame.mask == frame.image:
         return writer.relative(image), frame.mask and writer.relative(image)
-    return writer.relative(image), writer.relative(placed("masks", frame.mask, None, fill))
+    key = (frame.mask, frame.camera.params_to_string())  # photographs may share a mask
+    if key not in writer.masks:
+        writer.masks[key] = placed("masks", frame.mask, None, frame.fill_mask)
+    return writer.relative(image), writer.relative(writer.masks[key])
 
 
 def sensor(frame: Frame, name: str, image: str, mask: str | None, encoding: str | None) -> ElementTree.Element:
@@ -183,19 +198,22 @@ def main(arguments: Sequence[str]) -> None:
     frames = list(source.frames())
     check(frames, source.src)
     names = [frame.name or frame.image.stem for frame in frames]
-    if len(set(names)) < len(names):
+    if len({*names, "object"}) <= len(names):
         names = [f"{k:0{len(str(len(frames)))}}_{name}" for k, name in enumerate(names)]
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
     shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
     ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
+    if source.scene.suffix != ".xml" or source.scene.exists():
+        what = "exists already; give another name" if source.scene.exists() else "must end in .xml"
+        raise InputError(f"{source.scene}: SCENE.xml: {what}")
     try:
         source.scene.parent.mkdir(parents=True, exist_ok=True)
         writer = Writer(source.scene)
         try:
             for frame, name in zip(tqdm(frames, unit="photograph", disable=None, leave=False), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
-                root.append(sensor(frame, name, *place(writer, frame, name, source), encoding))
+                root.append(sensor(frame, name, *place(writer, frame, name, source.copy), encoding))
             if truth := getattr(source, "truth", None):
                 writer.write("truth/mesh.ply", lambda file: shutil.copyfile(truth, file))
             ElementTree.indent(root)

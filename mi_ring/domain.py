@@ -30,6 +30,7 @@ def load(path: Path) -> trimesh.Trimesh:
         mesh = trimesh.load(path, force="mesh")
     except Exception as error:
         raise InputError(f"{path}: domain: is no mesh ({' '.join(str(error).split())})") from error
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures split vertices
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise InputError(f"{path}: domain: is not a closed surface")
     return mesh

@@ -192,6 +192,7 @@ def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
     if choice != "sphere" and hull:
         surface = hull.surface()
         if choice == "hull" or genus(surface):
+            print(f"Start: the masks' visual hull, {genus(surface)} handles")
             return closed(surface, shape.center, shape.radius)
     return Sphere(), *scene.sphere()
 

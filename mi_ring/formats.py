@@ -16,9 +16,10 @@ import numpy as np
 import pycolmap
 import scipy.io
 import scipy.linalg
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 from tyro.conf import Positional, arg
 
+from mi_ring.capture import read_file
 from mi_ring.errors import InputError
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
@@ -46,6 +47,7 @@ class Frame:
     encoding: str | None = None  # "srgb" or "linear", if it is not what the type of file implies
     name: str = ""  # in the scene; that of the file, without suffix, if empty
     pixels: np.ndarray | None = None  # of an image that is no file yet, (H, W, 3) float32
+    fill_mask: bool = False  # fill the holes in the mask
 
     @property
     def size(self) -> tuple[int, int]:
@@ -87,10 +89,9 @@ class DiligentMV(Source):
 
     def frames(self) -> Iterator[Frame]:
         calibration = load_mat(self.src / "Calib_Results.mat")
-        folders = sorted(self.src.glob("view_*"))
-        if not folders:
+        numbers = {int(f.name[5:]): f for f in self.src.glob("view_*") if f.name[5:].isdigit()}
+        if not numbers:
             raise InputError(f"{self.src}: SRC: no folders view_01, view_02, …; give the folder of one object")
-        numbers = {int(folder.name[5:]): folder for folder in folders if folder.name[5:].isdigit()}
         K = entry(calibration, "KK", (3, 3), self.src / "Calib_Results.mat")
         for view in chosen(self.views, numbers, "--views", self.src):
             folder = numbers[view]
@@ -109,6 +110,7 @@ class DiligentMV(Source):
                 yield Frame(
                     existing(folder / f"{light:03}.png", "photograph"), camera, pose, mask,
                     Light("directional", -to_light, intensities[light - 1]), name=f"{view:02}_{light:03}",
+                    fill_mask=self.fill_holes,
                 )  # fmt: skip
 
     @property
@@ -144,16 +146,16 @@ class Transforms(Source):
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
             camera = transforms_camera({**top, **own}, image, f"{path}: {where}")
             mask = own.get("mask_path")
-            frame = Frame(image, camera, pose, name=Path(name).stem)
+            frame = Frame(image, camera, pose)
             if mask is not None:
-                frame.mask = existing(path.parent / mask, f"{where}.mask_path")
+                frame.mask = existing(path.parent / str(mask), f"{where}.mask_path")
             elif has_alpha(image):
                 frame.mask = image
             intensity = np.ones(3)
             if own.get("pl_intensity") is not None:
-                values = np.atleast_1d(own["pl_intensity"])
-                intensity = matrix(np.resize(values, 3) if len(values) == 1 else values, (3,),
-                                   f"{path}: {where}.pl_intensity")  # fmt: skip
+                rgb = own["pl_intensity"]
+                rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
+                intensity = matrix(rgb, (3,), f"{path}: {where}.pl_intensity")
                 frame.light = frame.at_camera(intensity)
             if own.get("pl_pos") is not None:
                 position = matrix(own["pl_pos"], (3,), f"{path}: {where}.pl_pos")
@@ -275,11 +277,13 @@ class Iron(Source):
     def frames(self) -> Iterator[Frame]:
         path = first_file([f / "cam_dict_norm.json" for f in (self.src, self.src / "train")], "SRC")
         cameras = load_json(path)
+        if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
+            raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
         for key in sorted(cameras):  # names end in .png, whatever the files' end is
             image = with_suffix((path.parent / "image" / key).with_suffix(""), f"{path}: {key}")
             K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
             to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)
-            size = cameras[key].get("img_size") or image_size(image)
+            size = matrix(cameras[key].get("img_size", image_size(image)), (2,), f"{path}: {key}.img_size")
             pose = inverse(to_camera[:3, :3], to_camera[:3, 3])
             yield Frame(image, pinhole(K, size, 0.0, f"{path}: {key}.K"), pose)
 
@@ -299,6 +303,8 @@ def pinhole(K: np.ndarray, size, shift: float, what: str) -> pycolmap.Camera:
 
 def camera_of(model: str, size, params) -> pycolmap.Camera:
     """One of COLMAP's camera models: https://colmap.github.io/cameras.html"""
+    if not (np.isfinite(size).all() and min(size) >= 1):
+        raise InputError(f"camera: is for photographs of {size[0]} x {size[1]} pixels; must be 1 or more")
     return pycolmap.Camera(model=model, width=int(size[0]), height=int(size[1]), params=[float(p) for p in params])
 
 
@@ -355,8 +361,9 @@ def decompose(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
 
 def exif_exposure(path: Path) -> float | None:
     """Exposure time · ISO / aperture², to which radiance as recorded is proportional; None if EXIF lacks one."""
-    with Image.open(path) as image:
-        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    if path.suffix.lower() == ".exr":
+        return None
+    exif = load(path, "image", read_exif)
     tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
     values = [exif.get(tag) for tag in tags]
     if not all(values):
@@ -365,23 +372,38 @@ def exif_exposure(path: Path) -> float | None:
     return seconds * iso / f_number**2
 
 
+def read_exif(path: Path):
+    """The part of the EXIF data that is about the exposure."""
+    with Image.open(path) as image:
+        return image.getexif().get_ifd(ExifTags.IFD.Exif)
+
+
+def read(path: Path) -> np.ndarray:
+    """Pixels (H, W, C) of an image file. Raises InputError if it cannot be read."""
+    return load(path, "image", read_file)
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) [px] of an image file. Raises InputError if it cannot be read."""
-    try:
+    def size(file):
         if path.suffix.lower() == ".exr":
-            return tuple(mi.Bitmap(str(path)).size())
-        with Image.open(path) as image:
+            return tuple(mi.Bitmap(str(file)).size())
+        with Image.open(file) as image:
             return image.size
-    except (OSError, RuntimeError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: cannot be read as an image ({' '.join(str(error).split())})") from error
+
+    return load(path, "image", size)
 
 
 def has_alpha(path: Path) -> bool:
     """Does an image file have an alpha channel?"""
     if path.suffix.lower() == ".exr":
-        return mi.Bitmap(str(path)).has_alpha()
-    with Image.open(path) as image:
-        return image.has_transparency_data
+        return read(path).shape[2] in (2, 4)
+
+    def alpha(file):
+        with Image.open(file) as image:
+            return image.mode in ("LA", "RGBA")
+
+    return load(path, "image", alpha)
 
 
 def existing(path: Path, field: str) -> Path:
@@ -396,7 +418,7 @@ def first_file(candidates: list[Path], field: str) -> Path:
     for path in candidates:
         if path.is_file():
             return path
-    raise InputError(f"{candidates[0].parent}: {field}: found neither {' nor '.join(p.name for p in candidates)}")
+    raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def with_suffix(path: Path, field: str) -> Path:

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from mi_ring.errors import InputError
 
 SHOWN = 0.25  #: share of the photographs that must show a point, else it is outside
-MOST = 128  #: silhouettes; more add little
+MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
 
 
 class OneLine(InputError):
@@ -30,6 +30,22 @@ class Silhouette(NamedTuple):
     focal: np.ndarray  # (2,) [px]
     centre: np.ndarray  # (2,) [px]
     name: str  # for messages
+
+
+def small(silhouette: Silhouette, width: int) -> Silhouette:
+    """With so many pixels across, at most."""
+    scale = -(-silhouette.mask.shape[1] // width)
+    height, width = (n // scale for n in silhouette.mask.shape)
+    blocks = silhouette.mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
+    return silhouette._replace(
+        mask=blocks.mean((1, 3)).astype(np.uint8), focal=silhouette.focal / scale, centre=silhouette.centre / scale
+    )
+
+
+def thinned(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
+    """At most so many of them, evenly, each with so many pixels across, at most."""
+    count = min(most, len(silhouettes))
+    return [small(silhouettes[k * len(silhouettes) // count], width) for k in range(count)]
 
 
 def directions(matrix, focal, centre, pixels) -> np.ndarray:
@@ -57,9 +73,7 @@ class Hull:
     """
 
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02):
-        self.silhouettes = [silhouettes[k * len(silhouettes) // MOST] for k in range(MOST)]
-        if len(silhouettes) <= MOST:
-            self.silhouettes = list(silhouettes)
+        self.silhouettes = thinned(silhouettes, MOST, WIDTH)
         self.what, self.wrong = what, wrong
         self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
         origins = np.stack([s.matrix[:3, 3] for s in self.silhouettes])
@@ -157,10 +171,7 @@ class Hull:
         self.require(int((field > 0).sum()))
         vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
         mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
-        mesh = max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
-        if mesh.volume < 0:
-            mesh.invert()
-        return mesh
+        return max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

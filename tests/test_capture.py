@@ -176,6 +176,16 @@ def test_no_masks_are_found_in_a_bright_room(broken_capture):
     assert scene.threshold is None and scene.masks == [None] * 12
 
 
+def test_a_photograph_that_the_light_missed_gets_no_mask(broken_capture):
+    path, _ = broken_capture
+    mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(path.parent / "images/004.png"))
+    scene = capture.load(path, masks="none")
+    assert scene.masks[4] is None and sum(mask is not None for mask in scene.masks) == 11
+    for file in path.parent.glob("images/*.png"):
+        mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(file))
+    assert capture.load(path, masks="none").threshold is None
+
+
 def test_specks_are_no_object(broken_capture):
     path, _ = broken_capture
     image = np.array(mi.Bitmap(str(path.parent / "images/004.png")))

@@ -112,6 +112,7 @@ def test_diligent_mv_takes_all_and_fills_holes_if_asked(diligent, tmp_path):
     scene = converted("diligent-mv", diligent, tmp_path / "bear.xml", "--fill-holes")
     assert len(scene) == 12
     assert (scene.masks[5] == disc()[..., 0]).all()
+    assert scene.masks[4] is scene.masks[7] and len(list((tmp_path / "bear/masks").iterdir())) == 3  # one per view
     scene = converted("diligent-mv", diligent, tmp_path / "bear2.xml")
     assert (scene.masks[5] == 0).sum() == (disc() == 0).sum() + 12
 
@@ -225,6 +226,46 @@ def test_distortion_is_undone(tmp_path, model, terms):
         assert scene.masks[0][int(v), int(u)] == 255
     np.testing.assert_allclose(np.ravel(scene.sensors[0].focal), f)
     assert scene.images[0].dtype == np.uint16  # all bits are kept
+
+
+def test_a_fisheye_without_coefficients_is_no_pinhole(tmp_path):
+    top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "camera_model": "OPENCV_FISHEYE"}
+    source = transforms(tmp_path / "data", top, [{"file_path": "a.png"}], lambda k: noise(np.uint8))
+    scene = converted("transforms", source, tmp_path / "lens.xml")
+    assert scene.sensors[0].filename.parts[-3:] == ("lens", "images", "a.png")  # written anew: straightened
+
+
+@pytest.mark.parametrize("scene", ["pot.xml", "pot/scene.xml"])
+def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
+    """The scene is to be where its files get the very names that the source's have."""
+    top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2}
+    source = transforms(tmp_path / "pot", top, [{"file_path": "images/a.png"}], lambda k: noise(np.uint8))
+    before = (source / "images/a.png").read_bytes()
+    with pytest.raises(InputError, match=r"images/a.png: exists already; give SCENE.xml another name"):
+        convert.main(["transforms", str(source), str(tmp_path / scene)])
+    assert (source / "images/a.png").read_bytes() == before
+    assert sorted(p.name for p in source.iterdir()) == ["images", "transforms.json"]
+
+
+def test_a_failure_halfway_leaves_nothing(tmp_path):
+    top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2, "w": W, "h": H}
+    frames = [{"file_path": "a.png"}, {"file_path": "b.png"}]
+    source = transforms(tmp_path / "data", top, frames, lambda k: noise(np.uint8, seed=k))
+    content = (source / "b.png").read_bytes()
+    (source / "b.png").write_bytes(content[: len(content) // 2])  # its header tells the size, its pixels are missing
+    (tmp_path / "out").mkdir()
+    with pytest.raises(InputError, match=r"b.png: cannot be read as image"):
+        convert.main(["transforms", str(source), str(tmp_path / "out/lens.xml")])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_an_existing_scene_is_not_overwritten(tmp_path):
+    source = neus(tmp_path / "dtu")
+    (tmp_path / "dtu.xml").write_text("mine")
+    with pytest.raises(InputError, match=r"dtu.xml: SCENE.xml: exists already"):
+        convert.main(["neus", str(source), str(tmp_path / "dtu.xml")])
+    with pytest.raises(InputError, match=r"out: SCENE.xml: must end in .xml"):
+        convert.main(["neus", str(source), str(tmp_path / "out")])
 
 
 # COLMAP
@@ -352,9 +393,9 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
     case("--views: 9: not in", "diligent-mv", diligent, out, "--views", 9)
     case("--lights: 0: not in", "diligent-mv", diligent, out, "--lights", 0)
     case("Calib_Results.mat: MATLAB file: no such file", "diligent-mv", colmap, out)
-    case("transforms.json nor transforms_train.json", "transforms", colmap, out)
+    case("transforms_train.json", "transforms", colmap, out)
     case("neither images.bin nor images.txt", "colmap", good, out)
-    case("cameras_sphere.npz nor cameras.npz", "neus", colmap, out)
+    case("cameras.npz", "neus", colmap, out)
     case("cam_dict_norm.json", "iron", colmap, out)
     for pattern, arguments in cases:
         with pytest.raises(SystemExit) as stop:
