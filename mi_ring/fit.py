@@ -184,16 +184,19 @@ def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
     if isinstance(choice, tuple):
         return closed(load(choice[1]), shape.center, shape.radius)
     if choice == "auto" and shape.domain:
-        return shape.domain, shape.center, shape.radius
-    hull = scene.whole and scene.hull
-    if choice == "hull" and not hull:
+        return shape.domain
+    try:
+        surface = scene.hull.surface() if choice != "sphere" and scene.whole and scene.hull else None
+    except InputError:
+        if choice == "hull" or shape.center is None or shape.radius is None:
+            raise
+        surface = None  # the masks are of no use, but the scene says where the object is
+    if surface is None and choice == "hull":
         raise InputError(f"{scene.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
-    if choice != "sphere" and hull:
-        surface = hull.surface()
-        if choice == "hull" or genus(surface):
-            print(f"Start: the masks' visual hull, {genus(surface)} handles")
-            return closed(surface, shape.center, shape.radius)
+    if surface is not None and (choice == "hull" or genus(surface)):
+        print(f"Start: the masks' visual hull, with {genus(surface)} handles")
+        return closed(surface, shape.center, shape.radius)
     return Sphere(), *scene.sphere()
 
 

@@ -60,22 +60,23 @@ class ShapeNetMesh(mi.Mesh):
             # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
-        #: What the XML says of normalising sphere and domain, for the fit; None where it says nothing.
+        #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
         self.center = np.array(given["center"]).ravel() if "center" in given else None
         self.radius = given.get("radius")
         if self.radius is not None and not self.radius > 0:
             raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
+        #: The domain that it names, with its own normalising sphere, or None.
         self.domain = None
         if "domain" in given:
-            mesh = load(beside_scene(given["domain"]))
-            self.domain, self.center, self.radius = closed(mesh, self.center, self.radius)
-        center, radius = np.zeros(3) if self.center is None else self.center, self.radius or 1.0
+            self.domain = closed(load(beside_scene(given["domain"])), self.center, self.radius)
+        sphere = Sphere(), np.zeros(3) if self.center is None else self.center, self.radius or 1.0
+        domain, center, radius = self.domain or sphere
         self.ring = Ring.load(beside_scene(given["weights"])) if "weights" in given else None
 
         material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
                     "roughness": torch.tensor(0.5)}  # fmt: skip
         if self.ring is None:
-            s, faces = (self.domain or Sphere()).sample(self.subdivisions)
+            s, faces = domain.sample(self.subdivisions)
             vertices = torch.as_tensor(center, dtype=torch.float32) + radius * s
             material = {name: m.expand(len(s), *m.shape) for name, m in material.items()}
         else:

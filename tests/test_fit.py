@@ -307,6 +307,29 @@ def test_auto_takes_the_hull_only_where_it_has_handles(small_capture, monkeypatc
     assert type(fit.start(scene, "sphere")[0]) is Sphere
 
 
+def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(broken_capture):
+    path, _ = broken_capture
+    mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/004.png"))
+    with pytest.raises(InputError, match="no object in it"):
+        fit.start(capture.load(path), "auto")
+    bsdf = '<bsdf type="cooktorrance"/>'
+    place = '<point name="center" x="400" y="-150" z="90"/><float name="radius" value="30"/>'
+    path.write_text(path.read_text().replace(bsdf, bsdf + place))
+    domain, center, radius = fit.start(capture.load(path), "auto")
+    assert type(domain) is Sphere and center.tolist() == CENTER.tolist() and radius == 30
+    with pytest.raises(InputError, match="no object in it"):
+        fit.start(capture.load(path), "hull")
+
+
+def test_a_domain_of_the_scene_does_not_normalise_another(broken_capture):
+    path, _ = broken_capture
+    torus_domain(path)
+    scene = capture.load(path)
+    assert fit.start(scene, "auto")[0] is scene.shape.domain[0]
+    domain, _, radius = fit.start(scene, "sphere")
+    assert type(domain) is Sphere and radius == pytest.approx(scene.sphere()[1]) != scene.shape.domain[2]
+
+
 def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     no_masks(path)

@@ -156,7 +156,7 @@ def test_domain_file_keeps_its_place_and_its_genus(torus):
     assert mesh.is_watertight and mesh.euler_number == 0
     assert mesh.volume == pytest.approx(original.volume, rel=0.05)
     np.testing.assert_allclose(mesh.bounds, original.bounds, atol=0.15)
-    assert np.linalg.norm(shape.domain.points, axis=1).max() == pytest.approx(1, abs=1e-5)  # 3 + 1 over a radius of 4
+    assert np.linalg.norm(shape.domain[0].points, axis=1).max() == pytest.approx(1, abs=1e-5)  # (3 + 1) / 4
 
 
 def test_domain_file_that_is_inside_out_is_turned(torus):
