@@ -18,7 +18,7 @@ from tqdm import tqdm
 from mi_ring import mesh, photograph
 from mi_ring.edges import Edges
 from mi_ring.errors import InputError
-from mi_ring.hull import Hull, OneLine, Silhouette, nearest_point
+from mi_ring.hull import Hull, OneLine, Silhouette, evenly, nearest_point
 from mi_ring.integrator import Photographs, check_attributes
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
@@ -61,8 +61,7 @@ class Capture:
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
-        count = min(most, len(self))
-        return [k * len(self) // count for k in range(count)]
+        return evenly(len(self), most)
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
         """Photograph `k` alone, to be rendered `scale` times smaller."""

@@ -16,7 +16,7 @@ from mi_ring import capture, command
 from mi_ring.capture import Capture, brightness, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
-from mi_ring.hull import Hull, Silhouette, thinned
+from mi_ring.hull import Hull, NoHull, Silhouette, thinned
 from mi_ring.results import replace
 
 matplotlib.use("Agg")
@@ -296,9 +296,7 @@ def main(arguments: Sequence[str]) -> int:
     scene = capture.load(config.scene, masks=config.masks)
     try:
         center, radius = scene.sphere()
-    except InputError as error:
-        if "inside all masks" not in str(error):
-            raise
+    except NoHull:
         center, radius = capture.sphere_of_cameras(scene)
     rows = measure(scene, center, radius)
     found = findings(scene, rows, center)

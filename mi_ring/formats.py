@@ -385,6 +385,7 @@ def read(path: Path) -> np.ndarray:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) [px] of an image file. Raises InputError if it cannot be read."""
+
     def size(file):
         if path.suffix.lower() == ".exr":
             return tuple(mi.Bitmap(str(file)).size())
@@ -483,8 +484,12 @@ def load_mat(path: Path) -> dict:
 
 def load_npz(path: Path):
     """A dictionary of arrays, or the one array of a .npy file."""
-    content = load(path, "NumPy file", np.load)
-    return content if isinstance(content, np.ndarray) else load(path, "NumPy file", lambda _: dict(content))
+
+    def arrays(file):
+        content = np.load(file)
+        return content if isinstance(content, np.ndarray) else dict(content)
+
+    return load(path, "NumPy file", arrays)
 
 
 def load_json(path: Path):

@@ -22,6 +22,10 @@ class OneLine(InputError):
     """All cameras look along one line: they do not say how far the object is."""
 
 
+class NoHull(InputError):
+    """No point in space is inside all masks."""
+
+
 class Silhouette(NamedTuple):
     """A mask and its camera."""
 
@@ -42,10 +46,15 @@ def small(silhouette: Silhouette, width: int) -> Silhouette:
     )
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of at most `most` of so many things, evenly spread."""
+    taken = min(most, count)
+    return [k * count // taken for k in range(taken)]
+
+
 def thinned(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
     """At most so many of them, evenly, each with so many pixels across, at most."""
-    count = min(most, len(silhouettes))
-    return [small(silhouettes[k * len(silhouettes) // count], width) for k in range(count)]
+    return [small(silhouettes[k], width) for k in evenly(len(silhouettes), most)]
 
 
 def directions(matrix, focal, centre, pixels) -> np.ndarray:
@@ -138,10 +147,10 @@ class Hull:
         return torch.cartesian_prod(*axes), tuple(map(len, axes))
 
     def require(self, inside: int) -> None:
-        """Raise InputError if no point was found inside."""
+        """Raise NoHull if no point was found inside."""
         if not inside:
-            raise InputError(f"{self.what}: mask: no point in space is inside all masks; "
-                             "check to_world, fx, fy, cx, cy")  # fmt: skip
+            raise NoHull(f"{self.what}: mask: no point in space is inside all masks; "
+                         "check to_world, fx, fy, cx, cy")  # fmt: skip
 
     def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
         """The hull's centre of mass (3,) and the radius of the ball of its volume [scene units]."""
