@@ -1,12 +1,13 @@
 """Fit captures with known truth and print, as Markdown with machine and date, how near they come and what it costs.
 
-    python benchmarks/accuracy.py SCENE.xml [MORE.xml …] [--seeds 0 1 2] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
+    python benchmarks/accuracy.py CAPTURE [MORE …] [--seeds 0 1 2] [--out out/accuracy] [OPTIONS OF mi_ring.fit]
 
-For each scene, and seed, the curve of the normals' mean error against fit time, then a table of the paper's columns and
-one of where the time went; the worst of several seeds, column by column, is a line of its own. The truth of SCENE.xml
-is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/, or where --truth says. Each fit is a process of its
-own. Fit time is the iterations' alone; wall time and peak memory are the whole process's, start-up and report included;
-the time of the evaluations for the curve is taken off, their memory is not.
+A capture is a scene file or a folder with a scene.xml. For each, and seed, the curve of the normals' mean error against
+fit time, then a table of the paper's columns and one of where the time went; the worst of several seeds, column by
+column, is a line of its own. The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/,
+or where --truth says. Each fit is a process of its own. Fit time is the iterations' alone; wall time and peak memory
+are the whole process's, start-up and report included; the time of the evaluations for the curve is taken off, their
+memory is not. GFLOP/s is the speed of float32 products of 4096³ right after the fit: what the machine could do then.
 """
 
 import argparse
@@ -19,15 +20,21 @@ import multiprocessing
 import os
 import platform
 import resource
+import statistics
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 COLUMNS = ("normal_mean", "normal_median", "depth_mean", "depth_median", "iou", "psnr_input", "psnr_novel")
-HIGHER_IS_BETTER = ("iou", "psnr_input", "psnr_novel")
-COSTS = ("fit s", "wall s", "GiB, at most")
+HIGHER_IS_BETTER = ("iou", "psnr_input", "psnr_novel", "GFLOP/s")
+COSTS = ("fit s", "wall s", "GiB, at most", "GFLOP/s")
 POINTS = 8  #: of the curve
+
+
+def scene_file(path: str) -> Path:
+    """The scene file that is meant, where a capture's folder is given, too."""
+    return Path(path) / "scene.xml" if Path(path).is_dir() else Path(path)
 
 
 def truth_of(scene: Path) -> Path:
@@ -82,6 +89,21 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB → GiB
 
 
+def product_speed(rows: int, width: int, dtype) -> float:
+    """FLOP/s of (rows, width) @ (width, width): the median of some repeats, after one to warm up."""
+    import torch  # here, for the reason given in watch()
+
+    a, b = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
+    times = max(1, 2**33 // (rows * width * width))
+    seconds = []
+    for _ in range(8):
+        before = time.perf_counter()
+        for _ in range(times):
+            torch.mm(a, b)
+        seconds.append(time.perf_counter() - before)
+    return times * 2 * rows * width * width / statistics.median(seconds[1:])
+
+
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """Run `mi_ring.fit` in this process and look on: the curve, seconds by part, wall seconds, memory [GiB]."""
     started = time.perf_counter()
@@ -123,7 +145,8 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
         fit.main(arguments)
     wall = time.perf_counter() - started - apart
-    return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": peak_memory()}
+    memory, speed = peak_memory(), product_speed(4096, 4096, torch.float32)
+    return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": memory, "speed": speed}
 
 
 def alone(function, *arguments):
@@ -149,14 +172,14 @@ def table(heads, rows) -> str:
 
 def cells(values) -> list[str]:
     """Of one line of the table: COLUMNS, then COSTS."""
-    formats = ["{:.4f}" if c == "iou" else "{:.2f}" for c in COLUMNS] + ["{:.0f}", "{:.0f}", "{:.1f}"]
+    formats = ["{:.4f}" if c == "iou" else "{:.2f}" for c in COLUMNS] + ["{:.0f}", "{:.0f}", "{:.1f}", "{:.0f}"]
     return [f.format(v) for f, v in zip(formats, values)]
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("scenes", nargs="+", type=scene_file, help="scene files, or folders with a scene.xml")
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--truth", type=Path, help="folder of mesh.ply and scene.xml, of a single scene")
@@ -176,7 +199,8 @@ def main() -> None:
             print(table([f"{label}, fit time s", *(f"{s:.0f}" for s in seconds)],
                         [["normals, mean error °", *(f"{e:.2f}" for e in errors)]]), flush=True)  # fmt: skip
             print()
-            rows.append([*(row[c] for c in COLUMNS), row["fit_seconds"], row["wall"], row["memory"]])
+            costs = row["fit_seconds"], row["wall"], row["memory"], row["speed"] / 1e9
+            rows.append([*(row[c] for c in COLUMNS), *costs])
             results.append([label, *cells(rows[-1])])
             print(f"{label}: {', '.join(results[-1][1:])}", file=sys.stderr)  # lest a failure later lose it
             rest = row["fit_seconds"] - sum(row["parts"].values())

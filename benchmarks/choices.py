@@ -1,6 +1,6 @@
 """Fit captures with one setting changed at a time and print, as Markdown with machine and date, what that does.
 
-    python benchmarks/choices.py SCENE.xml [MORE.xml …] [--out out/choices] [OPTIONS OF mi_ring.fit]
+    python benchmarks/choices.py CAPTURE [MORE …] [--out out/choices] [OPTIONS OF mi_ring.fit]
 
 All fits have the same number of iterations, so that a setting which makes them cheaper shows in the seconds. Give
 `--preset fast` for an answer in an hour. The truth is found as in accuracy.py.
@@ -11,7 +11,7 @@ import datetime
 import sys
 from pathlib import Path
 
-from accuracy import measure, processor, table, truth_of
+from accuracy import measure, processor, scene_file, table, truth_of
 
 from mi_ring.command import name_of
 
@@ -26,7 +26,7 @@ CHOICES = [
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("scenes", nargs="+", type=scene_file)
     parser.add_argument("--out", type=Path, default=Path("out/choices"))
     arguments, options = parser.parse_known_args()
     truths = [truth_of(scene) for scene in arguments.scenes]

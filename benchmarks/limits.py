@@ -13,7 +13,7 @@ import statistics
 import time
 from pathlib import Path
 
-from accuracy import processor, table
+from accuracy import processor, product_speed, table
 
 from mi_ring import bridge, capture, fit, integrator
 
@@ -37,13 +37,6 @@ def seconds(*functions) -> list[float]:
             function()
             results.append(time.perf_counter() - before)
     return [statistics.median(results[1:]) for results in times]
-
-
-def product_speed(rows: int, width: int, dtype) -> float:
-    """FLOP/s of (rows, width) @ (width, width)."""
-    a, b = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
-    times = max(1, 2**33 // (rows * width * width))
-    return times * 2 * rows * width * width / seconds(lambda: [torch.mm(a, b) for _ in range(times)])[0]
 
 
 def flow_speed(s, steps: int, dtype) -> tuple[float, float]:
