@@ -283,7 +283,10 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the XML file of a scene")
     try:
+        path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)
+    except UnicodeError as error:
+        raise InputError(f"{path}: is not UTF-8 at byte {error.start} ({error.reason}); convert it") from error
     except RuntimeError as error:
         raise InputError(f"{path}: {reason(error)}") from error
     sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
@@ -334,6 +337,9 @@ def read_file(path: Path) -> np.ndarray:
 def read_image(sensor, scene: Path) -> np.ndarray:
     """Encoded pixels (H, W, 3) of a photograph; one without colours is grey, and what is transparent is black."""
     pixels = read_pixels(sensor.filename, "filename", sensor, scene)
+    if sensor.encoding == "linear" and pixels.dtype == np.uint8:
+        raise InputError(f'{scene}: photograph "{sensor.id()}", encoding: is linear, but {sensor.filename.name} has 8 '
+                         "bits, as sRGB has; leave it out, or give 16 bits or EXR if it is linear indeed")  # fmt: skip
     channels = pixels.shape[2]
     rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
     if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files have the product already

@@ -17,7 +17,7 @@ from mi_ring.capture import Capture, brightness, camera_of, linear_to_srgb, to_b
 from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
 from mi_ring.hull import Hull, NoHull, Silhouette, thinned
-from mi_ring.results import replace
+from mi_ring.results import replace, writing
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -301,13 +301,11 @@ def main(arguments: Sequence[str]) -> int:
     rows = measure(scene, center, radius)
     found = findings(scene, rows, center)
     page = sheet(scene, rows, center, radius)
-    try:
+    with writing(f"{out}: --out"):
         out.parent.mkdir(parents=True, exist_ok=True)
-        buffer = io.BytesIO()
-        page.save(buffer, "PNG")
-        replace(out, buffer.getvalue())
-    except OSError as error:
-        raise InputError(f"{out}: --out: cannot be written ({error.strerror}); choose another file") from error
+    buffer = io.BytesIO()
+    page.save(buffer, "PNG")
+    replace(out, buffer.getvalue())
     print(table(rows))
     given = sum(mask is not None for mask in scene.masks)
     if scene.threshold is not None:

@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,10 @@ COMMANDS = ("convert", "check", "fit", "render", "evaluate", "validate")
 
 def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP):
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood."""
+    for word in (*arguments, os.getcwd()):  # a file's name may be any bytes
+        shown = os.fsencode(word).decode(errors="replace")
+        if shown != word:
+            raise InputError(f"{shown}: this name is not UTF-8, which Mitsuba and XML need; rename it")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):

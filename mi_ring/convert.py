@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Union
 
-import mitsuba as mi
 import numpy as np
 import scipy.ndimage
 import tyro
@@ -18,7 +17,7 @@ from tqdm import tqdm
 from mi_ring import command
 from mi_ring.errors import InputError
 from mi_ring.formats import FORMATS, Frame, camera_of, image_size, read
-from mi_ring.results import replace
+from mi_ring.results import replace, write_image
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
 
@@ -109,7 +108,7 @@ class Writer:
     def image(self, file: str, pixels: np.ndarray) -> Path:
         """Write an image: PNG if it has integers, else EXR."""
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
-        return self.write(file + suffix, lambda path: mi.Bitmap(np.ascontiguousarray(pixels)).write(str(path)))
+        return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> str:
         """As the scene names it."""
@@ -130,9 +129,16 @@ class Writer:
         shutil.rmtree(self.staging, ignore_errors=True)
 
 
-def place(writer: Writer, frame: Frame, name: str, copy: bool) -> tuple[str, str | None]:
+def place(writer: Writer, frame: Frame, name: str, copy: bool, encoding: str | None) -> tuple[str, str | None]:
     """Where the photograph and the mask of a frame are, as the scene names them; written anew where they must be."""
     straight = is_straight(frame)
+
+    def photograph() -> np.ndarray | None:
+        """Its pixels, if they are no file that will do: photographs of 8 bits are sRGB."""
+        if frame.pixels is not None or encoding != "linear":
+            return frame.pixels
+        pixels = read(frame.image)
+        return pixels * np.uint16(257) if pixels.dtype == np.uint8 else None
 
     def placed(folder: str, path: Path, pixels: np.ndarray | None, fill: bool = False) -> Path:
         if pixels is None and straight and not fill:
@@ -144,7 +150,7 @@ def place(writer: Writer, frame: Frame, name: str, copy: bool) -> tuple[str, str
             pixels = 255 * scipy.ndimage.binary_fill_holes(pixels[..., 0] > 127)[..., None].astype(np.uint8)
         return writer.image(f"{folder}/{name}", pixels if straight else undistort(pixels, frame))
 
-    image = placed("images", frame.image, frame.pixels)
+    image = placed("images", frame.image, photograph())
     if frame.mask is None or frame.mask == frame.image:
         return writer.relative(image), frame.mask and writer.relative(image)
     key = (frame.mask, frame.camera.params_to_string())  # photographs may share a mask
@@ -213,7 +219,7 @@ def main(arguments: Sequence[str]) -> None:
         try:
             for frame, name in zip(tqdm(frames, unit="photograph", disable=None, leave=False), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
-                root.append(sensor(frame, name, *place(writer, frame, name, source.copy), encoding))
+                root.append(sensor(frame, name, *place(writer, frame, name, source.copy, encoding), encoding))
             if truth := getattr(source, "truth", None):
                 writer.write("truth/mesh.ply", lambda file: shutil.copyfile(truth, file))
             ElementTree.indent(root)

@@ -60,6 +60,17 @@ class Domain:
         points, faces = self.levels[level]
         return (points if random is None else self.move(level, points, random)), faces
 
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (N, 3) are inside, (N,) bool."""
+        vertices, faces = self.sample(4)
+        inside = np.linalg.norm(points, axis=1) < np.linalg.norm(vertices, axis=1).max()
+        if inside.any():
+            from gpytoolbox import fast_winding_number  # here, for it takes a second
+
+            winding = fast_winding_number(points[inside], vertices.numpy().astype(float), faces.astype(np.int32))
+            inside[inside] = winding > 0.5
+        return inside
+
     def triangulate(self, level: int):
         """The surface in about 20 · 4^level triangles."""
         if level > FINEST:

@@ -5,7 +5,6 @@ import contextlib
 import ctypes
 import dataclasses
 import hashlib
-import json
 import math
 import os
 import signal
@@ -42,6 +41,7 @@ class Fit:
         self.random = torch.Generator().manual_seed(config.seed)
         torch.manual_seed(config.seed)
         domain, center, radius = start(scene, config.domain)
+        check_place(scene, domain, center, radius)
         self.exposure = scene.exposure()
         parameters, bsdf = reflectance.predicted(scene.path, scene.shape, config.parameters)
         scale = scene.reflectance(center, self.exposure)
@@ -200,6 +200,25 @@ def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
     return Sphere(), *scene.sphere()
 
 
+def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
+    """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
+    cameras = np.array(scene.photographs.cameras).reshape(-1, 3, 4)
+    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    ahead = ((center - cameras[:, :, 3]) * cameras[:, :, 2]).sum(1)
+    if (ahead < 0).any():
+        raise InputError(f'{scene.path}: photograph "{scene.sensors[int(ahead.argmin())].id()}", to_world: its camera '
+                         "looks away from the object; python -m mi_ring.check may tell why")  # fmt: skip
+    places = {"to_world: its camera": cameras[:, :, 3],
+              "emitter: its light": np.where(lights[:, 3:4] > 0, np.inf, lights[:, :3])}  # fmt: skip
+    for what, points in places.items():
+        if (inside := domain.contains((points - center) / radius)).any():
+            sensor = scene.sensors[int(inside.argmax())]
+            raise InputError(
+                f'{scene.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, of '
+                f"radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
+            )
+
+
 def digest(file: Path) -> str:
     """What tells one scene file from another."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
@@ -296,7 +315,8 @@ def train(fit: Fit, folder: Path, interrupted) -> None:
         total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
-    with bar, results.open_log(folder, fit.iteration) as log:
+    results.start_log(folder, fit.iteration)
+    with bar:
         while fit.iteration < fit.config.iterations and not interrupted():
             terms = fit.step()
             stage = fit.stages.index(fit.stage) + 1
@@ -308,8 +328,7 @@ def train(fit: Fit, folder: Path, interrupted) -> None:
                 entry = {"iteration": fit.iteration, "seconds": round(fit.seconds, 3), **terms,
                          "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": stage,
                          "vertices": vertices[fit.stage.level]}  # fmt: skip
-                log.write(json.dumps(entry) + "\n")
-                log.flush()
+                results.log(folder, entry)
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 results.save(fit.state(), folder / "checkpoint.pt")
                 saved = time.monotonic()

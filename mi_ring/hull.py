@@ -19,7 +19,7 @@ MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
 
 
 class OneLine(InputError):
-    """All cameras look along one line: they do not say how far the object is."""
+    """All cameras are in one place or look along one line: they do not say how far the object is."""
 
 
 class NoHull(InputError):
@@ -68,9 +68,9 @@ def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.
     """The point (3,) closest in the least-squares sense to lines (n, 3) + t (n, 3)."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
-    if np.linalg.cond(matrix) > 1e6:
-        raise OneLine(f"{what}: all cameras look along one line, so the object's place is unknown; "
-                      "give center and radius of the shapenet shape")  # fmt: skip
+    if np.linalg.cond(matrix) > 1e6 or not np.ptp(origins, axis=0).any():
+        raise OneLine(f"{what}: to_world: all cameras are in one place or look along one line, so the object's place "
+                      "is unknown; give center and radius of the shapenet shape")  # fmt: skip
     return np.linalg.solve(matrix, right)
 
 

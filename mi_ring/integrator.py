@@ -252,6 +252,8 @@ def light_of(sensor):
     strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
     if not (dr.all(dr.isfinite(strength) & (strength >= 0)) and dr.any(strength > 0)):
         raise ValueError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
+    if not dr.all(dr.isfinite(where)):
+        raise ValueError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
     return [*where, mi.Float(not finite), *strength, mi.Float(0)]
 
 

@@ -63,8 +63,10 @@ class ShapeNetMesh(mi.Mesh):
         #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
         self.center = np.array(given["center"]).ravel() if "center" in given else None
         self.radius = given.get("radius")
-        if self.radius is not None and not self.radius > 0:
+        if self.radius is not None and not 0 < self.radius < np.inf:
             raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
+        if self.center is not None and not np.isfinite(self.center).all():
+            raise ValueError(f'shapenet "{props.id()}": center is {self.center}, must be finite')
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain = None
         if "domain" in given:

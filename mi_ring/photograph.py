@@ -100,12 +100,17 @@ class Photograph(mi.Sensor):
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = float(props.get("saturation", 1.0))
+        if not self.saturation > 0:
+            raise ValueError(f'photograph "{props.id()}": saturation is {self.saturation}, must be positive')
 
         width, height = (int(s) for s in self.film().size())
         for name in ("fx", "fy"):
             if isinstance(props[name], str) or not 0 < props[name] < np.inf:
                 raise ValueError(f'photograph "{props.id()}": {name} is {props[name]}, must be a length in pixels')
         self.focal = mi.Point2f(props["fx"], props["fy"])
+        for name in ("cx", "cy"):
+            if isinstance(value := props.get(name, 0.0), str) or not np.isfinite(value):
+                raise ValueError(f'photograph "{props.id()}": {name} is {value}, must be a place in pixels')
         self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
         rotation = matrix[:3, :3]

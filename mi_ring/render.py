@@ -1,11 +1,9 @@
 """Photographs of a fitted object: `python -m mi_ring.render RUN SCENE.xml OUT/`."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional
@@ -13,7 +11,7 @@ from tyro.conf import Positional
 from mi_ring import bridge, capture, command
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
-from mi_ring.results import load_ring
+from mi_ring.results import load_ring, write_image, writing
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,9 @@ def main(arguments: Sequence[str]) -> None:
             raise InputError(f"{config.scene}: filename: {sensor.filename.name} must end in .png, .jpg or .exr")
         if (config.out / name).resolve() == sensor.filename.resolve():
             raise InputError(f"{config.out}: holds the scene's own photographs; choose another folder")
-    try:
+    with writing(config.out):
         for name in names:
             (config.out / name).parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{config.out}: cannot be written ({error.strerror}); choose another folder") from error
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(config.subdivisions))
     for k, name in enumerate(tqdm(names, desc="rendering", unit="photograph")):
@@ -66,13 +62,8 @@ def main(arguments: Sequence[str]) -> None:
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
     """Write (H, W, 3) linear radiance: EXR as it is, anything else 8-bit sRGB."""
-    if path.suffix.lower() == ".exr":
-        bitmap = mi.Bitmap(linear.astype(np.float32))
-    else:
-        bitmap = mi.Bitmap(to_bytes(linear_to_srgb(linear)))
-    partial = path.with_name(f".partial.{path.name}")
-    bitmap.write(str(partial))
-    os.replace(partial, path)
+    exr = path.suffix.lower() == ".exr"
+    write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 
 
 if __name__ == "__main__":

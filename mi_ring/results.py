@@ -1,5 +1,6 @@
 """The results of a fit: everything that is written into its folder."""
 
+import contextlib
 import io
 import json
 import os
@@ -19,11 +20,33 @@ from mi_ring.reflectance import bsdf_element
 from mi_ring.ring import Ring
 
 
+@contextlib.contextmanager
+def writing(what: Path | str):
+    """Turns what the system has against writing a file, a full disk for instance, into an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{what}: cannot be written ({error.strerror}); make room or choose another place") from error
+
+
 def replace(path: Path, content: bytes | str) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file so that it is there whole or not at all. Raises InputError if it cannot be written."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(partial, path)
+    with writing(path):
+        try:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def write_image(pixels: np.ndarray, path: Path) -> None:
+    """An image (H, W, C) as PNG, JPEG or EXR, by the file's name, whole or not at all."""
+    formats = mi.Bitmap.FileFormat
+    kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
+    replace(path, stream.raw_buffer())
 
 
 def save(state: dict, path: Path) -> None:
@@ -41,23 +64,27 @@ def prepare(folder: Path, config: Config) -> None:
     folder = folder.resolve()
     if folder in config.scene.resolve().parents:
         raise InputError(f"{folder}: --out: holds the scene file {config.scene.name} itself; choose another folder")
-    try:
+    with writing(f"{folder}: --out"):
         if not config.resume and any((folder / name).exists() for name in ("ring.pt", "checkpoint.pt")):
             aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
             folder.rename(aside)
             print(f"The results that were in {folder}/ are now in {aside}/")
         folder.mkdir(parents=True, exist_ok=True)
-        replace(folder / "config.json", config.to_json())
-    except OSError as error:
-        raise InputError(f"{folder}: --out: cannot be written ({error.strerror}); choose another folder") from error
+    replace(folder / "config.json", config.to_json())
 
 
-def open_log(folder: Path, iteration: int):
-    """log.jsonl, open for more lines, without those after `iteration`: they will be written again."""
+def start_log(folder: Path, iteration: int) -> None:
+    """Make log.jsonl, or take those entries out that are after `iteration`: they will be written again."""
+    entries = read_log(folder) if iteration and (folder / "log.jsonl").exists() else []
+    text = "".join(json.dumps(entry) + "\n" for entry in entries if entry["iteration"] <= iteration)
+    replace(folder / "log.jsonl", text)
+
+
+def log(folder: Path, entry: dict) -> None:
+    """One more line of log.jsonl."""
     path = folder / "log.jsonl"
-    entries = read_log(folder) if iteration and path.exists() else []
-    replace(path, "".join(json.dumps(entry) + "\n" for entry in entries if entry["iteration"] <= iteration))
-    return path.open("a")
+    with writing(path), path.open("a") as file:
+        file.write(json.dumps(entry) + "\n")
 
 
 def read_log(folder: Path) -> list[dict]:
@@ -103,9 +130,9 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
 def write_mesh(weights: Path, subdivisions: int, path: Path) -> None:
     """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …)."""
     mesh = mi.load_dict({"type": "shapenet", "weights": str(weights.resolve()), "subdivisions": subdivisions})
-    partial = path.with_name(f".{path.name}.partial.ply")
-    mesh.write_ply(str(partial))
-    os.replace(partial, path)
+    stream = mi.MemoryStream()
+    mesh.write_ply(stream)
+    replace(path, stream.raw_buffer())
 
 
 def scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:

@@ -21,7 +21,7 @@ from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, pixel_rays, render_photographs
 from mi_ring.mesh import ShapeNetMesh
-from mi_ring.results import replace
+from mi_ring.results import replace, writing
 
 BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
 BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
@@ -368,10 +368,8 @@ def main(arguments: Sequence[str]) -> int:
     out = config.out or out
     scene, sensors = open_scene(path)
     chosen = choose(sensors, config.photographs)
-    try:
+    with writing(f"{out}: --out"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: --out: cannot be written ({error.strerror}); choose another folder") from error
 
     photographs, spp = Photographs.of(sensors), -(-config.spp // BATCHES)
     names = [sensor.filename.name for sensor in sensors]

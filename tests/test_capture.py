@@ -1,6 +1,5 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
-import re
 import shutil
 
 import mitsuba as mi
@@ -234,82 +233,3 @@ def test_exposure_and_reflectance_follow_the_lamp(small_capture):
     assert exposure == pytest.approx(inside.mean().item(), rel=1e-5)
     # The lamp gives 2.2 at the centre, so a surface there that looks `exposure` bright reflects exposure / 2.2.
     assert scene.reflectance(CENTER, exposure) == pytest.approx(exposure / 2.2, rel=1e-4)
-
-
-def rename(path, edit):
-    (path.parent / "images/004.png").rename(path.parent / "images/x.png")
-
-
-def wrong_mask(path, edit):
-    mi.Bitmap(np.zeros((40, 55, 1), np.uint8)).write(str(path.parent / "masks/005.png"))
-
-
-def wrong_film(path, edit):
-    edit('name="width" value="56"', 'name="width" value="57"')
-
-
-def no_photographs(path, edit):
-    text = path.read_text()
-    path.write_text(text[: text.index("<sensor")] + "</scene>")
-
-
-def black(path, edit):
-    for k in range(12):
-        mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(path.parent / f"images/{k:03}.png"))
-
-
-def empty_mask(path, edit):
-    mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/005.png"))
-
-
-def spot(path, edit):
-    path.write_text(re.sub(r"<emitter.*?</emitter>", '<emitter type="spot"/>', path.read_text(), count=1))
-
-
-def dark(path, edit):
-    path.write_text(re.sub(r'(<rgb name="intensity" value=")[^"]*', r"\g<1>0", path.read_text(), count=1))
-
-
-def wire(path, edit):
-    (path.parent / "wire.txt").write_text("".join(f"{x} 0 0 0.1\n" for x in range(5)))
-    curve = '<shape type="bsplinecurve" id="wire"><string name="filename" value="wire.txt"/></shape>'
-    edit('<shape type="shapenet"', curve + '<shape type="shapenet"')
-
-
-BROKEN = {
-    "missing image": (rename, ["images/004.png", 'photograph "004"', "filename"]),
-    "truncated image": (lambda path, edit: (path.parent / "images/004.png").write_bytes(b"\x89PNG"), ["004.png"]),
-    "mask of another size": (wrong_mask, ["005.png", "mask", "55 x 40", "56 x 40"]),
-    "film of another size": (wrong_film, ["000.png", "filename", "56 x 40", "57 x 40"]),
-    "no photographs": (no_photographs, ["small.xml", "sensor"]),
-    "no shapenet": (lambda path, edit: edit('type="shapenet"', 'type="sphere"'), ["small.xml", "shapenet"]),
-    "unknown property": (lambda path, edit: edit('name="fx"', 'name="fxx"'), ["small.xml", "fx"]),
-    "unknown plugin": (lambda path, edit: edit('type="photograph"', 'type="fotograph"'), ["small.xml", "fotograph"]),
-    "no XML": (lambda path, edit: path.write_text("<scene version='3.0.0'><shape"), ["small.xml"]),
-    "no file": (lambda path, edit: path.unlink(), ["small.xml", "no such file"]),
-    "scaled pose": (lambda path, edit: edit('name="to_world"', 'name="to_world">'
-                    '<scale value="2"/></transform><transform name="other"'), ["small.xml", "to_world", "scale"]),
-    "spot light": (spot, ['"000"', "SpotLight", "directional"]),
-    "light switched off": (dark, ['"000"', "light", "positive"]),
-    "no focal length": (lambda path, edit: edit('<float name="fx" value="60.0"/>', ""), ['"000"', "fx is missing"]),
-    "wrong attribute": (lambda path, edit: edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance">'
-                        '<texture type="mesh_attribute" name="diffuse"><string name="name" value="vertex_color"/>'
-                        '</texture></bsdf>'), ["small.xml", "vertex_color"]),
-    "zero focal length": (lambda path, edit: edit('name="fy" value="66.0"', 'name="fy" value="0"'), ["000", "fy is 0"]),
-    "black photographs": (black, ["small.xml", "black"]),
-    "shape without gradients": (wire, ["small.xml", '"wire"', "BSplineCurve", "meshes"]),
-    "empty mask": (empty_mask, ["005.png", "mask"]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_capture_gives_one_line_that_names_what_is_wrong(case, broken_capture):
-    path, edit = broken_capture
-    breaking, words = BROKEN[case]
-    breaking(path, edit)
-    with pytest.raises(InputError) as error:
-        scene = capture.load(path)
-        scene.sphere()
-        scene.exposure()
-    message = str(error.value)
-    assert "\n" not in message and all(word in message for word in words), message
