@@ -294,12 +294,16 @@ def main(arguments: Sequence[str]) -> int:
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.name_of(config.scene)}.png"
     scene = capture.load(config.scene, masks=config.masks)
+    empty = [k for k, mask in enumerate(scene.masks) if mask is not None and not (mask > 127).any()]
+    for k in empty:
+        scene.masks[k] = None
     try:
         center, radius = scene.sphere()
     except NoHull:
         center, radius = capture.sphere_of_cameras(scene)
     rows = measure(scene, center, radius)
-    found = findings(scene, rows, center)
+    found = [f"{rows[k].name}: its mask is empty: nothing in it is above 127" for k in empty]
+    found += findings(scene, rows, center)
     page = sheet(scene, rows, center, radius)
     with writing(f"{out}: --out"):
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -68,6 +68,48 @@ def test_exchanged_principal_point(broken_capture, tmp_path, capsys):
     assert status == 1 and "cx and cy are exchanged" in text, text
 
 
+def test_principal_points_off_by_half_a_pixel(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    path.write_text(path.read_text().replace('"cx" value="30.5"', '"cx" value="30"').replace('"18.0"', '"17.5"'))
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "half a pixel: add 0.5 to cx and cy" in text, text
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda image: image[::-1], "upside down"), (lambda image: image[:, ::-1], "mirrored"),
+])  # fmt: skip
+def test_flipped_photographs(change, words, broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    for folder in ("images", "masks"):
+        edit_images(path, change, folder)
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and f"photographs or masks are {words}" in text, text
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.5, "half the size: double"), (2, "twice the size: halve")])
+def test_intrinsics_of_another_size(factor, words, broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    path.write_text(re.sub(r'name="([fc][xy])" value="(\S+)"',
+                           lambda m: f'name="{m[1]}" value="{factor * float(m[2])}"', path.read_text()))  # fmt: skip
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and words in text, text
+
+
+def test_an_empty_mask_is_named_and_the_rest_is_looked_at(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_images(path, np.zeros_like, "masks", "005")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and text.count("To mend") == 1 and "To mend: 005.png: its mask is empty" in text, text
+
+
+def test_few_photographs(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    text = path.read_text()
+    path.write_text(text[: text.index('  <sensor type="photograph" id="005"')] + "</scene>")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "5 photographs are few" in text, text
+
+
 def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     count = iter(range(100))
@@ -109,7 +151,7 @@ def test_exposure_and_background(change, words, broken_capture, tmp_path, capsys
 def test_without_masks(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     status, text = run(path, tmp_path, capsys, "--masks", "none")
-    assert "Masks: found by brightness" in text
+    assert status == 0 and "Masks: found by brightness" in text
     path.write_text(re.sub(r'<string name="mask"[^>]*>', "", path.read_text()))
     status, text = run(path, tmp_path, capsys, "--masks", "given")
     assert status == 0 and "Masks: 0 of 12 photographs" in text
