@@ -122,7 +122,7 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
             before = dict(seconds)
             terms = super().step()
             parts.update({part: seconds[part] - before[part] for part in seconds})
-            if self.iteration * points // self.config.iterations > len(curve):
+            if self.iteration * points // self.iterations > len(curve):
                 paused = time.perf_counter()
                 curve.append((self.seconds, self.error()))
                 apart += time.perf_counter() - paused

@@ -227,9 +227,12 @@ def load(path: str | Path, images: bool = True, masks: str = "given") -> Capture
         reading = tqdm(sensors if images else [], desc="reading", unit="photograph", leave=False, disable=None)
         pixels = [read_image(s, path) for s in reading]
         linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
-        files = {(s.mask, s.size, s.mask == s.filename): s for s in sensors if images}  # photographs may share a mask
-        read = {key: read_mask(s, path) for key, s in files.items() if masks != "none"}
-        given = [read.get((s.mask, s.size, s.mask == s.filename)) for s in sensors] if images else []
+        given = []
+        if images:
+            of_each = [(s.mask, s.size, s.mask == s.filename) for s in sensors]  # photographs may share a mask
+            once = dict(zip(of_each, sensors)) if masks != "none" else {}
+            read = {key: read_mask(s, path) for key, s in once.items()}
+            given = [read.get(key) for key in of_each]
         shadows = getattr(scene.integrator(), "shadows", True)
         capture = Capture(path, scene, shapes[0], sensors, pixels, linear, given, shadows)
     except ValueError as error:

@@ -12,6 +12,9 @@ from tyro.conf import Positional
 from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
+HEAD_START = 2 / 3  #: share of the first stage that starts near the object do without
+EXCHANGE = 0.6  #: iterations of the second stage for one of the first, which take as long
+
 
 class Stage(NamedTuple):
     """One stage of coarse to fine."""
@@ -43,13 +46,14 @@ class Config:
     seed: int = 0
     """Of every random choice."""
     iterations: int = 500
-    """In all, shared out among the stages."""
+    """In all, shared out among the stages. From a hull or a mesh it is some fewer, see `shares`."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
     widths: tuple[int, ...] = (128, 256, 512)
     """Width of the photographs in each stage, at most [px]."""
     shares: tuple[float, ...] = (0.45, 0.43, 0.12)
-    """Share of the iterations of each stage."""
+    """Share of the iterations of each stage. A hull or a mesh is near the object already: from there two thirds of the
+    first stage are exchanged for iterations of the second, which take as long."""
     batch: int = 8
     """Photographs per iteration."""
     steps: int = 8
@@ -127,10 +131,14 @@ class Config:
         """Where the results go."""
         return self.out or Path("out") / self.name
 
-    def stages(self) -> list[Stage]:
-        """Those stages that get at least one iteration, in order."""
+    def stages(self, near: bool = False) -> list[Stage]:
+        """Those stages that get at least one iteration, in order, from a start that is `near` the object or far."""
+        shares = list(self.shares)
+        if near and len(shares) > 1:
+            shares[1] += EXCHANGE * HEAD_START * shares[0]
+            shares[0] -= HEAD_START * shares[0]
         total, done, first, stages = sum(self.shares), 0.0, 0, []
-        for level, width, share in zip(self.levels, self.widths, self.shares):
+        for level, width, share in zip(self.levels, self.widths, shares):
             done += share
             last = round(self.iterations * done / total)
             stages.append(Stage(level, width, first, last))

@@ -13,6 +13,7 @@ from mi_ring.errors import InputError
 
 FINEST = 6  #: level up to which domains are remeshed; beyond it triangles are cut in four
 PLACES = 16  #: for each vertex to be at
+MOST_SAMPLES = 2**22  #: of the surface, among which they are found: at levels 7 and 8 some vertices have fewer places
 
 
 def closed(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> tuple["Domain", np.ndarray, float]:
@@ -24,13 +25,19 @@ def closed(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> t
     return Domain((mesh.vertices - center) / radius, mesh.faces), center, radius
 
 
+def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
+    """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:
+        raise InputError(f"{path}: {field}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices
+    return mesh
+
+
 def load(path: Path) -> trimesh.Trimesh:
     """A closed mesh from a file. Raises InputError if it is none."""
-    try:
-        mesh = trimesh.load(path, force="mesh")
-    except Exception as error:
-        raise InputError(f"{path}: domain: is no mesh ({' '.join(str(error).split())})") from error
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures split vertices
+    mesh = read_mesh(path, "domain")
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise InputError(f"{path}: domain: is not a closed surface")
     return mesh
@@ -100,7 +107,8 @@ class Domain:
         points, faces = self.sample(level)
         coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
         fine = trimesh.Trimesh(self.points, self.faces, process=False)
-        dense, triangle = trimesh.sample.sample_surface(fine, 4 * PLACES * len(points), seed=level)
+        samples = min(4 * PLACES * len(points), MOST_SAMPLES)
+        dense, triangle = trimesh.sample.sample_surface(fine, samples, seed=level)
         longest = coarse.edges_unique_length[coarse.faces_unique_edges].max(1)
         height = 2 * coarse.area_faces / longest
         reach = np.full(len(points), np.inf)

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 
 from mi_ring import bridge, capture, command
 from mi_ring.capture import linear_to_srgb, to_bytes
+from mi_ring.domain import read_mesh
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, center_rays
 from mi_ring.results import load_ring
@@ -34,11 +35,7 @@ class EvaluateConfig:
 
 def load_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
     """A mesh file and the scene that holds it alone, with smooth normals. Raises InputError if it cannot be read."""
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams split vertices; shading normals are per position
+    mesh = read_mesh(path, "mesh")
     return mesh, scene_of(mesh.vertices, mesh.faces)
 
 

@@ -57,7 +57,8 @@ class Fit:
         self.ring.to(self.device)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)
         self.optimizers = optimizers(self.ring, config)
-        self.stages = config.stages()
+        self.stages = config.stages(near=not isinstance(domain, Sphere))
+        self.iterations = self.stages[-1].last
         self.autocast = autocast(config.precision, self.device)
         self.iteration, self.seconds, self.stage = 0, 0.0, None
         self.failures = 0  # losses or gradients in a row that were not finite
@@ -89,7 +90,7 @@ class Fit:
         config = self.config
         started = time.perf_counter()
         self.enter_stage()
-        progress = self.iteration / config.iterations
+        progress = self.iteration / self.iterations
         s, _ = self.ring.domain.sample(self.stage.level, self.random)
         s = s.to(self.device)
         vertices, material = self.deform(s)
@@ -317,14 +318,14 @@ def train(fit: Fit, folder: Path, interrupted) -> None:
     )  # fmt: skip
     results.start_log(folder, fit.iteration)
     with bar:
-        while fit.iteration < fit.config.iterations and not interrupted():
+        while fit.iteration < fit.iterations and not interrupted():
             terms = fit.step()
             stage = fit.stages.index(fit.stage) + 1
-            where = f"stage {stage}/{len(fit.stages)}, iteration {fit.iteration}/{fit.config.iterations}"
+            where = f"stage {stage}/{len(fit.stages)}, iteration {fit.iteration}/{fit.iterations}"
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {terms['loss']:.4f}", refresh=False)
             bar.update(work[fit.iteration - 1])
-            if fit.iteration % LOG_EVERY == 0 or fit.iteration == fit.config.iterations:
+            if fit.iteration % LOG_EVERY == 0 or fit.iteration == fit.iterations:
                 entry = {"iteration": fit.iteration, "seconds": round(fit.seconds, 3), **terms,
                          "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": stage,
                          "vertices": vertices[fit.stage.level]}  # fmt: skip
@@ -363,8 +364,8 @@ def main(arguments: Sequence[str]) -> int:
             results.write(folder, fit, fitted_scene)
             raise
         results.write(folder, fit, fitted_scene)
-    if fit.iteration < config.iterations:
-        print(f"Stopped at iteration {fit.iteration} of {config.iterations}; go on with the same command and --resume")
+    if fit.iteration < fit.iterations:
+        print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
         return 130
     return 0
 

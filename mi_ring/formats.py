@@ -70,7 +70,8 @@ class Source:
     copy: bool = False
     """Copy the photographs beside the scene file instead of referring to where they are."""
     encoding: Literal["auto", "srgb", "linear"] = "auto"
-    """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear."""
+    """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
+    are written anew with 16."""
 
 
 @dataclass(frozen=True)

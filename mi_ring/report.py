@@ -45,7 +45,7 @@ def html(fit, log: list[dict]) -> str:
                                              if len(rows) < len(capture) else ""),
         "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels)",
         "Silhouettes": f"{np.mean(masked):.4f} intersection over union with the masks" if masked else "no masks given",
-        "Iterations": f"{fit.iteration} of {fit.config.iterations}",
+        "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
@@ -105,7 +105,7 @@ def loss_curve(log: list[dict], fit) -> str:
     for term in ("loss", *fit.config.weights):
         points = []
         for entry in log:
-            done = (entry["iteration"] - 1) / fit.config.iterations  # before the iteration that the entry is about
+            done = (entry["iteration"] - 1) / fit.iterations  # before the iteration that the entry is about
             weights = {"loss": 1.0} | fit.config.weights_at(done)
             points.append((entry["iteration"], weights[term] * entry.get(term, 0)))
         points = [(iteration, value) for iteration, value in points if value > 0]

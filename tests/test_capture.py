@@ -106,11 +106,13 @@ def test_a_shape_needs_no_id(broken_capture):
 def test_declared_encoding_beats_the_default(broken_capture):
     path, edit = broken_capture
     edit('<string name="filename" value="images/001.png"/>',
-         '<string name="filename" value="images/001.png"/><string name="encoding" value="linear"/>')  # fmt: skip
+         '<string name="filename" value="images/001.png"/><string name="encoding" value="srgb"/>')  # fmt: skip
+    pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
+    for k in (1, 2):
+        mi.Bitmap(pixels).write(str(path.parent / f"images/{k:03}.png"))
     scene = capture.load(path)
-    for k, convert in ((0, capture.srgb_to_linear), (1, np.float32)):
-        encoded = np.array(mi.Bitmap(str(path.parent / f"images/{k:03}.png"))) / 255.0
-        np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(encoded), atol=1e-6)
+    for k, convert in ((1, capture.srgb_to_linear), (2, np.float32)):
+        np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(pixels / 65535.0), atol=1e-6)
 
 
 def test_shrinking_averages_blocks(small_capture):

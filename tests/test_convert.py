@@ -179,7 +179,8 @@ def test_transforms_of_nerfstudio(tmp_path):
         np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
     assert (scene.masks[1] == disc()[..., 0]).all()
     np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
-    assert not (tmp_path / "studio").exists()
+    assert not (tmp_path / "studio/masks").exists()
+    assert scene.images[0].dtype == np.uint16  # linear data of 8 bits is written anew, with more of them
 
 
 #: Kannala–Brandt and Brown–Conrady: where rays (x, y, 1) go, written out from OpenCV's documentation.

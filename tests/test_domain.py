@@ -86,5 +86,5 @@ def test_a_mesh_with_a_hole_is_no_domain(tmp_path):
     ball.export(tmp_path / "open.ply")
     with pytest.raises(InputError, match=r"open.ply: domain: is not a closed surface"):
         load(tmp_path / "open.ply")
-    with pytest.raises(InputError, match=r"gone.ply: domain: is no mesh"):
+    with pytest.raises(InputError, match=r"gone.ply: domain: cannot be read as a mesh"):
         load(tmp_path / "gone.ply")

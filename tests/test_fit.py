@@ -275,6 +275,7 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
         return fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), *options]))
 
     before = fresh()
+    assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.84
     for _ in range(3):
         before.step()
     results.save(before.state(), tmp_path / "checkpoint.pt")
@@ -455,6 +456,14 @@ def test_presets_are_valid_and_can_be_overridden(preset):
     assert all(a.last == b.first for a, b in zip(stages, stages[1:]))
     for name, value in PRESETS[preset].items():
         assert getattr(config, name) == value
+
+
+def test_starts_near_the_object_spend_less_on_the_coarse_stage():
+    config = Config("scene.xml", iterations=100, shares=(0.5, 0.3, 0.2))
+    assert [s.last - s.first for s in config.stages()] == [50, 30, 20]
+    assert [s.last - s.first for s in config.stages(near=True)] == [17, 50, 20]  # 50/3, 30 + 0.6 · 2/3 · 50
+    config = Config("scene.xml", iterations=100, levels=(4,), widths=(128,), shares=(1,))
+    assert [s.last for s in config.stages(near=True)] == [100]
 
 
 def test_paper_preset_is_the_papers():
