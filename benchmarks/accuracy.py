@@ -4,8 +4,8 @@
 
 A capture is a scene file or a folder with a scene.xml. For each, and seed, the curve of the normals' mean error against
 fit time, then a table of the paper's columns and one of where the time went; the worst of several seeds, column by
-column, is a line of its own. The truth of SCENE.xml is in truth/{mesh.ply,scene.xml} beside it, in <scene name>/truth/,
-or where --truth says. Each fit is a process of its own. Fit time is the iterations' alone; wall time and peak memory
+column, is a line of its own. The truth of SCENE.xml is in truth/mesh.ply, and in truth/scene.xml for novel views, beside
+it, in <scene name>/truth/, or where --truth says. Each fit is a process of its own. Fit time is the iterations' alone; wall time and peak memory
 are the whole process's, start-up and report included; the time of the evaluations for the curve is taken off, their
 memory is not. GFLOP/s is the speed of float32 products of 4096³ right after the fit: what the machine could do then.
 """
@@ -16,6 +16,7 @@ import contextlib
 import datetime
 import functools
 import json
+import math
 import multiprocessing
 import os
 import platform
@@ -158,11 +159,12 @@ def alone(function, *arguments):
 def measure(scene: Path, out: Path, options: list[str], truth: Path, points: int = 0) -> dict:
     """Fit one scene in a new process and evaluate it."""
     watched = alone(watched_fit, [str(scene), "--out", str(out), *options], truth, points)
-    evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply"),
-                "--novel", str(truth / "scene.xml")]  # fmt: skip
+    evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply")]
+    if (novel := truth / "scene.xml").is_file():
+        evaluate += ["--novel", str(novel)]
     numbers = json.loads(subprocess.run(evaluate, check=True, capture_output=True, text=True).stdout)
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return numbers | watched | {"fit_seconds": log[-1]["seconds"]}
+    return {"psnr_novel": math.nan} | numbers | watched | {"fit_seconds": log[-1]["seconds"]}
 
 
 def table(heads, rows) -> str:
