@@ -4,10 +4,11 @@
 
 A capture is a scene file or a folder with a scene.xml. For each, and seed, the curve of the normals' mean error against
 fit time, then a table of the paper's columns and one of where the time went; the worst of several seeds, column by
-column, is a line of its own. The truth of SCENE.xml is in truth/mesh.ply, and in truth/scene.xml for novel views, beside
-it, in <scene name>/truth/, or where --truth says. Each fit is a process of its own. Fit time is the iterations' alone; wall time and peak memory
-are the whole process's, start-up and report included; the time of the evaluations for the curve is taken off, their
-memory is not. GFLOP/s is the speed of float32 products of 4096³ right after the fit: what the machine could do then.
+column, is a line of its own. The truth of SCENE.xml is in truth/mesh.ply beside it, and that of novel views in
+truth/scene.xml, or both in <scene name>/truth/ or where --truth says. Each fit is a process of its own. Fit time is the
+iterations' alone; wall time and peak memory are the whole process's, start-up and report included; the time of the
+evaluations for the curve is taken off, their memory is not. GFLOP/s is the speed of float32 products of 4096³ right
+after the fit: what the machine could do then.
 """
 
 import argparse
