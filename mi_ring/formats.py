@@ -257,14 +257,15 @@ class Neus(Source):
             if masks and not frame.mask:
                 raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
             if energies:
-                energy = np.resize(cameras.get(f"light_energy_{k}", 0.0), 3).astype(float)
+                energy = np.resize(cameras.get(f"light_energy_{k}", 0.0), 3)
+                energy = matrix(energy, (3,), f"{path}: light_energy_{k}")
                 if not energy.any():
                     continue
                 unit = entry(cameras, f"scale_mat_{k}", (4, 4), path)[0, 0]  # energies are for the object's unit sphere
                 frame.light = frame.at_camera(energy * unit**2)
                 frame.encoding = "linear"
                 if "max_intensity" in cameras:
-                    frame.saturation = float(cameras["max_intensity"])
+                    frame.saturation = float(entry(cameras, "max_intensity", (), path))
             yield frame
 
 
@@ -296,6 +297,8 @@ FORMATS = {
 
 def pinhole(K: np.ndarray, size, shift: float, what: str) -> pycolmap.Camera:
     """Of a calibration matrix; `shift` [px] is what its principal point lacks to have pixels' centres at 0.5."""
+    if not K[2, 2]:
+        raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
     K = K / K[2, 2]
     if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
         raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here")
@@ -350,7 +353,7 @@ def inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 def decompose(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Calibration matrix (3, 3) and camera-to-world (4, 4) of a projection matrix K [R | t], up to scale (3, 4)."""
-    if abs(np.linalg.det(P[:, :3])) < 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
+    if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])
     signs = np.sign(np.diag(K))
@@ -455,9 +458,10 @@ def matrix(values, shape: tuple[int, ...], what: str) -> np.ndarray:
         array = np.array(values, float)
     except (TypeError, ValueError):
         array = np.array(np.nan)
-    if array.shape != shape:
+    if array.shape != shape or (array.ndim == 0 and np.isnan(array)):
         shown = "missing" if values is None else f"of shape {array.shape}" if array.size > 1 else values
-        raise InputError(f"{what}: is {shown}; must be {' x '.join(map(str, shape))} numbers")
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        raise InputError(f"{what}: is {shown}; must be {wanted}")
     if not np.isfinite(array).all():
         raise InputError(f"{what}: has NaN or infinite numbers")
     return array

@@ -365,15 +365,20 @@ def test_wildlight_photographs_in_one_array(tmp_path):
 # IRON
 
 
-def test_iron(tmp_path):
-    folder, dictionary = tmp_path / "dragon/train", {}
+def iron(folder, edit=lambda dictionary: None):
+    dictionary = {}
     for k, (R, t) in enumerate(cameras()):
         K4, W2C = np.eye(4), np.eye(4)
         K4[:3, :3], W2C[:3, :3], W2C[:3, 3] = K, R, t
         dictionary[f"{k}.png"] = {"K": K4.ravel().tolist(), "W2C": W2C.ravel().tolist(), "img_size": [W, H]}
-        write(folder / f"image/{k}.exr", noise(np.uint8, seed=k).astype(np.float32))
-    (folder / "cam_dict_norm.json").write_text(json.dumps(dictionary))
-    scene = converted("iron", folder.parent, tmp_path / "iron.xml")
+        write(folder / f"train/image/{k}.exr", noise(np.uint8, seed=k).astype(np.float32))
+    edit(dictionary)
+    (folder / "train/cam_dict_norm.json").write_text(json.dumps(dictionary))
+    return folder
+
+
+def test_iron(tmp_path):
+    scene = converted("iron", iron(tmp_path / "dragon"), tmp_path / "iron.xml")
     for sensor, (R, t) in zip(scene.sensors, cameras()):
         np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
     np.testing.assert_allclose(scene.observe([1])[0][0], noise(np.uint8, seed=1), rtol=1e-3)
@@ -433,6 +438,59 @@ def test_mistakes_in_transforms(tmp_path, edit, pattern):
     with pytest.raises(InputError, match=pattern) as error:
         convert.main(["transforms", str(source), str(tmp_path / "out/scene.xml")])
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+
+def refused(arguments, pattern, out):
+    with pytest.raises(InputError, match=pattern) as error:
+        convert.main([*map(str, arguments), str(out)])
+    assert "\n" not in str(error.value) and not out.parent.exists()
+
+
+@pytest.mark.parametrize(("more", "pattern"), [
+    ({"world_mat_1": np.full((4, 4), np.nan)}, "world_mat_1.*NaN"),
+    ({"world_mat_1": np.eye(3)}, r"world_mat_1: is of shape \(3, 3\); must be 4 x 4"),
+    ({"world_mat_1": np.zeros((4, 4))}, "world_mat_1: .*singular"),
+    ({"world_mat_1": np.array("none")}, "world_mat_1"),
+    ({"light_energy_0": [-1.0, 1, 1]}, "light.*not negative"),
+    ({"light_energy_0": ["a", "b", "c"]}, "light_energy_0: is .*must be 3 numbers"),
+    ({"light_energy_0": [1.0, 1, 1], "max_intensity": np.array("much")}, "max_intensity: is much; must be a number"),
+])  # fmt: skip
+def test_mistakes_in_cameras_sphere(tmp_path, more, pattern):
+    source = neus(tmp_path / "dtu")
+    with np.load(source / "cameras_sphere.npz") as arrays:
+        np.savez(source / "cameras_sphere.npz", **{**arrays, **more})
+    refused(["neus", source], pattern, tmp_path / "out/scene.xml")
+
+
+def test_wrong_counts_of_photographs_and_masks(tmp_path):
+    source, out = neus(tmp_path / "dtu"), tmp_path / "out/scene.xml"
+    (source / "mask/001.png").rename(source / "mask/aside")
+    refused(["neus", source], "no mask for photograph 1", out)
+    (source / "mask/aside").rename(source / "mask/001.png")
+    for k in (3, 4):
+        write(source / f"image/{k:03}.png", noise(np.uint8))
+    refused(["neus", source], "world_mat: there are 3, but 5 photographs", out)
+    for file in (source / "image").iterdir():
+        file.unlink()
+    refused(["neus", source], "image: no photographs in this folder", out)
+    np.save(source / "images.npy", np.zeros((2, H, W, 3), np.float32))
+    refused(["neus", source], r"images.npy: is of shape \(2, .* must be \(3, H, W, 3\)", out)
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda d: d["1.png"]["K"].pop(), r"1.png.K: is of shape \(15,\); must be 16"),
+    (lambda d: d["1.png"].pop("W2C"), "1.png.W2C: is missing"),
+    (lambda d: d["1.png"]["W2C"].__setitem__(0, "x"), "1.png.W2C"),
+    (lambda d: d["1.png"]["W2C"].__setitem__(3, float("inf")), "1.png"),
+    (lambda d: d["1.png"].update(img_size=[9, 9]), "1.exr: photograph: is 62 x 52 pixels, its camera 9 x 9"),
+    (lambda d: d["1.png"].update(img_size="large"), "1.png.img_size"),
+    (lambda d: d["1.png"].update(K=[0] * 16), "1.png.K"),
+    (lambda d: d.update({"7.png": d["1.png"]}), "7.png: no such file"),
+    (lambda d: d.update({"1.png": 3}), "must be an object"),
+    (lambda d: d.clear(), "no photographs"),
+])  # fmt: skip
+def test_mistakes_in_cam_dict(tmp_path, edit, pattern):
+    refused(["iron", iron(tmp_path / "dragon", edit)], pattern, tmp_path / "out/scene.xml")
 
 
 def test_truncated_files(diligent, colmap, tmp_path):
