@@ -13,7 +13,7 @@ from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
 HEAD_START = 2 / 3  #: share of the first stage that starts near the object do without
-EXCHANGE = 0.6  #: iterations of the second stage for one of the first, which take as long
+EXCHANGE = 0.5  #: iterations of the second stage that take as long as one of the first
 
 
 class Stage(NamedTuple):

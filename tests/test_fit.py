@@ -275,7 +275,7 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
         return fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), *options]))
 
     before = fresh()
-    assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.84
+    assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.6
     for _ in range(3):
         before.step()
     results.save(before.state(), tmp_path / "checkpoint.pt")
@@ -461,7 +461,7 @@ def test_presets_are_valid_and_can_be_overridden(preset):
 def test_starts_near_the_object_spend_less_on_the_coarse_stage():
     config = Config("scene.xml", iterations=100, shares=(0.5, 0.3, 0.2))
     assert [s.last - s.first for s in config.stages()] == [50, 30, 20]
-    assert [s.last - s.first for s in config.stages(near=True)] == [17, 50, 20]  # 50/3, 30 + 0.6 · 2/3 · 50
+    assert [s.last - s.first for s in config.stages(near=True)] == [17, 46, 20]  # 16.7, and 30 + 0.5 · 33.3
     config = Config("scene.xml", iterations=100, levels=(4,), widths=(128,), shares=(1,))
     assert [s.last for s in config.stages(near=True)] == [100]
 
