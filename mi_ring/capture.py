@@ -18,7 +18,7 @@ from tqdm import tqdm
 from mi_ring import mesh, photograph
 from mi_ring.edges import Edges
 from mi_ring.errors import InputError
-from mi_ring.hull import Hull, OneLine, Silhouette, evenly, nearest_point
+from mi_ring.hull import Hull, NoParallax, Silhouette, evenly, nearest_point
 from mi_ring.integrator import Photographs, check_attributes
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
@@ -118,17 +118,21 @@ class Capture:
         distance2 = np.where(lights[:, 3] > 0, 1.0, ((lights[:, :3] - center) ** 2).sum(1))
         return float(exposure / np.median(lights[:, 4:7].mean(1) / distance2))
 
-    @functools.cached_property
-    def hull(self) -> Hull | None:
-        """The visual hull of the masks, if there are any and they are seen from more than one side."""
-        once = {}  # one photograph for all that share camera and mask
+    def silhouettes(self) -> list[Silhouette]:
+        """The masks with their cameras, one for all photographs that share both."""
+        once = {}
         for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
             if mask is not None:
                 once.setdefault((id(mask), camera_of(sensor)[0].tobytes()), k)
-        silhouettes = [Silhouette(self.masks[k], *camera_of(self.sensors[k]), self.outline(k)) for k in once.values()]
+        return [Silhouette(self.masks[k], *camera_of(self.sensors[k]), self.outline(k)) for k in once.values()]
+
+    @functools.cached_property
+    def hull(self) -> Hull | None:
+        """The visual hull of the masks, if there are any and they are seen from more than one side."""
+        silhouettes = self.silhouettes()
         try:
             return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
-        except OneLine:
+        except NoParallax:
             return None
 
     @property
@@ -261,13 +265,17 @@ def find_masks(capture: Capture) -> None:
         return
     noise = float(np.quantile(np.concatenate(apart), 0.999))
     capture.threshold = max(4 * noise, 1e-3 * float(np.median(bright)))
+    largest = []
     for k in range(len(capture)):
         seen = brightness(capture, k) > capture.threshold
         pieces, _ = scipy.ndimage.label(seen)
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
-        if sizes.max() > 0:  # else the light did not reach the object
-            capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+        capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+        largest.append(sizes.max() / seen.size)
+    for k, share in enumerate(largest):
+        if share <= 0.02 * np.median(largest):  # a few hot pixels: the light did not reach the object
+            capture.masks[k] = None
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:

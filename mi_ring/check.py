@@ -13,10 +13,10 @@ from scipy import ndimage
 from tyro.conf import Positional
 
 from mi_ring import capture, command
-from mi_ring.capture import Capture, brightness, camera_of, linear_to_srgb, to_bytes
+from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
-from mi_ring.hull import Hull, NoHull, Silhouette, thinned
+from mi_ring.hull import WIDTH, Hull, NoHull, Silhouette, shrink, small, thinned
 from mi_ring.results import replace, writing
 
 matplotlib.use("Agg")
@@ -53,7 +53,7 @@ class Row:
     clipped: float  # share of the object that is clipped
     dark: float  # share of the object that is black, or nearly
     background: float | None  # brightness of what is not object, in that of the object
-    albedo: float  # brightness of the object, for the light it gets
+    brightness: float  # brightness of the object, for the light it gets
     agreement: float | None  # share of the mask that the other masks agree to
 
 
@@ -62,12 +62,33 @@ HEADS = (
 )
 
 
-def measure(scene: Capture, center: np.ndarray, radius: float) -> list[Row]:
+def agreements(scene: Capture) -> tuple[dict[str, float], list[str]]:
+    """Of each mask, by its file, the share that the others agree to; and what is wrong with all of them.
+
+    A single one that is wrong spoils the hull for all. It is told by a hull for which some may be wrong.
+    """
+    if not scene.hull:
+        return {}, []
+    silhouettes = [small(silhouette) for silhouette in scene.silhouettes()]
+    pixels = max(16, 12800 // len(silhouettes))
+
+    def shares(hull):
+        return (hull.shortfall(silhouettes, pixels) < 1).mean(1)
+
+    agree, why = shares(scene.hull), None
+    if scene.whole and agree.min() < CONFORMS:
+        why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
+        robust = agree if why else shares(Hull(silhouettes, "", wrong=max(0.1, 1.01 / len(scene.hull.silhouettes))))
+        if np.median(robust) >= CONFORMS:
+            agree = robust
+        else:
+            why = why or "cameras or masks are wrong"
+    wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else []
+    return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
+
+
+def measure(scene: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]) -> list[Row]:
     """The rows of all photographs."""
-    agreement = {}
-    if scene.hull:
-        agrees = (scene.hull.shortfall() < 1).mean(1)
-        agreement = {silhouette.name: float(a) for silhouette, a in zip(scene.hull.silhouettes, agrees)}
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
     rows = []
     for k, (sensor, name, light) in enumerate(zip(scene.sensors, scene.names, lights)):
@@ -75,22 +96,22 @@ def measure(scene: Capture, center: np.ndarray, radius: float) -> list[Row]:
         to_light = light[:3] if light[3] else light[:3] - center
         away = np.linalg.norm(to_light)
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(away, 1e-12))
-        image, mask = brightness(scene, k), scene.masks[k]
-        inside = image > 0.02 * image.max() if mask is None else mask > 127
-        outside = None if mask is None else ~ndimage.binary_dilation(mask > 127, iterations=3)
+        rgb, saturated, mask, masked = (t[0].numpy() for t in scene.observe([k], -(-max(sensor.size) // WIDTH)))
+        image = rgb.max(-1)
+        inside = mask > 0.5 if masked else image > 0.02 * image.max()
+        outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
         level = float(np.quantile(image[inside], 0.9)) if inside.any() else 0.0  # what is lit, not in shadow
         around = None if outside is None or not outside.any() else float(np.median(image[outside]))
-        _, saturated = capture.decode(scene.images[k], scene.linear[k], sensor.saturation)
         received = float(light[4:7].mean()) / (1.0 if light[3] else max(away, 1e-12) ** 2)
         rows.append(Row(
             name=name, distance=float(np.linalg.norm(to_camera) / radius),
             light=float("inf") if light[3] else float(away / radius),
             angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-            object=None if mask is None else float(inside.mean()),
+            object=float(inside.mean()) if masked else None,
             clipped=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
             dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
             background=None if around is None else around / max(level, 1e-9),
-            albedo=level / max(received, 1e-30), agreement=agreement.get(scene.outline(k)),
+            brightness=level / max(received, 1e-30), agreement=agreement.get(scene.outline(k)),
         ))  # fmt: skip
     return rows
 
@@ -126,7 +147,7 @@ OTHERS = {
 def agreement(silhouettes: Sequence[Silhouette]) -> float:
     """Share of the masks' pixels that all masks agree to; 0 if there is no hull."""
     try:
-        return float((Hull(silhouettes, "").shortfall(100, 48) < 1).mean())
+        return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
         return 0.0
 
@@ -148,13 +169,16 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(silhouettes: Sequence[Silhouette]) -> str | None:
-    """Are all principal points off by half a pixel? Then outlines do not quite meet the hull."""
+    """Are all principal points off by half a pixel? Then outlines do not quite meet the hull.
+
+    Of photographs that are shrunk for the hull it cannot be told, and matters little.
+    """
     gaps, silhouettes = {}, thinned(silhouettes, 32, 512)
     for shift in (-0.5, 0.0, 0.5):
         moved = [s._replace(centre=s.centre + shift) for s in silhouettes]
-        gaps[shift] = float(np.mean(Hull(moved, "").shortfall(100, 96, outline=True).clip(max=2)))
+        gaps[shift] = float(np.mean(Hull(moved, "").shortfall(samples=96, outline=True).clip(max=2)))
     best = min(gaps, key=gaps.get)
-    if best and gaps[best] < gaps[0.0] - 0.03:
+    if gaps[0.0] > 0.01 and gaps[best] < 0.5 * gaps[0.0]:
         do = "add 0.5 to" if best > 0 else "subtract 0.5 from"
         return f"principal points seem off by half a pixel: {do} cx and cy (the first pixel's centre is 0.5, 0.5)"
     return None
@@ -179,26 +203,32 @@ def units(scene: Capture, center: np.ndarray) -> str | None:
     return None
 
 
+def facing(scene: Capture, center: np.ndarray) -> str | None:
+    """Do the cameras look at the object?"""
+    cameras = np.stack([camera_of(sensor)[0] for sensor in scene.sensors])
+    away = ((center - cameras[:, :3, 3]) * cameras[:, :3, 2]).sum(1) < 0
+    if away.mean() > 0.5:
+        return (f"{away.sum()} of {len(away)} cameras look away from the object: z of to_world is forward, here; "
+                "of OpenGL's (NeRF's, Blender's) axes: to_world @ diag(-1, 1, -1, 1)")  # fmt: skip
+    return f"{', '.join(np.array(scene.names)[away][:5])}: looking away from the object" if away.any() else None
+
+
 def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
     """What is to be mended, each in one line."""
     found = []
     agreements = [row.agreement for row in rows if row.agreement is not None]
-    if not scene.whole:
-        pass  # such masks need not agree
-    elif agreements and np.median(agreements) < CONFORMS:
-        why = mistake(scene.hull.silhouettes)
-        found.append(f"The masks agree to {np.mean(agreements):.0%} only: " + (why or "cameras or masks are wrong"))
-    elif agreements:
-        found += filter(None, [half_pixel(scene.hull.silhouettes)])
-        for row in rows:
-            if row.agreement is not None and row.agreement < CONFORMS:
-                found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
-    found += filter(None, [units(scene, center)])
-    lit = [row for row in rows if row.angle < 60 and row.albedo > 0]  # not from behind
-    typical = np.median([row.albedo for row in lit]) if lit else 1.0
+    if scene.whole and agreements and np.median(agreements) >= CONFORMS:  # those of bright parts only need not agree
+        strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
+        if not strays and max(sensor.size[0] for sensor in scene.sensors) <= WIDTH:
+            found += filter(None, [half_pixel(scene.hull.silhouettes)])
+        for row in strays:
+            found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
+    found += filter(None, [facing(scene, center), units(scene, center)])
+    lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind
+    typical = np.median([row.brightness for row in lit]) if lit else 1.0
     for row in lit:
-        if not typical / 4 < row.albedo < 4 * typical:
-            times = f"{row.albedo / typical:.2g} times as bright as the others"
+        if not typical / 4 < row.brightness < 4 * typical:
+            times = f"{row.brightness / typical:.2g} times as bright as the others"
             found.append(f"{row.name}: is {times}, for the light it gets: its exposure or its light is wrong")
     for name, limit, text in (
         ("clipped", CLIPPED, "of the object is over-exposed; expose less"),
@@ -208,8 +238,9 @@ def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
         shares = [value for row in rows if (value := getattr(row, name)) is not None]
         if shares and np.median(shares) > limit:
             found.append(f"{np.median(shares):.0%} {text}")
-    if len(rows) < 8:
-        found.append(f"{len(rows)} photographs are few: about 30 from all around are needed for a closed surface")
+    views = len({camera_of(sensor)[0].tobytes() for sensor in scene.sensors})
+    if views < 8:
+        found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")
     return found
 
 
@@ -272,7 +303,7 @@ def sheet(scene: Capture, rows: list[Row], center: np.ndarray, radius: float) ->
 
 def table(rows: list[Row]) -> str:
     """The rows as text."""
-    typical = np.median([row.albedo for row in rows])
+    typical = np.median([row.brightness for row in rows])
 
     def cells(row):
         yield row.name
@@ -281,7 +312,7 @@ def table(rows: list[Row]) -> str:
         yield f"{row.angle:.0f}"
         for share in (row.object, row.clipped, row.dark, row.background):
             yield "-" if share is None else f"{share:.1%}"
-        yield f"{row.albedo / typical:.2f}" if typical else "-"
+        yield f"{row.brightness / typical:.2f}" if typical else "-"
         yield "-" if row.agreement is None else f"{row.agreement:.0%}"
 
     lines = [HEADS, *map(tuple, map(cells, rows))]
@@ -289,21 +320,32 @@ def table(rows: list[Row]) -> str:
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
 
 
+def drop_empty(scene: Capture) -> list[str]:
+    """Forget masks with nothing in them and return the names of their photographs."""
+    empty = [k for k, mask in enumerate(scene.masks) if mask is not None and not (shrink(mask, WIDTH)[0] > 127).any()]
+    for k in empty:
+        scene.masks[k] = None
+    return [scene.names[k] for k in empty]
+
+
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if there is something to mend."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.name_of(config.scene)}.png"
     scene = capture.load(config.scene, masks=config.masks)
-    empty = [k for k, mask in enumerate(scene.masks) if mask is not None and not (mask > 127).any()]
-    for k in empty:
-        scene.masks[k] = None
+    if out.suffix.lower() != ".png":
+        raise InputError(f"{out}: --out: must end in .png")
+    if out.resolve() in {file.resolve() for s in scene.sensors for file in (s.filename, s.mask) if file}:
+        raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
+    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(scene)]
     try:
         center, radius = scene.sphere()
-    except NoHull:
+    except NoHull as error:
         center, radius = capture.sphere_of_cameras(scene)
-    rows = measure(scene, center, radius)
-    found = [f"{rows[k].name}: its mask is empty: nothing in it is above 127" for k in empty]
-    found += findings(scene, rows, center)
+        found += [] if scene.whole else [str(error)]
+    agreement, wrong = agreements(scene)
+    rows = measure(scene, center, radius, agreement)
+    found += wrong + findings(scene, rows, center)
     page = sheet(scene, rows, center, radius)
     with writing(f"{out}: --out"):
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -61,6 +61,9 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
     except InputError as error:
         print(f"{program}: {error}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:  # a file that may not be read, a folder that is gone
+        print(f"{program}: {error.filename or os.getenv('PWD', '.')}: {error.strerror}", file=sys.stderr)
+        sys.exit(2)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
 HEAD_START = 2 / 3  #: share of the first stage that starts near the object do without
-EXCHANGE = 0.5  #: iterations of the second stage that take as long as one of the first
+EXCHANGE = 0.5  #: iterations of the second stage that take about as long as one of the first, of the presets
 
 
 class Stage(NamedTuple):
@@ -42,7 +42,7 @@ class Config:
     the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
     masks: Literal["auto", "given", "none"] = "auto"
     """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
-    room; none: as if it had none."""
+    room; none: as if it had none, which finds them in a dark room, too; --weights.mask 0 does without any."""
     seed: int = 0
     """Of every random choice."""
     iterations: int = 500
@@ -53,7 +53,7 @@ class Config:
     """Width of the photographs in each stage, at most [px]."""
     shares: tuple[float, ...] = (0.45, 0.43, 0.12)
     """Share of the iterations of each stage. A hull or a mesh is near the object already: from there two thirds of the
-    first stage are exchanged for iterations of the second, which take as long."""
+    first stage are exchanged for half as many iterations of the second, which take about as long."""
     batch: int = 8
     """Photographs per iteration."""
     steps: int = 8

@@ -1,5 +1,6 @@
 """Bring photographs in: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -25,11 +26,13 @@ Formats = Union[tuple(Annotated[source, tyro.conf.subcommand(name)] for name, so
 
 
 def check(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError for cameras and lights that are none, and for files of another size than their camera's."""
+    """Raise InputError for invalid cameras, lights and names, and for files of another size than their camera's."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     for frame in frames:
         what = f"{frame.image}: camera"
+        if (shown := os.fsencode(frame.image).decode(errors="replace")) != str(frame.image):
+            raise InputError(f"{shown}: this name is not UTF-8, which XML needs; rename it")
         rotation = frame.pose[:3, :3]
         if not np.isfinite(frame.pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise InputError(f"{what}: its pose is no rotation and translation")
@@ -56,7 +59,7 @@ def principal_point(frame: Frame) -> tuple[float, float]:
     return frame.camera.principal_point_x, frame.camera.principal_point_y
 
 
-def is_straight(frame: Frame) -> bool:
+def is_pinhole(frame: Frame) -> bool:
     """Is the camera a pinhole? Asked of its corners, for a fisheye without coefficients is none."""
     fx, fy = focal(frame)
     rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
@@ -93,6 +96,8 @@ class Writer:
         self.scene = scene
         #: What belongs to x/pot.xml is in x/pot/, what belongs to x/scene.xml is in x/.
         self.folder = scene.parent if scene.stem == "scene" else scene.with_suffix("")
+        self.made = [folder for folder in (scene.parent, *scene.parent.parents) if not folder.exists()]
+        scene.parent.mkdir(parents=True, exist_ok=True)
         self.staging = Path(tempfile.mkdtemp(prefix=f".{scene.stem}.", dir=scene.parent))
         self.files: list[Path] = []
         self.masks: dict = {}  # where masks are, by file and camera
@@ -125,13 +130,16 @@ class Writer:
         replace(self.scene, xml)
 
     def close(self) -> None:
-        """Remove what has not been moved."""
+        """Remove what has not been moved, and folders that were made for nothing."""
         shutil.rmtree(self.staging, ignore_errors=True)
+        for folder in self.made:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
 
 
 def place(writer: Writer, frame: Frame, name: str, copy: bool, encoding: str | None) -> tuple[str, str | None]:
     """Where the photograph and the mask of a frame are, as the scene names them; written anew where they must be."""
-    straight = is_straight(frame)
+    straight = is_pinhole(frame)
 
     def photograph() -> np.ndarray | None:
         """Its pixels, if they are no file that will do: photographs of 8 bits are sRGB."""
@@ -214,7 +222,6 @@ def main(arguments: Sequence[str]) -> None:
         what = "exists already; give another name" if source.scene.exists() else "must end in .xml"
         raise InputError(f"{source.scene}: SCENE.xml: {what}")
     try:
-        source.scene.parent.mkdir(parents=True, exist_ok=True)
         writer = Writer(source.scene)
         try:
             for frame, name in zip(tqdm(frames, unit="photograph", disable=None, leave=False), names):

@@ -205,10 +205,12 @@ def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radi
     """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
     cameras = np.array(scene.photographs.cameras).reshape(-1, 3, 4)
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
-    ahead = ((center - cameras[:, :, 3]) * cameras[:, :, 2]).sum(1)
-    if (ahead < 0).any():
-        raise InputError(f'{scene.path}: photograph "{scene.sensors[int(ahead.argmin())].id()}", to_world: its camera '
-                         "looks away from the object; python -m mi_ring.check may tell why")  # fmt: skip
+    surface = center + radius * domain.sample(3)[0].numpy()
+    ahead = [((surface - camera[:, 3]) @ camera[:, 2]).max() for camera in cameras]
+    if min(ahead) < 0:
+        sensor = scene.sensors[int(np.argmin(ahead))]
+        raise InputError(f'{scene.path}: photograph "{sensor.id()}", to_world: its camera looks away from the surface '
+                         "that the fit starts from; see python -m mi_ring.check")  # fmt: skip
     places = {"to_world: its camera": cameras[:, :, 3],
               "emitter: its light": np.where(lights[:, 3:4] > 0, np.inf, lights[:, :3])}  # fmt: skip
     for what, points in places.items():

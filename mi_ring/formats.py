@@ -5,6 +5,7 @@ pixels' centres at (0.5, 0.5), (1.5, 0.5), …
 """
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -238,17 +239,17 @@ class Neus(Source):
             if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers):
                 raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3): "
                                  f"one photograph for each world_mat in {path.name}")  # fmt: skip
-            pictures = {k: array for k in range(len(stack))}
+            pictures = dict.fromkeys(numbers, array)
         elif not pictures:
             raise InputError(f"{self.src}: image: no photographs in this folder, and no images.npy")
         masks = numbered(self.src / "mask")
         energies = any(key.startswith("light_energy_") for key in cameras)
         if not set(pictures) <= set(numbers):  # names that are no numbers of cameras: by their order
-            pictures, masks = ({k: files[n] for k, n in enumerate(sorted(files))} for files in (pictures, masks))
-        if not set(pictures) <= set(numbers):
-            raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(pictures)} photographs")
+            if len(pictures) != len(numbers):
+                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(pictures)} photographs")
+            pictures, masks = (dict(zip(numbers, [files[n] for n in sorted(files)])) for files in (pictures, masks))
         for k, image in pictures.items():
-            pixels = stack[k].astype(np.float32) if image == array else None
+            pixels = stack[numbers.index(k)].astype(np.float32) if image == array else None
             size = image_size(image) if pixels is None else pixels.shape[1::-1]
             projection = entry(cameras, f"world_mat_{k}", (4, 4), path)
             K, pose = decompose(projection[:3], f"{path}: world_mat_{k}")
@@ -257,15 +258,17 @@ class Neus(Source):
             if masks and not frame.mask:
                 raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
             if energies:
-                energy = np.resize(cameras.get(f"light_energy_{k}", 0.0), 3)
-                energy = matrix(energy, (3,), f"{path}: light_energy_{k}")
+                energy = np.ravel(cameras.get(f"light_energy_{k}", 0.0))
+                energy = matrix(np.repeat(energy, 3) if len(energy) == 1 else energy, (3,), f"{path}: light_energy_{k}")
                 if not energy.any():
                     continue
                 unit = entry(cameras, f"scale_mat_{k}", (4, 4), path)[0, 0]  # energies are for the object's unit sphere
                 frame.light = frame.at_camera(energy * unit**2)
                 frame.encoding = "linear"
                 if "max_intensity" in cameras:
-                    frame.saturation = float(entry(cameras, "max_intensity", (), path))
+                    frame.saturation = float(matrix(np.squeeze(cameras["max_intensity"]), (), f"{path}: max_intensity"))
+                    if frame.saturation <= 0:
+                        raise InputError(f"{path}: max_intensity: is {frame.saturation}; must be positive")
             yield frame
 
 
@@ -321,15 +324,20 @@ def transforms_camera(given: dict, image: Path, where: str) -> pycolmap.Camera:
             raise InputError(f"{where}.{names[0]}: is {'missing' if value is None else value}; must be a number")
         return float(value)
 
+    def angle(name):
+        if not 0 < (value := number(name)) < math.pi:
+            raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
+        return value
+
     width, height = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)
     if given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")
     else:
         fx = fy = None
         if "camera_angle_x" in given:
-            fx = fy = 0.5 * width / np.tan(0.5 * number("camera_angle_x"))
+            fx = fy = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
         if "camera_angle_y" in given:
-            fy = 0.5 * height / np.tan(0.5 * number("camera_angle_y"))
+            fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
         fx = number("fl_x", default=fx)
         fy = number("fl_y", default=fy if "fl_x" not in given else fx)
         cx, cy = number("cx", default=width / 2), number("cy", default=height / 2)
@@ -372,8 +380,15 @@ def exif_exposure(path: Path) -> float | None:
     values = [exif.get(tag) for tag in tags]
     if not all(values):
         return None
-    seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
-    return seconds * iso / f_number**2
+    try:
+        seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
+        exposure = seconds * iso / f_number**2
+    except (TypeError, ValueError, ZeroDivisionError):
+        exposure = math.nan
+    if not 0 < exposure < math.inf:
+        raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {', '.join(map(str, values))}; must be "
+                         "positive numbers, or give --no-exif if all photographs have the same exposure")  # fmt: skip
+    return exposure
 
 
 def read_exif(path: Path):
@@ -504,5 +519,7 @@ def load_json(path: Path):
 
 def load_table(path: Path, columns: int) -> np.ndarray:
     """A text file of so many numbers a line."""
+    if load(path, "table of numbers", Path.read_text).isspace() or not path.stat().st_size:
+        raise InputError(f"{path}: is empty; must have {columns} numbers a line")
     table = load(path, "table of numbers", lambda file: np.loadtxt(file, ndmin=2))
     return matrix(table, (len(table), columns), str(path))

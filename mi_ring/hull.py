@@ -18,7 +18,7 @@ SHOWN = 0.25  #: share of the photographs that must show a point, else it is out
 MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
 
 
-class OneLine(InputError):
+class NoParallax(InputError):
     """All cameras are in one place or look along one line: they do not say how far the object is."""
 
 
@@ -36,14 +36,18 @@ class Silhouette(NamedTuple):
     name: str  # for messages
 
 
-def small(silhouette: Silhouette, width: int) -> Silhouette:
+def shrink(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """A mask (H, W) uint8 with so many pixels across, at most, and how many of its own are one of these across."""
+    scale = -(-mask.shape[1] // width)
+    height, width = (n // scale for n in mask.shape)
+    blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
+    return blocks.mean((1, 3)).astype(np.uint8), scale
+
+
+def small(silhouette: Silhouette, width: int = WIDTH) -> Silhouette:
     """With so many pixels across, at most."""
-    scale = -(-silhouette.mask.shape[1] // width)
-    height, width = (n // scale for n in silhouette.mask.shape)
-    blocks = silhouette.mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
-    return silhouette._replace(
-        mask=blocks.mean((1, 3)).astype(np.uint8), focal=silhouette.focal / scale, centre=silhouette.centre / scale
-    )
+    mask, scale = shrink(silhouette.mask, width)
+    return silhouette._replace(mask=mask, focal=silhouette.focal / scale, centre=silhouette.centre / scale)
 
 
 def evenly(count: int, most: int) -> list[int]:
@@ -69,8 +73,8 @@ def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
     if np.linalg.cond(matrix) > 1e6 or not np.ptp(origins, axis=0).any():
-        raise OneLine(f"{what}: to_world: all cameras are in one place or look along one line, so the object's place "
-                      "is unknown; give center and radius of the shapenet shape")  # fmt: skip
+        raise NoParallax(f"{what}: to_world: all cameras are in one place or look along one line, so the object's "
+                         "place is unknown; give center and radius of the shapenet shape")  # fmt: skip
     return np.linalg.solve(matrix, right)
 
 
@@ -96,7 +100,7 @@ class Hull:
         """Directions (n, 3) through the pixels of a mask."""
         rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
-            raise InputError(f"{silhouette.name}: mask: no object in it (no pixel above 127)")
+            raise InputError(f"{silhouette.name}: mask: nothing in it, or next to nothing: no pixels above 127")
         return directions(*silhouette[1:4], np.stack([columns, rows], 1) + 0.5)
 
     def depth(self, points: Tensor) -> Tensor:
@@ -120,18 +124,20 @@ class Hull:
             shown += seen
         return torch.where(shown >= SHOWN * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
 
-    def shortfall(self, pixels: int = 100, samples: int = 64, outline: bool = False) -> np.ndarray:
-        """By how much the hull misses the silhouettes that it is made of: (N, pixels) [px], above 0.
+    def shortfall(
+        self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
+    ) -> np.ndarray:
+        """By how much the hull misses silhouettes, by default those that it is made of: (N, pixels) [px], above 0.
 
         Of so many pixels of each mask, or of its outline, how far the nearest of the hull is: 0 where the other
         silhouettes leave something of what is behind the pixel.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
-        for silhouette, distance in zip(self.silhouettes, self.distances):
+        for silhouette in self.silhouettes if of is None else of:
             rays = self.rays(silhouette)
             if outline:
-                rays = rays[distance.numpy()[silhouette.mask > 127] < 1]
+                rays = rays[signed_distance(silhouette.mask)[silhouette.mask > 127] < 1]
             rays = rays[random.integers(len(rays), size=pixels)]
             origin = silhouette.matrix[:3, 3]
             middle = origin + rays * (rays @ (self.center - origin))[:, None]

@@ -6,7 +6,7 @@ import torch
 
 from mi_ring.bsdf import check_attributes
 from mi_ring.domain import Sphere, closed, load
-from mi_ring.photograph import beside_scene
+from mi_ring.photograph import beside_scene, number
 from mi_ring.ring import Ring
 
 # Mitsuba's names of mesh parameters; 3.10 renames them.
@@ -49,24 +49,25 @@ class ShapeNetMesh(mi.Mesh):
 
     def __init__(self, props):
         self.subdivisions = props.get("subdivisions", 5)
-        if not 0 <= self.subdivisions <= 8:
+        if not isinstance(self.subdivisions, int) or self.subdivisions not in range(9):
             raise ValueError(f'shapenet "{props.id()}": subdivisions is {self.subdivisions}, must be 0 to 8')
         given = {key: props[key] for key in ("center", "radius", "domain", "weights") if key in props}
         for key in ("center", "radius", "domain"):
             if key in given and "weights" in given:
                 raise ValueError(f'shapenet "{props.id()}": weights carry their own {key}; give only one of the two')
-        to_world = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
+        to_world = props.get("to_world", mi.ScalarTransform4f())
+        if isinstance(to_world, str | int | float):
+            raise ValueError(f'shapenet "{props.id()}": to_world is {to_world}, must be a <transform>')
+        to_world = np.array(to_world.matrix)
         if props.get("flash", True):
             # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
         #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
         self.center = np.array(given["center"]).ravel() if "center" in given else None
-        self.radius = given.get("radius")
-        if self.radius is not None and not 0 < self.radius < np.inf:
-            raise ValueError(f'shapenet "{props.id()}": radius is {self.radius}, must be positive')
-        if self.center is not None and not np.isfinite(self.center).all():
-            raise ValueError(f'shapenet "{props.id()}": center is {self.center}, must be finite')
+        self.radius = number(props, "radius", positive=True) if "radius" in given else None
+        if self.center is not None and not (self.center.dtype.kind == "f" and np.isfinite(self.center).all()):
+            raise ValueError(f'shapenet "{props.id()}": center is {given["center"]}, must be a <point>')
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain = None
         if "domain" in given:

@@ -15,6 +15,15 @@ def beside_scene(name: str) -> Path:
     return Path(str(mi.file_resolver()[0])) / name
 
 
+def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
+    """A property of a plugin that is a finite number. Raises ValueError, which names it, if it is anything else."""
+    value = props.get(name, default)
+    if isinstance(value, int | float) and np.isfinite(value) and (value > 0 or not positive):
+        return float(value)
+    wanted = "a positive number" if positive else "a number"
+    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {value}, must be {wanted}')
+
+
 def camera_ray(to_world, focal, centre, pixel):
     """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
 
@@ -64,7 +73,7 @@ class Photograph(mi.Sensor):
                                   first pixel is (0.5, 0.5). Default: the middle of the film
     ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale
     ``encoding``     string       ``srgb`` or ``linear``; default ``srgb`` for 8-bit files, ``linear`` for 16-bit
-                                  PNG/TIFF and EXR
+                                  PNG/TIFF and EXR; linear data of 8 bits is refused
     ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped: they only say "at
                                   least this bright". Default 1
     (nested)         film         its size is the image's
@@ -99,19 +108,11 @@ class Photograph(mi.Sensor):
         self.encoding = props.get("encoding", "auto")
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
-        self.saturation = float(props.get("saturation", 1.0))
-        if not self.saturation > 0:
-            raise ValueError(f'photograph "{props.id()}": saturation is {self.saturation}, must be positive')
+        self.saturation = number(props, "saturation", 1.0, positive=True)
 
         width, height = (int(s) for s in self.film().size())
-        for name in ("fx", "fy"):
-            if isinstance(props[name], str) or not 0 < props[name] < np.inf:
-                raise ValueError(f'photograph "{props.id()}": {name} is {props[name]}, must be a length in pixels')
-        self.focal = mi.Point2f(props["fx"], props["fy"])
-        for name in ("cx", "cy"):
-            if isinstance(value := props.get(name, 0.0), str) or not np.isfinite(value):
-                raise ValueError(f'photograph "{props.id()}": {name} is {value}, must be a place in pixels')
-        self.centre = mi.Point2f(props.get("cx", width / 2), props.get("cy", height / 2))
+        self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))
+        self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
         rotation = matrix[:3, :3]
         rigid = np.isfinite(matrix).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3

@@ -179,7 +179,9 @@ def test_no_masks_are_found_in_a_bright_room(broken_capture):
 
 def test_a_photograph_that_the_light_missed_gets_no_mask(broken_capture):
     path, _ = broken_capture
-    mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(path.parent / "images/004.png"))
+    missed = np.zeros((40, 56, 3), np.uint8)
+    missed[30, 50] = 255  # a hot pixel
+    mi.Bitmap(missed).write(str(path.parent / "images/004.png"))
     scene = capture.load(path, masks="none")
     assert scene.masks[4] is None and sum(mask is not None for mask in scene.masks) == 11
     for file in path.parent.glob("images/*.png"):

@@ -6,8 +6,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
+from test_hull import ball, silhouettes
 
-from mi_ring import check, command
+from mi_ring import check, command, hull
 
 
 def run(path, tmp_path, capsys, *options):
@@ -40,6 +41,8 @@ def test_a_good_capture_passes(small_capture, tmp_path, capsys):
     assert sheet.width >= 1200
     red = (np.array(sheet) == [255, 51, 51]).all(-1)
     assert red.sum() > 12 * 30  # the masks' outlines
+    cells = np.array(sheet)[400:].astype(int)
+    assert (cells[..., 1] > cells[..., [0, 2]].max(-1) + 60).sum() > 12 * 100  # the hull, green
 
 
 MATRICES = {
@@ -75,6 +78,13 @@ def test_principal_points_off_by_half_a_pixel(broken_capture, tmp_path, capsys):
     assert status == 1 and "half a pixel: add 0.5 to cx and cy" in text, text
 
 
+@pytest.mark.parametrize("scale", [1, 4])
+@pytest.mark.parametrize(("shift", "words"), [(-0.5, "add 0.5 to"), (0.5, "subtract 0.5 from"), (0.0, None)])
+def test_half_a_pixel_either_way(shift, words, scale):
+    found = check.half_pixel([s._replace(centre=s.centre + shift) for s in silhouettes(ball(4.0), 12, scale)])
+    assert words in found if words else found is None
+
+
 @pytest.mark.parametrize(("change", "words"), [
     (lambda image: image[::-1], "upside down"), (lambda image: image[:, ::-1], "mirrored"),
 ])  # fmt: skip
@@ -107,7 +117,7 @@ def test_few_photographs(broken_capture, tmp_path, capsys):
     text = path.read_text()
     path.write_text(text[: text.index('  <sensor type="photograph" id="005"')] + "</scene>")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and "5 photographs are few" in text, text
+    assert status == 1 and "5 views are few" in text, text
 
 
 def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
@@ -117,6 +127,34 @@ def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
     edit_matrices(path, lambda m: m @ turn if next(count) == 4 else m)  # the camera upright
     status, text = run(path, tmp_path, capsys)
     assert status == 1 and "To mend: 004.png: the others agree to" in text and text.count("To mend") <= 2, text
+
+
+def test_one_wrong_place_is_named(broken_capture, tmp_path, capsys):
+    """It spoils the hull of all, so that nothing agrees any more."""
+    path, _ = broken_capture
+    count = iter(range(100))
+    move = np.zeros((4, 4))
+    move[:3, 3] = 25, -10, 20
+    edit_matrices(path, lambda m: m + move if next(count) == 4 else m)
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and re.findall("To mend: (.*): the others agree to", text) == ["004.png"], text
+
+
+def test_cameras_that_look_away(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_matrices(path, lambda m: m @ np.diag([-1.0, 1, -1, 1]))
+    path.write_text(re.sub(r'<string name="mask"[^>]*>', "", path.read_text()))
+    status, text = run(path, tmp_path, capsys, "--masks", "given")
+    assert status == 1 and re.search(r"12 of 12 cameras look away .*diag\(-1, 1, -1, 1\)", text), text
+
+
+def test_more_photographs_than_the_hull_is_made_of(broken_capture, tmp_path, capsys, monkeypatch):
+    path, _ = broken_capture
+    monkeypatch.setattr(hull, "MOST", 5)
+    edit_images(path, lambda mask: np.roll(mask, 9, 1), "masks", "008")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "To mend: 008.png: the others agree to" in text, text
+    assert all(line.endswith("%") for line in text.splitlines() if re.match(r"0\d\d.png", line.strip()))
 
 
 def test_lights_in_other_units(broken_capture, tmp_path, capsys):
@@ -161,6 +199,8 @@ def test_mistakes_of_the_user(tmp_path, small_capture, capsys):
     for arguments, words in (
         ([tmp_path / "gone.xml"], "gone.xml: no such file"),
         ([small_capture, "--out", small_capture / "sheet.png"], "--out: cannot be written"),
+        ([small_capture, "--out", small_capture], "--out: must end in .png"),
+        ([small_capture, "--out", small_capture.parent / "images/003.png"], "--out: is one of the scene's own"),
     ):
         with pytest.raises(SystemExit) as stop:
             command.run("mi_ring.check", check.main, [str(a) for a in arguments])

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 import scipy.io
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from scipy.spatial.transform import Rotation
 
 from mi_ring import capture, command, convert, photograph
@@ -353,6 +354,19 @@ def test_wildlight(tmp_path):
     assert scene.sensors[0].saturation == pytest.approx(0.9)
 
 
+@pytest.mark.parametrize("names", ["{:03}", "IMG_{}"])
+def test_photographs_of_neus_may_be_numbered_otherwise(tmp_path, names):
+    """From 1, or not at all: their order counts, as the cameras' does."""
+    source = neus(tmp_path / "dtu")
+    for folder in ("image", "mask"):
+        for k in (2, 1, 0):
+            (source / f"{folder}/{k:03}.png").rename(source / f"{folder}/{names.format(k + 7)}.png")
+    scene = converted("neus", source, tmp_path / "dtu.xml")
+    for k, (R, t) in enumerate(cameras()):
+        np.testing.assert_allclose(in_scene(scene.sensors[k]), by_hand(R, t) + 0.5, atol=0.01)
+        assert (scene.images[k] == noise(np.uint8, seed=k)[..., :3]).all()
+
+
 def test_wildlight_photographs_in_one_array(tmp_path):
     source = neus(tmp_path / "wild", **{f"light_energy_{k}": [1.0, 1, 1] for k in range(3)}, max_intensity=7.0)
     stack = np.random.default_rng(1).uniform(0, 7, (3, H, W, 3)).astype(np.float32)
@@ -422,6 +436,7 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
     (lambda d: [row.__setitem__(0, -row[0]) for row in d["frames"][0]["transform_matrix"]], "left-handed"),
     (lambda d: d.pop("camera_angle_x"), r"frames\[0\].fl_x: is missing"),
     (lambda d: d.update(camera_angle_x="wide"), "camera_angle_x: is wide; must be a number"),
+    (lambda d: d.update(camera_angle_x=0), "camera_angle_x: is 0.0; must be between 0 and pi"),
     (lambda d: d.update(fl_x=-3.0), "focal lengths"),
     (lambda d: d.update(w=99, h=52), "is 62 x 52 pixels, its camera 99 x 52"),
     (lambda d: d.update(k4=0.1), r"frames\[0\].k4"),
@@ -452,6 +467,8 @@ def refused(arguments, pattern, out):
     ({"world_mat_1": np.zeros((4, 4))}, "world_mat_1: .*singular"),
     ({"world_mat_1": np.array("none")}, "world_mat_1"),
     ({"light_energy_0": [-1.0, 1, 1]}, "light.*not negative"),
+    ({"light_energy_0": [1.0, 1]}, r"light_energy_0: is of shape \(2,\); must be 3"),
+    ({"light_energy_0": [1.0, 1, 1], "max_intensity": [0.0]}, "max_intensity: is 0.0; must be positive"),
     ({"light_energy_0": ["a", "b", "c"]}, "light_energy_0: is .*must be 3 numbers"),
     ({"light_energy_0": [1.0, 1, 1], "max_intensity": np.array("much")}, "max_intensity: is much; must be a number"),
 ])  # fmt: skip
@@ -493,6 +510,18 @@ def test_mistakes_in_cam_dict(tmp_path, edit, pattern):
     refused(["iron", iron(tmp_path / "dragon", edit)], pattern, tmp_path / "out/scene.xml")
 
 
+def test_exif_that_is_no_number(colmap, tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({33434: IFDRational(0, 0), 33437: 2.8, 34855: 100})
+    Image.fromarray(noise(np.uint8)).save(colmap / "images/sub/2.jpg", exif=exif)
+    refused(["colmap", colmap], r"\.jpg: EXIF: exposure time, ISO and aperture are nan", tmp_path / "out/scene.xml")
+
+
+def test_an_empty_list_of_lights(diligent, tmp_path):
+    (diligent / "view_02/light_directions.txt").write_text("\n")
+    refused(["diligent-mv", diligent], "light_directions.txt: is empty", tmp_path / "out/scene.xml")
+
+
 def test_truncated_files(diligent, colmap, tmp_path):
     out = tmp_path / "out/scene.xml"
     for path in (colmap / "sparse/0/images.bin", colmap / "text/cameras.txt", diligent / "Calib_Results.mat",
@@ -504,7 +533,7 @@ def test_truncated_files(diligent, colmap, tmp_path):
             convert.main(
                 [kind, str(source), str(out), *(["--images", str(colmap / "images")] if kind == "colmap" else [])]
             )
-        assert "\n" not in str(error.value)
+        assert "\n" not in str(error.value) and str(path.parent) in str(error.value)
         path.write_bytes(content)
     assert not out.parent.exists()
 

@@ -20,13 +20,13 @@ def cameras(count, distance=20.0):
         yield matrix
 
 
-def silhouettes(hit, count=24):
-    """Masks of a body: `hit(origin, directions)` says which rays meet it."""
-    y, x = np.mgrid[:H, :W] + 0.5
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
+def silhouettes(hit, count=24, scale=1):
+    """Masks of a body: `hit(origin, directions)` says which rays meet it. `scale`: so many times as many pixels."""
+    y, x = np.mgrid[: scale * H, : scale * W] + 0.5
+    pixels, camera = np.stack([x.ravel(), y.ravel()], 1), (scale * FOCAL, scale * CENTRE)
     for k, matrix in enumerate(cameras(count)):
-        mask = hit(matrix[:3, 3], directions(matrix, FOCAL, CENTRE, pixels)).reshape(H, W)
-        yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), matrix, FOCAL, CENTRE, f"mask {k}")
+        mask = hit(matrix[:3, 3], directions(matrix, *camera, pixels)).reshape(x.shape)
+        yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), matrix, *camera, f"mask {k}")
 
 
 def ball(radius, at=CENTER):
@@ -110,9 +110,9 @@ def test_what_photographs_do_not_show_is_not_cut_off():
 
 def test_mistakes():
     views = list(silhouettes(ball(4.0)))
-    with pytest.raises(InputError, match="mask 3: mask: no object in it"):
+    with pytest.raises(InputError, match="mask 3: mask: nothing in it"):
         Hull([*views[:3], views[3]._replace(mask=np.zeros_like(views[3].mask))], "scene.xml")
-    with pytest.raises(InputError, match="scene.xml: all cameras look along one line"):
+    with pytest.raises(InputError, match="scene.xml: to_world: all cameras are in one place or look along one l"):
         Hull(views[:1], "scene.xml")
     apart = list(silhouettes(ball(2.0)))
     for view in apart[::2]:

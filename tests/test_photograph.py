@@ -147,12 +147,16 @@ def point(position, intensity=1.0):
         ({"to_world": mi.ScalarTransform4f(POSE @ np.diag([1, -1, 1, 1]))}, "mirror"),
         ({"to_world": mi.ScalarTransform4f(np.where(np.eye(4)[::-1] > 0, np.nan, POSE))}, "to_world"),
         ({"fxx": 3.0}, "fxx"),
-        ({"fx": None}, "fx"),
+        ({"fx": None}, "fx is missing"),
+        ({"fx": "wide"}, "fx is wide, must be a positive number"),
+        ({"saturation": "high"}, "saturation is high, must be a positive number"),
+        ({"to_world": "there"}, "to_world.* has the wrong type"),
         ({"filename": None}, "filename"),
         ({"encoding": "gamma"}, '"gamma", must be "srgb" or "linear"'),
         ({"one": point([0, 0, 1]), "two": point([0, 1, 0])}, "2 nested emitters"),
     ],
-    ids=["scale", "mirror", "NaN", "typo", "no fx", "no filename", "encoding", "two lights"],
+    ids=["scale", "mirror", "NaN", "typo", "no fx", "fx in words", "saturation in words", "to_world in words",
+         "no filename", "encoding", "two lights"],
 )
 def test_refuses(changed, message):
     with pytest.raises(Exception, match=message):
