@@ -1,5 +1,6 @@
 """Is a capture usable? `python -m mi_ring.check SCENE.xml`."""
 
+import copy
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from mi_ring import capture, command
 from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
-from mi_ring.hull import WIDTH, Hull, NoHull, Silhouette, shrink, small, thinned
+from mi_ring.hull import WIDTH, Hull, NoHull, Silhouette, evenly, shrink, small, thinned
 from mi_ring.results import replace, writing
 
 matplotlib.use("Agg")
@@ -168,15 +169,16 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
     return f"{best} (the masks then agree to {scores[best]:.0%}, not {as_it_is:.0%})"
 
 
-def half_pixel(silhouettes: Sequence[Silhouette]) -> str | None:
+def half_pixel(hull: Hull) -> str | None:
     """Are all principal points off by half a pixel? Then outlines do not quite meet the hull.
 
     Of photographs that are shrunk for the hull it cannot be told, and matters little.
     """
-    gaps, silhouettes = {}, thinned(silhouettes, 32, 512)
+    gaps, hull, some = {}, copy.copy(hull), evenly(len(hull.silhouettes), 32)
+    silhouettes, hull.distances = ([values[k] for k in some] for values in (hull.silhouettes, hull.distances))
     for shift in (-0.5, 0.0, 0.5):
-        moved = [s._replace(centre=s.centre + shift) for s in silhouettes]
-        gaps[shift] = float(np.mean(Hull(moved, "").shortfall(samples=96, outline=True).clip(max=2)))
+        hull.silhouettes = [s._replace(centre=s.centre + shift) for s in silhouettes]
+        gaps[shift] = float(np.mean(hull.shortfall(pixels=50, samples=96, outline=True).clip(max=2)))
     best = min(gaps, key=gaps.get)
     if gaps[0.0] > 0.01 and gaps[best] < 0.5 * gaps[0.0]:
         do = "add 0.5 to" if best > 0 else "subtract 0.5 from"
@@ -220,7 +222,7 @@ def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
     if scene.whole and agreements and np.median(agreements) >= CONFORMS:  # those of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
         if not strays and max(sensor.size[0] for sensor in scene.sensors) <= WIDTH:
-            found += filter(None, [half_pixel(scene.hull.silhouettes)])
+            found += filter(None, [half_pixel(scene.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
     found += filter(None, [facing(scene, center), units(scene, center)])

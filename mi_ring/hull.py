@@ -119,8 +119,9 @@ class Hull:
             place = (centre - focal * local[:, :2] / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
             seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
             inside = F.grid_sample(distance[None, None], 2 * place[None, None] - 1, align_corners=False)[0, 0, 0]
-            lowest = torch.cat([lowest, torch.where(seen, inside * z / focal.mean(), torch.inf)[None]])
-            lowest = lowest.sort(0).values[:worst]
+            deep = torch.where(seen, inside * z / focal.mean(), torch.inf)
+            for low in lowest:  # in order, so that each hands on what is more than it keeps
+                deep, low[:] = torch.maximum(low, deep), torch.minimum(low, deep)
             shown += seen
         return torch.where(shown >= SHOWN * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
 
@@ -137,7 +138,8 @@ class Hull:
         for silhouette in self.silhouettes if of is None else of:
             rays = self.rays(silhouette)
             if outline:
-                rays = rays[signed_distance(silhouette.mask)[silhouette.mask > 127] < 1]
+                inside = silhouette.mask > 127
+                rays = rays[~scipy.ndimage.binary_erosion(inside)[inside]]
             rays = rays[random.integers(len(rays), size=pixels)]
             origin = silhouette.matrix[:3, 3]
             middle = origin + rays * (rays @ (self.center - origin))[:, None]
