@@ -176,7 +176,7 @@ def table(heads, rows) -> str:
 def cells(values) -> list[str]:
     """Of one line of the table: COLUMNS, then COSTS."""
     formats = ["{:.4f}" if c == "iou" else "{:.2f}" for c in COLUMNS] + ["{:.0f}", "{:.0f}", "{:.1f}", "{:.0f}"]
-    return [f.format(v) for f, v in zip(formats, values)]
+    return ["-" if math.isnan(v) else f.format(v) for f, v in zip(formats, values)]
 
 
 def main() -> None:

@@ -249,7 +249,8 @@ def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
     assert sorted(p.name for p in source.iterdir()) == ["images", "transforms.json"]
 
 
-def test_a_failure_halfway_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("out", ["out", "out/deeper"])
+def test_a_failure_halfway_leaves_nothing(tmp_path, out):
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2, "w": W, "h": H}
     frames = [{"file_path": "a.png"}, {"file_path": "b.png"}]
     source = transforms(tmp_path / "data", top, frames, lambda k: noise(np.uint8, seed=k))
@@ -257,7 +258,7 @@ def test_a_failure_halfway_leaves_nothing(tmp_path):
     (source / "b.png").write_bytes(content[: len(content) // 2])  # its header tells the size, its pixels are missing
     (tmp_path / "out").mkdir()
     with pytest.raises(InputError, match=r"b.png: cannot be read as image"):
-        convert.main(["transforms", str(source), str(tmp_path / "out/lens.xml")])
+        convert.main(["transforms", str(source), str(tmp_path / out / "lens.xml")])
     assert list((tmp_path / "out").iterdir()) == []
 
 
