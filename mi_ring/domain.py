@@ -69,13 +69,12 @@ class Domain:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points (N, 3) are inside, (N,) bool."""
-        vertices, faces = self.sample(4)
-        inside = np.linalg.norm(points, axis=1) < np.linalg.norm(vertices, axis=1).max()
+        inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
             from gpytoolbox import fast_winding_number  # here, for it takes a second
 
-            winding = fast_winding_number(points[inside], vertices.numpy().astype(float), faces.astype(np.int32))
-            inside[inside] = winding > 0.5
+            mesh = self.points.astype(float), self.faces.astype(np.int32)
+            inside[inside] = fast_winding_number(points[inside], *mesh) > 0.5
         return inside
 
     def triangulate(self, level: int):
@@ -133,6 +132,9 @@ class Sphere(Domain):
     def __init__(self):
         icosahedron = trimesh.creation.icosahedron()
         super().__init__(icosahedron.vertices, icosahedron.faces)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points, axis=1) < 1
 
     def triangulate(self, level: int):
         mesh = trimesh.creation.icosphere(subdivisions=level)

@@ -205,7 +205,7 @@ def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radi
     """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
     cameras = np.array(scene.photographs.cameras).reshape(-1, 3, 4)
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
-    surface = center + radius * domain.sample(3)[0].numpy()
+    surface = center + radius * domain.points
     ahead = [((surface - camera[:, 3]) @ camera[:, 2]).max() for camera in cameras]
     if min(ahead) < 0:
         sensor = scene.sensors[int(np.argmin(ahead))]

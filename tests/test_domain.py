@@ -6,7 +6,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_ring.domain import PLACES, closed, load
+from mi_ring.domain import PLACES, Domain, Sphere, closed, load
 from mi_ring.errors import InputError
 
 MAJOR, MINOR = 1.0, 0.35
@@ -88,3 +88,12 @@ def test_a_mesh_with_a_hole_is_no_domain(tmp_path):
         load(tmp_path / "open.ply")
     with pytest.raises(InputError, match=r"gone.ply: domain: cannot be read as a mesh"):
         load(tmp_path / "gone.ply")
+
+
+def test_what_a_domain_contains():
+    torus = trimesh.creation.torus(2.0, 0.5)
+    torus.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    tilt = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]
+    points = np.array([[2, 0, 0.4], [0, -2.3, 0], [0, 0, 0], [2, 0, 0.6], [0, 1.4, 0], [9, 0, 0]]) @ tilt.T
+    assert Domain(torus.vertices, torus.faces).contains(points).tolist() == [True, True, False, False, False, False]
+    assert Sphere().contains(np.array([[0.57, 0.57, 0.57], [0.58, 0.58, 0.58]])).tolist() == [True, False]
