@@ -8,8 +8,10 @@ with 16-bit photographs. One camera does not say how far away the object is: it 
 """
 
 import argparse
+import contextlib
 import datetime
 import json
+import sys
 from pathlib import Path
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
@@ -68,7 +70,8 @@ def fit(file: Path, out: Path, options: list[str]) -> dict:
         data = dict(archive)
     mi.set_variant("llvm_ad_rgb")
     scene = write_scene(data, out / "scene")
-    fitting.main([str(scene), "--out", str(out / "run"), *options])
+    with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
+        fitting.main([str(scene), "--out", str(out / "run"), *options])
     _, surface = evaluate.load_mesh(out / "run" / "mesh.ply")
     seen, _, normals = evaluate.hits(surface, capture.load(scene).photograph(0))
     mask = data["mask"] > 0
