@@ -3,8 +3,9 @@
     python benchmarks/singleview.py ball.npz [cat.npz …] [--out out/singleview] [OPTIONS OF mi_ring.fit]
 
 The files hold `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z
-to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes) and `K` (3, 3). Each becomes a scene file
-with 16-bit photographs. One camera does not say how far away the object is: it is put at a metre and a half.
+to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes, 0 where none is known) and `K` (3, 3).
+Each becomes a scene file with 16-bit photographs. One camera does not say how far away the object is: it is put at a
+metre and a half.
 """
 
 import argparse
@@ -74,8 +75,7 @@ def fit(file: Path, out: Path, options: list[str]) -> dict:
         fitting.main([str(scene), "--out", str(out / "run"), *options])
     _, surface = evaluate.load_mesh(out / "run" / "mesh.ply")
     seen, _, normals = evaluate.hits(surface, capture.load(scene).photograph(0))
-    mask = data["mask"] > 0
-    inside = mask.ravel()
+    inside = ((data["mask"] > 0) & data["normal_gt"].any(-1)).ravel()  # along the cat's outline none are measured
     angles = np.full(len(inside), 90.0)  # where the surface is not: as wrong as can be
     cosine = (normals * AXES * data["normal_gt"].reshape(-1, 3)).sum(1)
     angles[seen] = np.degrees(np.arccos(np.clip(cosine[seen], -1, 1)))
