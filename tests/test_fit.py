@@ -311,7 +311,7 @@ def test_auto_takes_the_hull_only_where_it_has_handles(small_capture, monkeypatc
 def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(broken_capture):
     path, _ = broken_capture
     mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/004.png"))
-    with pytest.raises(InputError, match="no object in it"):
+    with pytest.raises(InputError, match="nothing in it"):
         fit.start(capture.load(path), "auto")
     bsdf = '<bsdf type="cooktorrance"/>'
     place = '<point name="center" x="400" y="-150" z="90"/><float name="radius" value="30"/>'
