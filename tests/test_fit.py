@@ -318,7 +318,7 @@ def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(br
     path.write_text(path.read_text().replace(bsdf, bsdf + place))
     domain, center, radius = fit.start(capture.load(path), "auto")
     assert type(domain) is Sphere and center.tolist() == CENTER.tolist() and radius == 30
-    with pytest.raises(InputError, match="no object in it"):
+    with pytest.raises(InputError, match="nothing in it"):
         fit.start(capture.load(path), "hull")
 
 
