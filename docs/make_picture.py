@@ -1,4 +1,4 @@
-"""The README's picture: how the sphere becomes the object, and what is known of it in the end.
+"""The README's picture: how the start becomes the object, and what is known of it in the end.
 
     python docs/make_picture.py out/pot2 docs/pot2.png [--photograph 7]
 """

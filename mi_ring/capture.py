@@ -292,7 +292,8 @@ def brightness(capture: Capture, k: int) -> np.ndarray:
 def open_scene(path: Path) -> tuple[mi.Scene, list]:
     """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give the XML file of a scene")
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: {what}; give the XML file of a scene")
     try:
         path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)

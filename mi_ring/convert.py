@@ -34,6 +34,8 @@ def check(frames: Sequence[Frame], source: Path) -> None:
         if (shown := os.fsencode(frame.image).decode(errors="replace")) != str(frame.image):
             raise InputError(f"{shown}: this name is not UTF-8, which XML needs; rename it")
         rotation = frame.pose[:3, :3]
+        if not np.allclose(frame.pose[3], [0, 0, 0, 1], atol=1e-6):
+            raise InputError(f"{what}: the last row of its pose is {frame.pose[3]}, must be 0 0 0 1; is it transposed?")
         if not np.isfinite(frame.pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise InputError(f"{what}: its pose is no rotation and translation")
         if np.linalg.det(rotation) < 0:
@@ -123,7 +125,7 @@ class Writer:
         """Move everything to its place. Raises InputError if there are other files, which may be the sources."""
         for file in self.files:
             if (self.folder / file).exists():
-                raise InputError(f"{self.folder / file}: exists already; give SCENE.xml another name, or remove it")
+                raise InputError(f"{self.folder / file}: exists already; give SCENE.xml another name or folder")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)

@@ -196,7 +196,7 @@ def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
         raise InputError(f"{scene.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
     if surface is not None and (choice == "hull" or genus(surface)):
-        print(f"Start: the masks' visual hull, with {genus(surface)} handles")
+        print(f"Start: the masks' visual hull, of genus {genus(surface)}")
         return closed(surface, shape.center, shape.radius)
     return Sphere(), *scene.sphere()
 

@@ -304,7 +304,8 @@ def pinhole(K: np.ndarray, size, shift: float, what: str) -> pycolmap.Camera:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
     K = K / K[2, 2]
     if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
-        raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here")
+        raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here; is "
+                         "the matrix transposed?")  # fmt: skip
     return camera_of("PINHOLE", size, [K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift])
 
 

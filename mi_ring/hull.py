@@ -74,7 +74,7 @@ def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
     if np.linalg.cond(matrix) > 1e6 or not np.ptp(origins, axis=0).any():
         raise NoParallax(f"{what}: to_world: all cameras are in one place or look along one line, so the object's "
-                         "place is unknown; give center and radius of the shapenet shape")  # fmt: skip
+                         "place is unknown; if that is so, give center and radius of the shapenet shape")  # fmt: skip
     return np.linalg.solve(matrix, right)
 
 

@@ -56,7 +56,7 @@ class ValidateConfig:
     spp: int = 64
     """Samples per pixel, rounded up to a multiple of 16."""
     depth: int = 6
-    """Longest paths, `max_depth` of the path tracer; 2 is direct light. -1: no limit."""
+    """Longest paths, `max_depth` of the path tracer: 3 or more, for 2 is direct light. -1: no limit."""
     significance: float = 0.01
     """Chance that renderers which agree are said to disagree."""
     seed: int = 0

@@ -83,7 +83,7 @@ SPHERE = '<point name="center" x="400" y="-150" z="90"/><float name="radius" val
 #: What is done to a good capture, options, and words of the complaint.
 BROKEN = {
     "no scene": (lambda path: path.unlink(), [], ["small.xml", "no such file"]),
-    "a folder instead": (lambda path: (path.unlink(), path.mkdir()), [], ["small.xml", "no such file"]),
+    "a folder instead": (lambda path: (path.unlink(), path.mkdir()), [], ["small.xml", "is a folder"]),
     "no XML": (xml("<shape.*", "<shape"), [], ["small.xml: ", "XML"]),
     "an empty file": (content("small.xml", b""), [], ["small.xml: ", "XML"]),
     "a picture as scene": (lambda path: mi.Bitmap(IMAGE).write(str(path), mi.Bitmap.FileFormat.PNG), [],

@@ -434,6 +434,8 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
     (lambda d: d["frames"][0]["transform_matrix"][1].pop(), r"frames\[0\].transform_matrix"),
     (lambda d: d["frames"][0]["transform_matrix"].__setitem__(1, [float("nan")] * 4), "NaN"),
     (lambda d: d["frames"][0]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "no rotation"),
+    (lambda d: d["frames"][0].update(transform_matrix=np.transpose(d["frames"][0]["transform_matrix"]).tolist()),
+     "the last row of its pose is .* must be 0 0 0 1; is it transposed"),
     (lambda d: [row.__setitem__(0, -row[0]) for row in d["frames"][0]["transform_matrix"]], "left-handed"),
     (lambda d: d.pop("camera_angle_x"), r"frames\[0\].fl_x: is missing"),
     (lambda d: d.update(camera_angle_x="wide"), "camera_angle_x: is wide; must be a number"),
