@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -44,6 +45,9 @@ def complaint_in(box: str) -> str:
             parts[-1].append(line)
     alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
     complaint = " ".join(parts[0]) or " ".join(box.split())
+    union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
+    if union:  # of kinds of values; why each is not meant is of no interest
+        complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), union[2])
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
 
 

@@ -345,7 +345,9 @@ def main(arguments: Sequence[str]) -> int:
     set_threads(config)
     keep_memory()
     scene = capture.load(config.scene, masks=config.masks)
-    if config.masks != "given" and scene.threshold is None and all(mask is None for mask in scene.masks):
+    if scene.threshold is not None:
+        print("Masks: found by brightness, for the room was dark")
+    elif config.masks != "given" and all(mask is None for mask in scene.masks):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     fit = Fit(scene, config)
     folder = config.folder

@@ -432,6 +432,8 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
         (["--levels", "4", "9"], ["--levels", "0 to 8"]),
         (["--levels", "4"], ["--widths", "as many"]),
         (["--loss", "l3"], ["loss", "l3"]),
+        (["--domain", "cube"], ["--domain: is cube; must be {auto,sphere,hull}|{{mesh} PATH}"]),
+        (["--domain", "mesh"], ["--domain: is mesh; must be"]),
         (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
     ],
 )
