@@ -83,11 +83,14 @@ def agreements(scene: Capture) -> tuple[dict[str, float], list[str]]:
     agree, why = shares(scene.hull), None
     if scene.whole and agree.min() < CONFORMS:
         why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
-        robust = agree if why else shares(Hull(silhouettes, "", wrong=max(0.1, 1.01 / len(scene.hull.silhouettes))))
-        if np.median(robust) >= CONFORMS:
-            agree = robust
-        else:
-            why = why or "cameras or masks are wrong"
+        if not why:
+            tolerant = copy.copy(scene.hull)
+            tolerant.wrong = max(0.1, 1.01 / len(tolerant.silhouettes))
+            robust = shares(tolerant)
+            if np.median(robust) >= CONFORMS:
+                agree = robust
+            else:
+                why = "cameras or masks are wrong"
     wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else []
     return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
 
@@ -222,8 +225,8 @@ def facing(scene: Capture, center: np.ndarray) -> str | None:
 def findings(scene: Capture, rows: list[Row], center: np.ndarray) -> list[str]:
     """What is to be mended, each in one line."""
     found = []
-    agreements = [row.agreement for row in rows if row.agreement is not None]
-    if scene.whole and agreements and np.median(agreements) >= CONFORMS:  # those of bright parts only need not agree
+    agree = [row.agreement for row in rows if row.agreement is not None]
+    if scene.whole and agree and np.median(agree) >= CONFORMS:  # those of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
         if not strays and max(sensor.size[0] for sensor in scene.sensors) <= WIDTH:
             found += filter(None, [half_pixel(scene.hull)])

@@ -18,10 +18,8 @@ COMMANDS = ("convert", "check", "fit", "render", "evaluate", "validate")
 
 def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP):
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood."""
-    for word in (*arguments, os.getcwd()):  # a file's name may be any bytes
-        shown = os.fsencode(word).decode(errors="replace")
-        if shown != word:
-            raise InputError(f"{shown}: this name is not UTF-8, which Mitsuba and XML need; rename it")
+    for word in (*arguments, os.getcwd()):
+        require_utf8(word)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -30,6 +28,13 @@ def parse(config_type: type, arguments: Sequence[str], program: str, default=tyr
         if not stop.code:
             raise
         raise InputError(complaint_in(box.getvalue())) from None
+
+
+def require_utf8(name: str) -> None:
+    """Raise InputError for a file's name that is not UTF-8: it may be any bytes."""
+    shown = os.fsencode(name).decode(errors="replace")
+    if shown != name:
+        raise InputError(f"{shown}: this name is not UTF-8, which Mitsuba and XML need; rename it")
 
 
 def complaint_in(box: str) -> str:

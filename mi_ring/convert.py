@@ -31,8 +31,7 @@ def check(frames: Sequence[Frame], source: Path) -> None:
         raise InputError(f"{source}: SRC: found no photographs")
     for frame in frames:
         what = f"{frame.image}: camera"
-        if (shown := os.fsencode(frame.image).decode(errors="replace")) != str(frame.image):
-            raise InputError(f"{shown}: this name is not UTF-8, which XML needs; rename it")
+        command.require_utf8(str(frame.image))
         rotation = frame.pose[:3, :3]
         if not np.allclose(frame.pose[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{what}: the last row of its pose is {frame.pose[3]}, must be 0 0 0 1; is it transposed?")
