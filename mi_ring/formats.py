@@ -520,7 +520,8 @@ def load_json(path: Path):
 
 def load_table(path: Path, columns: int) -> np.ndarray:
     """A text file of so many numbers a line."""
-    if load(path, "table of numbers", Path.read_text).isspace() or not path.stat().st_size:
+    text = load(path, "table of numbers", Path.read_text)
+    if not text.strip():
         raise InputError(f"{path}: is empty; must have {columns} numbers a line")
-    table = load(path, "table of numbers", lambda file: np.loadtxt(file, ndmin=2))
+    table = load(path, "table of numbers", lambda _: np.loadtxt(text.splitlines(), ndmin=2))
     return matrix(table, (len(table), columns), str(path))
