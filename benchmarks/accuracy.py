@@ -32,6 +32,7 @@ COLUMNS = ("normal_mean", "normal_median", "depth_mean", "depth_median", "iou", 
 HIGHER_IS_BETTER = ("iou", "psnr_input", "psnr_novel", "GFLOP/s")
 COSTS = ("fit s", "wall s", "GiB, at most", "GFLOP/s")
 POINTS = 8  #: of the curve
+REPEATS = 7  #: of what is timed by itself
 
 
 def scene_file(path: str) -> Path:
@@ -91,19 +92,24 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB → GiB
 
 
+def median_seconds(*functions) -> list[float]:
+    """Median time of a call of each, called in turn so that a busy machine slows all alike, after one to warm up."""
+    times = [[] for _ in functions]
+    for _ in range(REPEATS + 1):
+        for function, results in zip(functions, times):
+            before = time.perf_counter()
+            function()
+            results.append(time.perf_counter() - before)
+    return [statistics.median(results[1:]) for results in times]
+
+
 def product_speed(rows: int, width: int, dtype) -> float:
-    """FLOP/s of (rows, width) @ (width, width): the median of some repeats, after one to warm up."""
+    """FLOP/s of (rows, width) @ (width, width)."""
     import torch  # here, for the reason given in watch()
 
     a, b = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
     times = max(1, 2**33 // (rows * width * width))
-    seconds = []
-    for _ in range(8):
-        before = time.perf_counter()
-        for _ in range(times):
-            torch.mm(a, b)
-        seconds.append(time.perf_counter() - before)
-    return times * 2 * rows * width * width / statistics.median(seconds[1:])
+    return times * 2 * rows * width * width / median_seconds(lambda: [torch.mm(a, b) for _ in range(times)])[0]
 
 
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:

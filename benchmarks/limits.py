@@ -9,11 +9,9 @@ what a picture of eight photographs takes with gradients, without them, and if r
 
 import argparse
 import datetime
-import statistics
-import time
 from pathlib import Path
 
-from accuracy import processor, product_speed, table
+from accuracy import median_seconds, processor, product_speed, table
 
 from mi_ring import bridge, capture, fit, integrator
 
@@ -24,19 +22,6 @@ from torch.nn import functional as F
 
 from mi_ring.domain import Sphere
 from mi_ring.shapenet import SLOPE, ShapeNet
-
-REPEATS = 7
-
-
-def seconds(*functions) -> list[float]:
-    """Median time of a call of each, called in turn so that a busy machine slows all alike, after one to warm up."""
-    times = [[] for _ in functions]
-    for _ in range(REPEATS + 1):
-        for function, results in zip(functions, times):
-            before = time.perf_counter()
-            function()
-            results.append(time.perf_counter() - before)
-    return [statistics.median(results[1:]) for results in times]
 
 
 def flow_speed(s, steps: int, dtype) -> tuple[float, float]:
@@ -49,7 +34,7 @@ def flow_speed(s, steps: int, dtype) -> tuple[float, float]:
             x = net(s)
         x.backward(torch.ones_like(x))
 
-    t = seconds(run)[0]
+    t = median_seconds(run)[0]
     return 3 * 2 * weights * steps * len(s) / t, t
 
 
@@ -81,7 +66,7 @@ def layer(level: int) -> str:
         "gradient of the weights": lambda: back.T @ x,
         "gradient of the bias": lambda: back.sum(0),
     }
-    times = dict(zip(parts, seconds(*parts.values())))
+    times = dict(zip(parts, median_seconds(*parts.values())))
     plain, *others = times.values()
     lines = [[name, f"{1000 * t:.2f}"] for name, t in times.items()]
     lines.append(["all but the first", f"{1000 * sum(others):.2f}"])
@@ -121,7 +106,8 @@ def rendering(scene: Path, level: int) -> str:
         "a picture: rays, rays to the light, shading": lambda: bridge.draw(surface, photographs, spp=1),
         "a picture with all gradients: all of the above, edges, and back": gradients,
     }
-    rows = [[name, f"{1000 * t:.0f}", f"{pixels / t / 1e6:.1f}"] for name, t in zip(parts, seconds(*parts.values()))]
+    times = zip(parts, median_seconds(*parts.values()))
+    rows = [[name, f"{1000 * t:.0f}", f"{pixels / t / 1e6:.1f}"] for name, t in times]
     views = f"{len(photographs)} photographs of {size[0]} × {size[1]} of {scene.name}, {len(s):,} vertices"
     return f"{views}:\n\n" + table(["part", "ms", "million pixels per second"], rows)
 

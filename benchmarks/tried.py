@@ -9,8 +9,7 @@ import argparse
 import datetime
 import time
 
-from accuracy import alone, processor, table
-from limits import seconds
+from accuracy import alone, median_seconds, processor, table
 
 from mi_ring import fit, losses, shapenet
 
@@ -50,7 +49,7 @@ def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
     fit.set_threads(fit.parse(["scene.xml"]))
     torch.manual_seed(0)
-    return seconds(flow(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
+    return median_seconds(flow(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
 
 
 def doubled(x):
@@ -87,11 +86,11 @@ def main() -> None:
     rows = []
 
     def compare(idea, as_it_is, tried, note=""):
-        rows.append([idea, *(f"{1000 * t:.3g}" for t in seconds(as_it_is, tried)), note])
+        rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
     compare("flow: gradient by autograd instead of by hand", flow(net, s), flow(net, s, net.velocity))
     compare("flow: chunks of 2,048 points instead of 8,192 at most", flow(net, s), chunked(net, s, 2048))
-    rows.append(["flow: freed memory returned to the system", f"{1000 * seconds(flow(net, s))[0]:.3g}",
+    rows.append(["flow: freed memory returned to the system", f"{1000 * median_seconds(flow(net, s))[0]:.3g}",
                  f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
 
     encode = PosEnc()
