@@ -12,7 +12,7 @@ from PIL import Image
 
 from mi_ring import bridge, capture
 from mi_ring.capture import linear_to_srgb, to_bytes
-from mi_ring.results import load_ring
+from mi_ring.ring import Ring
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--photograph", type=int, default=7)
     arguments = parser.parse_args()
 
-    scene, ring = capture.load(arguments.run / "scene.xml"), load_ring(arguments.run)
+    scene, ring = capture.load(arguments.run / "scene.xml"), Ring.load(arguments.run)
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     k = arguments.photograph
     photograph = scene.photograph(k)

@@ -77,12 +77,12 @@ class Surface:
         self.written += 1
         return list(arrays.values())
 
-    def show(self, ring, s: Tensor, faces: np.ndarray) -> None:
-        """Write a `Ring` at domain points (V, 3) with these triangles."""
+    def show(self, ring, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
+        """Write a `Ring` at domain points (V, 3) with these triangles, where the flow has them at `time` in [0, 1]."""
         with torch.no_grad():
             self.set_faces(faces)
             s = s.to(ring.center.device)
-            self.write(ring.surface(s), ring.brdf_net(s))
+            self.write(ring.surface(s, time), ring.brdf_net(s))
 
 
 class _Render(torch.autograd.Function):

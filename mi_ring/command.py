@@ -13,7 +13,7 @@ import tyro
 
 from mi_ring.errors import InputError
 
-COMMANDS = ("convert", "check", "fit", "render", "evaluate", "validate")
+COMMANDS = ("convert", "check", "fit", "render", "export", "evaluate", "validate")
 
 
 def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP):

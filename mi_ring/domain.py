@@ -77,6 +77,14 @@ class Domain:
             inside[inside] = fast_winding_number(points[inside], *mesh) > 0.5
         return inside
 
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """The points of the surface that are nearest to these (N, 3)."""
+        from gpytoolbox import squared_distance  # here, for it takes a second
+
+        faces = self.faces.astype(np.int32)
+        _, face, weights = squared_distance(points.astype(float), self.points.astype(float), faces, use_cpp=True)
+        return (self.points[self.faces[face]] * weights[..., None]).sum(1)
+
     def triangulate(self, level: int):
         """The surface in about 20 · 4^level triangles."""
         if level > FINEST:
@@ -135,6 +143,9 @@ class Sphere(Domain):
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points, axis=1) < 1
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        return points / np.linalg.norm(points, axis=1, keepdims=True)
 
     def triangulate(self, level: int):
         mesh = trimesh.creation.icosphere(subdivisions=level)

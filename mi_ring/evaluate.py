@@ -15,7 +15,6 @@ from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.domain import read_mesh
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, center_rays
-from mi_ring.results import load_ring
 from mi_ring.ring import Ring
 
 
@@ -91,7 +90,7 @@ def psnr(scene: capture.Capture, ring: Ring, subdivisions: int, spp: int) -> flo
 
 def evaluate(run: Path, mesh: Path, novel: Path | None = None, spp: int = 16) -> dict[str, float]:
     """The paper's columns for the results folder `run`."""
-    ring = load_ring(run)
+    ring = Ring.load(run)
     subdivisions = json.loads((run / "config.json").read_text())["subdivisions"]
     scene = capture.load(run / "scene.xml")
     unseen = novel and capture.load(novel)

@@ -52,7 +52,8 @@ class Fit:
                              "times the light that it gets, which the ranges of --parameters do not reach; give "
                              "the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and self.albedo < 1
-        self.ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps)
+        self.ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps,
+                         config.subdivisions)  # fmt: skip
         self.device = bridge.device()
         self.ring.to(self.device)
         self.surface = bridge.Surface(scene.scene, scene.shape, self.ring)

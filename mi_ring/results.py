@@ -16,6 +16,7 @@ from mi_ring import bridge, report
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.config import Config
 from mi_ring.errors import InputError
+from mi_ring.mesh import FACES, POSITIONS
 from mi_ring.reflectance import bsdf_element
 from mi_ring.ring import Ring
 
@@ -119,7 +120,7 @@ def write_inputs(path: Path, fit) -> None:
 def write(folder: Path, fit, fitted_scene: bytes) -> None:
     """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
     save(fit.ring.state(fit.config.settings()), folder / "ring.pt")
-    write_mesh(folder / "ring.pt", fit.config.subdivisions, folder / "mesh.ply")
+    write_mesh(fit.ring, fit.config.subdivisions, folder / "mesh.ply")
     replace(folder / "scene.xml", fitted_scene)
     s, faces = fit.ring.domain.sample(fit.config.subdivisions)
     fit.surface.show(fit.ring, s, faces)
@@ -127,9 +128,19 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 
-def write_mesh(weights: Path, subdivisions: int, path: Path) -> None:
+def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> None:
     """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …)."""
-    mesh = mi.load_dict({"type": "shapenet", "weights": str(weights.resolve()), "subdivisions": subdivisions})
+    s, faces = ring.domain.sample(subdivisions)
+    with torch.no_grad():
+        s = s.to(ring.center.device)
+        vertices, material = ring.surface(s, time), ring.brdf_net(s)
+    mesh = mi.Mesh("object", len(s), len(faces), has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params[POSITIONS] = mi.Float(vertices.cpu().numpy().ravel())
+    params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+    params.update()
+    for name, value in material.items():
+        mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
     stream = mi.MemoryStream()
     mesh.write_ply(stream)
     replace(path, stream.raw_buffer())
@@ -159,7 +170,3 @@ def scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes
     ElementTree.indent(tree)
     return ElementTree.tostring(tree.getroot(), "utf-8")
 
-
-def load_ring(run: Path) -> Ring:
-    """The ring of a results folder, or of a ring.pt itself."""
-    return Ring.load(run / "ring.pt" if run.is_dir() else run)

@@ -17,23 +17,24 @@ class Ring(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
 
     `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
-    `indirect`: was interreflection part of the fit, so that it belongs into pictures?
+    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level at which
+    the surface is best sampled; between the vertices of the fit the networks are less certain.
     """
 
     def __init__(
         self, center, radius: float, scale: float = 1.0, domain: Domain | None = None, parameters=COOK_TORRANCE,
-        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20,
+        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
     ):  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = ShapeNet(steps), BRDFNet(scale, parameters)
-        self.bsdf, self.indirect = bsdf, indirect
+        self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.domain = domain or Sphere()
 
-    def surface(self, s: Tensor) -> Tensor:
-        """Surface points (V, 3) [scene units] of domain points (V, 3)."""
-        return self.center + self.radius * self.shape_net(s)
+    def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
+        """Surface points (V, 3) [scene units] of domain points (V, 3); at another `time` where the flow has them then."""
+        return self.center + self.radius * self.shape_net(s, time)
 
     def state(self, config: dict | None = None) -> dict:
         domain = None
@@ -49,13 +50,17 @@ class Ring(nn.Module):
     def from_state(cls, state: dict) -> "Ring":
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
         properties = {name: state[name] for name in ("parameters", "bsdf", "indirect", "steps")}
+        if "subdivisions" in state["config"]:
+            properties["subdivisions"] = state["config"]["subdivisions"]
         ring = cls(torch.zeros(3), 1.0, domain=domain, **properties)
         ring.load_state_dict(state["networks"])
         return ring
 
     @classmethod
     def load(cls, path: str | Path) -> "Ring":
-        """Read `ring.pt`. Raises InputError if the file is missing, is no ring or is of another format version."""
+        """Read `ring.pt`, given itself or its folder. Raises InputError if it is missing, no ring or of another version."""
+        path = Path(path)
+        path = path / "ring.pt" if path.is_dir() else path
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             version = state["format"]

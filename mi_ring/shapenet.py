@@ -45,9 +45,11 @@ class ShapeNet(nn.Module):
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
         return _Flow.apply(x, 1 / self.steps, steps, self.speed, dtype, torch.is_grad_enabled(), *parameters)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Φ(x, 1)"""
-        return self.flow(x, self.steps)
+    def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
+        """Φ(x, time), `time` in [0, 1]; where that is between two Euler steps, by a part of the second."""
+        steps = int(time * self.steps)
+        x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
+        return x + rest * self.velocity(x) if rest else x
 
 
 def euler(velocity, x: Tensor, dt: float, steps: int) -> Tensor:

@@ -21,6 +21,7 @@ from mi_ring import capture, command, fit, render, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.domain import Domain, Sphere
 from mi_ring.errors import InputError
+from mi_ring.ring import Ring
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
 FILES = ["scene.xml", "ring.pt", "mesh.ply", "config.json", "log.jsonl", "inputs.png", "report.html", "checkpoint.pt"]
@@ -57,7 +58,7 @@ def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
 
 
 def test_steps_of_the_flow_are_part_of_the_result(finished):
-    assert results.load_ring(finished).shape_net.steps == Config("scene.xml").steps != 20
+    assert Ring.load(finished).shape_net.steps == Config("scene.xml").steps != 20
 
 
 def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
@@ -261,7 +262,7 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
     assert distance(run / "mesh.ply") < 0.04  # hardly a fit: it is the start that is near
     mesh = trimesh.load(run / "mesh.ply", process=False)
     assert mesh.is_watertight and mesh.euler_number == 2
-    domain = results.load_ring(run).domain
+    domain = Ring.load(run).domain
     assert type(domain) is Domain and np.linalg.norm(domain.points, axis=1).mean() == pytest.approx(1, abs=0.01)
     again = mi.load_dict({"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 3})
     vertices = np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)

@@ -10,7 +10,7 @@ import trimesh
 
 from mi_ring import bridge, capture, fit, reflectance
 from mi_ring.errors import InputError
-from mi_ring.results import load_ring
+from mi_ring.ring import Ring
 
 QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
 PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
@@ -45,7 +45,7 @@ def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
     """The result's own scene, rendered by stock Mitsuba, is what the fit predicts."""
     out = tmp_path / "run"
     assert fit.main(arguments(scene[0], out)) == 0
-    ring = load_ring(out)
+    ring = Ring.load(out)
     assert [p.name for p in ring.brdf_net.bsdf_parameters] == list(PREDICT)
     saved = trimesh.load(out / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
     assert any("base_color" in name for name in saved.dtype.names)
@@ -62,7 +62,7 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
     """Shown in a scene whose shape has another BSDF, the fitted object looks the same."""
     out = tmp_path / "run"
     assert fit.main([*arguments(scene[0], out), "--no-indirect"]) == 0
-    ring, pictures = load_ring(out), []
+    ring, pictures = Ring.load(out), []
     for path in (out / "scene.xml", small_capture):
         loaded = capture.load(path)
         surface = bridge.Surface(loaded.scene, loaded.shape, ring)
@@ -105,7 +105,7 @@ def test_cooktorrance_keeps_its_distribution(broken_capture, tmp_path):
     given = '<bsdf type="cooktorrance"><string name="distribution" value="beckmann"/></bsdf>'
     edit('<bsdf type="cooktorrance"/>', given)
     assert fit.main([str(path), "--out", str(tmp_path / "run"), *QUICK, "--no-indirect"]) == 0
-    assert "beckmann" in load_ring(tmp_path / "run").bsdf
+    assert "beckmann" in Ring.load(tmp_path / "run").bsdf
     assert "beckmann" in str(mi.load_file(str(tmp_path / "run" / "scene.xml")).shapes()[0].bsdf())
 
 
