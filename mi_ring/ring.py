@@ -36,6 +36,7 @@ class Ring(nn.Module):
         return self.center + self.radius * self.shape_net(s)
 
     def state(self, config: dict | None = None) -> dict:
+        """What `ring.pt` holds, to be written by `torch.save`."""
         domain = None
         if not isinstance(self.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
             domain = {"points": torch.tensor(self.domain.points), "faces": torch.tensor(self.domain.faces)}
@@ -47,6 +48,7 @@ class Ring(nn.Module):
 
     @classmethod
     def from_state(cls, state: dict) -> "Ring":
+        """The inverse of `state`."""
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
         properties = {name: state[name] for name in ("parameters", "bsdf", "indirect", "steps")}
         ring = cls(torch.zeros(3), 1.0, domain=domain, **properties)
