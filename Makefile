@@ -9,13 +9,14 @@ ARGS   ?=
 
 RUN = $(VENV)/bin/python -m
 
-.PHONY: help setup fit test lint clean
+.PHONY: help setup fit test lint docs clean
 
 help:
 	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
 	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE)'
 	@echo 'make test [ARGS=...]         run pytest'
 	@echo 'make lint                    run ruff'
+	@echo 'make docs                    build the documentation: build/docs/index.html'
 	@echo 'make clean                   remove caches; $(VENV) stays'
 
 setup: $(VENV)/.setup-done
@@ -49,6 +50,10 @@ test: setup
 
 lint: setup
 	$(RUN) ruff check .
+
+docs: setup
+	$(RUN) sphinx -W --keep-going -q docs build/docs
+	@echo build/docs/index.html
 
 clean:
 	rm -rf .pytest_cache .ruff_cache build *.egg-info

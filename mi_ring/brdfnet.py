@@ -15,10 +15,10 @@ class Parameter(NamedTuple):
     """A parameter of a BSDF that BRDF-Net predicts."""
 
     name: str
-    channels: int  # 1 or 3
+    channels: int  #: 1 or 3
     low: float
-    high: float  # inf: no upper end
-    start: float = 0.0  # is added to the network's output, before that is brought into the range
+    high: float  #: inf: no upper end
+    start: float = 0.0  #: is added to the network's output, before that is brought into the range
 
 
 #: The paper's five numbers.

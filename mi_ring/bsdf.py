@@ -17,21 +17,24 @@ DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Bec
 class CookTorrance(mi.BSDF):
     """The paper's reflectance, equation 1: B = ρᵈ + ρᵞ · D(n, h; r) · G(i, o; r) / (π (n·i)(n·o)).
 
-    ================ =================== ========================================================================
-    parameter        type                meaning
-    ================ =================== ========================================================================
-    ``diffuse``      texture (rgb)       ρᵈ; the diffuse term has no 1/π. Default: mesh attribute
-                                         ``vertex_diffuse``
-    ``specular``     texture (1 channel) ρᵞ; Fresnel is constant and folded in. Default: ``vertex_specular``
-    ``roughness``    texture (1 channel) r, the width α of the distribution itself. Default: ``vertex_roughness``
-    ``distribution`` string              D and the G that belongs to it: ``ggx`` (default) or ``beckmann``
-    ================ =================== ========================================================================
+    ================ ================= ================================================================= =====
+    Parameter        Type              Description                                                       Flags
+    ================ ================= ================================================================= =====
+    ``diffuse``      rgb or texture    ρᵈ; the diffuse term has no 1/π. Default: the mesh attribute      P, ∂
+                                       ``vertex_diffuse``
+    ``specular``     float or texture  ρᵞ; Fresnel is constant and folded in. Default: the mesh          P, ∂
+                                       attribute ``vertex_specular``
+    ``roughness``    float or texture  r, the width α of the distribution itself, 0.02 at the least.     P, ∂
+                                       Default: the mesh attribute ``vertex_roughness``
+    ``distribution`` string            D and the G that belongs to it: ``ggx`` or ``beckmann``.
+                                       Default: ``ggx``
+    ================ ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
     Rough Surfaces): D is equation 33 (GGX) or 25 (Beckmann) without its 1/π, G Smith's product of equations 34 or 27,
     the latter Walter's rational fit to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor`` with F = 1.
 
-    **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh:
+    **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
@@ -44,11 +47,23 @@ class CookTorrance(mi.BSDF):
 
     Raises ValueError if ``distribution`` is neither of the two.
 
-    .. code-block:: xml
+    .. tab-set-code::
 
-        <bsdf type="cooktorrance"><rgb name="diffuse" value="0.2, 0.1, 0.1"/>
-          <float name="specular" value="0.05"/><float name="roughness" value="0.3"/>
-          <string name="distribution" value="beckmann"/></bsdf>
+        .. code-block:: xml
+
+            <bsdf type="cooktorrance">
+              <rgb name="diffuse" value="0.2, 0.1, 0.1"/>
+              <float name="specular" value="0.05"/>
+              <float name="roughness" value="0.3"/>
+              <string name="distribution" value="beckmann"/>
+            </bsdf>
+
+        .. code-block:: python
+
+            {
+                "type": "cooktorrance", "diffuse": {"type": "rgb", "value": [0.2, 0.1, 0.1]},
+                "specular": 0.05, "roughness": 0.3, "distribution": "beckmann",
+            }
     """
 
     def __init__(self, props):

@@ -33,11 +33,11 @@ class Capture:
     scene: mi.Scene
     shape: "mesh.ShapeNetMesh"
     sensors: list
-    images: list[np.ndarray]  # (H, W, 3) uint8, uint16 or float32 each
-    linear: list[bool]  # are the encoded pixels linear radiance, or sRGB?
-    masks: list[np.ndarray | None]  # (H, W) uint8, 0 background, 255 object
+    images: list[np.ndarray]  #: (H, W, 3) uint8, uint16 or float32 each
+    linear: list[bool]  #: are the encoded pixels linear radiance, or sRGB?
+    masks: list[np.ndarray | None]  #: (H, W) uint8, 0 background, 255 object
     shadows: bool
-    threshold: float | None = None  # radiance by which masks were found in the photographs; None if they were not
+    threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were not
 
     def __post_init__(self):
         self.photographs = Photographs.of(self.sensors)

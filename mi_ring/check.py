@@ -1,17 +1,17 @@
-"""Is a capture usable? `python -m mi_ring.check SCENE.xml`."""
+"""Say whether a capture is usable, and what is wrong with it: `python -m mi_ring.check SCENE.xml`."""
 
 import copy
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw
 from scipy import ndimage
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring import capture, command
 from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
@@ -38,12 +38,13 @@ class CheckConfig:
     something to mend.
     """
 
-    scene: Positional[Path]
+    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
     """Picture to write. Default: out/check/<name>.png."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """As in mi_ring.fit."""
+    """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
+    room; none: as if it had none."""
 
 
 @dataclass
@@ -51,15 +52,15 @@ class Row:
     """What there is to say of one photograph. Distances are in radii of the normalising sphere."""
 
     name: str
-    distance: float  # from the camera to the object
-    light: float  # from the light to the object; infinite if it is distant
-    angle: float  # between light and camera, seen from the object [deg]
-    object: float | None  # share of the photograph that is object
-    clipped: float  # share of the object that is clipped
-    dark: float  # share of the object that is black, or nearly
-    background: float | None  # brightness of what is not object, in that of the object
-    brightness: float  # brightness of the object, for the light it gets
-    agreement: float | None  # share of the mask that the other masks agree to
+    distance: float  #: from the camera to the object
+    light: float  #: from the light to the object; infinite if it is distant
+    angle: float  #: between light and camera, seen from the object [deg]
+    object: float | None  #: share of the photograph that is object
+    clipped: float  #: share of the object that is clipped
+    dark: float  #: share of the object that is black, or nearly
+    background: float | None  #: brightness of what is not object, in that of the object
+    brightness: float  #: brightness of the object, for the light it gets
+    agreement: float | None  #: share of the mask that the other masks agree to
 
 
 HEADS = (

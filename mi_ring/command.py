@@ -1,5 +1,6 @@
 """What all commands share: arguments from a dataclass, one line for a user's mistake, the `mi-ring` entry point."""
 
+import ast
 import contextlib
 import importlib
 import io
@@ -13,17 +14,24 @@ import tyro
 
 from mi_ring.errors import InputError
 
+#: Modules of the package; the first line of each says what the command does and ends in how it is called.
 COMMANDS = ("convert", "check", "fit", "render", "export", "evaluate", "validate")
 
 
-def parse(config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP):
-    """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood."""
+def parse(
+    config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP,
+    description: str | None = None,
+):  # fmt: skip
+    """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood.
+
+    The help begins with `description`, by default the docstring of the dataclass.
+    """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(config_type, args=list(arguments), prog=program, default=default)
+            return tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -75,12 +83,29 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
         sys.exit(2)
 
 
+def summary(name: str) -> tuple[str, str]:
+    """How a command is called, and what it does, by the first line of its module, which is not imported."""
+    source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
+    sentence, _, call = ast.get_docstring(ast.parse(source)).split("\n")[0].partition("`python -m mi_ring.")
+    return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")
+
+
+def overview() -> str:
+    """The help of `mi-ring`: every command in two lines."""
+    lines = ["usage: mi-ring COMMAND …", ""]
+    for usage, sentence in map(summary, COMMANDS):
+        lines += [f"  {usage}", f"      {sentence}"]
+    return "\n".join([*lines, "", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same."])
+
+
 def main() -> None:
     """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in ("-h", "--help"):
+        print(overview())
+        sys.exit(0)
     if name not in COMMANDS:
-        help_asked = name in ("-h", "--help")
-        print(f"usage: mi-ring {{{','.join(COMMANDS)}}} …; mi-ring COMMAND --help tells more",
-              file=sys.stdout if help_asked else sys.stderr)  # fmt: skip
-        sys.exit(0 if help_asked else 2)
+        what = f"is {name}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
+        print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
+        sys.exit(2)
     run(f"mi-ring {name}", importlib.import_module(f"mi_ring.{name}").main, sys.argv[2:])

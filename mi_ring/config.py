@@ -5,9 +5,9 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring.command import name_of
 from mi_ring.errors import InputError
@@ -19,17 +19,17 @@ EXCHANGE = 0.5  #: iterations of the second stage that take about as long as one
 class Stage(NamedTuple):
     """One stage of coarse to fine."""
 
-    level: int  # of the icosphere
-    width: int  # of the photographs, at most [px]
-    first: int  # iteration
-    last: int  # iteration after the last
+    level: int  #: of the icosphere
+    width: int  #: of the photographs, at most [px]
+    first: int  #: iteration
+    last: int  #: iteration after the last
 
 
 @dataclass(frozen=True)
 class Config:
     """Reconstruct an object: photographs in, a watertight mesh with a spatially varying material out."""
 
-    scene: Positional[Path]
+    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
     """Folder of the results. Default: out/<name>, the name of the scene file, or of its folder if it is scene.xml."""
@@ -46,7 +46,7 @@ class Config:
     seed: int = 0
     """Of every random choice."""
     iterations: int = 500
-    """In all, shared out among the stages. From a hull or a mesh it is some fewer, see `shares`."""
+    """In all, shared out among the stages. From a hull or a mesh it is some fewer, see --shares."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
     widths: tuple[int, ...] = (128, 256, 512)
@@ -70,7 +70,8 @@ class Config:
     indirect: bool = True
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
-    """Weight of each term of the loss; 0 switches a term off. velocity: the paper's lambda."""
+    """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
+    flow is, the paper's lambda."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
     while it finds its place, weak at the end, for details."""

@@ -1,4 +1,4 @@
-"""Bring photographs in: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
+"""Bring photographs in from other tools: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
 
 import contextlib
 import os
@@ -21,6 +21,10 @@ from mi_ring.formats import FORMATS, Frame, camera_of, image_size, read
 from mi_ring.results import replace, write_image
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
+
+DESCRIPTION = """Write a scene file for photographs in the format of another tool.
+
+Lens distortion is undone; units and frame stay as they are. mi_ring.convert FORMAT --help tells more."""
 
 Formats = Union[tuple(Annotated[source, tyro.conf.subcommand(name)] for name, source in FORMATS.items())]  # noqa: UP007
 
@@ -209,7 +213,7 @@ def main(arguments: Sequence[str]) -> None:
     """The command."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in FORMATS:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
-    source = command.parse(Formats, arguments, "mi_ring.convert")
+    source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
     frames = list(source.frames())
     check(frames, source.src)
     names = [frame.name or frame.image.stem for frame in frames]

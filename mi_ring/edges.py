@@ -28,13 +28,13 @@ def leave(point, distance):
 class Curve:
     """Samples of curves in space, any number per photograph."""
 
-    view: mi.UInt32  # the photograph
-    point: mi.Point3f  # attached to what moves the curve
-    tangent: mi.Vector3f  # detached: the piece of the curve that the sample stands for [scene units]
-    inside: mi.Point3f  # detached: what the curve bounds lies on this side of it
+    view: mi.UInt32  #: the photograph
+    point: mi.Point3f  #: attached to what moves the curve
+    tangent: mi.Vector3f  #: detached: the piece of the curve that the sample stands for [scene units]
+    inside: mi.Point3f  #: detached: what the curve bounds lies on this side of it
     active: mi.Bool
-    offset: float  # how far to both sides of it one has to look [px]
-    shadow: bool = False  # is it an edge of light and not of a shape?
+    offset: float  #: how far to both sides of it one has to look [px]
+    shadow: bool = False  #: is it an edge of light and not of a shape?
 
 
 class Edges:

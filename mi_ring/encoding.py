@@ -17,6 +17,7 @@ class PosEnc(nn.Module):
         self.width = 6 * frequencies
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features of points."""
         omega = torch.arange(1, self.frequencies + 1, dtype=x.dtype, device=x.device)
         phase = (x[..., None, :] * omega[:, None]).flatten(-2)
         return torch.cat([phase.cos(), phase.sin()], dim=-1)

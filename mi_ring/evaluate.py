@@ -1,14 +1,15 @@
-"""How far a fit is from the truth: `python -m mi_ring.evaluate RUN --mesh TRUTH.ply`."""
+"""Compare a fit with the truth: `python -m mi_ring.evaluate RUN --mesh TRUTH.ply`."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
 import trimesh
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring import bridge, capture, command
 from mi_ring.capture import linear_to_srgb, to_bytes
@@ -22,7 +23,7 @@ from mi_ring.ring import Ring
 class EvaluateConfig:
     """Compare a finished fit with the truth and print the paper's numbers as one line of JSON."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit."""
     mesh: Path
     """True surface in the units and frame of the scene: PLY, OBJ or GLB."""

@@ -1,4 +1,4 @@
-"""The fit: `python -m mi_ring.fit scenes/pot2.xml`."""
+"""Reconstruct an object from its photographs: `python -m mi_ring.fit SCENE.xml`."""
 
 import argparse
 import contextlib

@@ -31,8 +31,8 @@ class Light(NamedTuple):
     """Of one photograph, in the world."""
 
     kind: Literal["point", "directional"]
-    vector: np.ndarray  # (3,) position, or direction in which the light travels
-    rgb: np.ndarray  # (3,) intensity or irradiance
+    vector: np.ndarray  #: (3,) position, or direction in which the light travels
+    rgb: np.ndarray  #: (3,) intensity or irradiance
 
 
 @dataclass
@@ -40,15 +40,15 @@ class Frame:
     """A photograph, its camera and its light."""
 
     image: Path
-    camera: pycolmap.Camera  # size, focal lengths, principal point, distortion [px]
-    pose: np.ndarray  # (4, 4) camera-to-world, OpenCV's axes
-    mask: Path | None = None  # of the same size; `image` itself if its alpha channel is meant
-    light: Light | None = None  # None: a point light of intensity 1 at the camera
-    saturation: float | None = None  # encoded value at which pixels are clipped, if not full scale
-    encoding: str | None = None  # "srgb" or "linear", if it is not what the type of file implies
-    name: str = ""  # in the scene; that of the file, without suffix, if empty
-    pixels: np.ndarray | None = None  # of an image that is no file yet, (H, W, 3) float32
-    fill_mask: bool = False  # fill the holes in the mask
+    camera: pycolmap.Camera  #: size, focal lengths, principal point, distortion [px]
+    pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
+    mask: Path | None = None  #: of the same size; `image` itself if its alpha channel is meant
+    light: Light | None = None  #: None: a point light of intensity 1 at the camera
+    saturation: float | None = None  #: encoded value at which pixels are clipped, if not full scale
+    encoding: str | None = None  #: "srgb" or "linear", if it is not what the type of file implies
+    name: str = ""  #: in the scene; that of the file, without suffix, if empty
+    pixels: np.ndarray | None = None  #: of an image that is no file yet, (H, W, 3) float32
+    fill_mask: bool = False  #: fill the holes in the mask
 
     @property
     def size(self) -> tuple[int, int]:

@@ -29,11 +29,11 @@ class NoHull(InputError):
 class Silhouette(NamedTuple):
     """A mask and its camera."""
 
-    mask: np.ndarray  # (H, W) uint8, object above 127
-    matrix: np.ndarray  # (4, 4) camera-to-world, Mitsuba's axes
-    focal: np.ndarray  # (2,) [px]
-    centre: np.ndarray  # (2,) [px]
-    name: str  # for messages
+    mask: np.ndarray  #: (H, W) uint8, object above 127
+    matrix: np.ndarray  #: (4, 4) camera-to-world, Mitsuba's axes
+    focal: np.ndarray  #: (2,) [px]
+    centre: np.ndarray  #: (2,) [px]
+    name: str  #: for messages
 
 
 def shrink(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:

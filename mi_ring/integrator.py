@@ -22,11 +22,11 @@ class Photometric(ADIntegrator):
     rendered, B · max(0, n·i) · irradiance for a directional one. Emitters at the top level of the scene (an environment
     map, a lamp) light every photograph, one emitter sample each.
 
-    =========== ===== =================================================================================
-    parameter   type  meaning
-    =========== ===== =================================================================================
-    ``shadows`` bool  is a point lit only if it sees the light? Default: true
-    =========== ===== =================================================================================
+    =========== ======= =============================================================================== =====
+    Parameter   Type    Description                                                                     Flags
+    =========== ======= =============================================================================== =====
+    ``shadows`` boolean is a point lit only if it sees the light of its photograph? Default: true
+    =========== ======= =============================================================================== =====
 
     Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
 
@@ -36,12 +36,19 @@ class Photometric(ADIntegrator):
     al. 2018, "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
 
     What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
-    about the photographs' own lights, others always cast shadows. Gradients need an RGB variant and a `photograph`
-    sensor; the soft shadows of area lights and environment maps give none when they move.
+    about the photographs' own lights, others always cast shadows. What Mitsuba's integrators have in common
+    (``max_depth``, ``hide_emitters``, …) is accepted and has no effect. Gradients need an RGB variant and a
+    `photograph` sensor; the soft shadows of area lights and environment maps give none when they move.
 
-    .. code-block:: xml
+    .. tab-set-code::
 
-        <integrator type="photometric"><boolean name="shadows" value="true"/></integrator>
+        .. code-block:: xml
+
+            <integrator type="photometric"><boolean name="shadows" value="true"/></integrator>
+
+        .. code-block:: python
+
+            {"type": "photometric", "shadows": True}
     """
 
     def __init__(self, props=None):
@@ -148,12 +155,12 @@ class Photographs:
     `index` (UInt32) selects and orders them; `size` is (width, height) [px] of every selected photograph.
     """
 
-    cameras: object  # Float, 12 per photograph: the upper three rows of to_world
-    intrinsics: object  # Float, 4 per photograph: fx, fy, cx, cy [px]
-    lights: object  # Float, 8 per photograph: position or direction toward it, 0 point | 1 distant, intensity, unused
+    cameras: object  #: Float, 12 per photograph: the upper three rows of to_world
+    intrinsics: object  #: Float, 4 per photograph: fx, fy, cx, cy [px]
+    lights: object  #: Float, 8 per photograph: position or direction toward it, 0 point | 1 distant, intensity, unused
     index: object
     size: tuple[int, int]
-    colocated: bool  # is every light at its camera's centre? Then nothing that is seen is in shadow
+    colocated: bool  #: is every light at its camera's centre? Then nothing that is seen is in shadow
 
     @classmethod
     def of(cls, sensors) -> "Photographs":

@@ -16,22 +16,37 @@ POSITIONS, FACES = "vertex_positions", "faces"
 class ShapeNetMesh(mi.Mesh):
     """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
 
-    ================ ========= ===============================================================================
-    parameter        type      meaning
-    ================ ========= ===============================================================================
-    ``weights``      string    a saved fit (``ring.pt``); without it the shape is the undeformed domain
-    ``subdivisions`` integer   level of the icosphere: 10 · 4ⁿ + 2 vertices. Default: 5
-    ``domain``       string    optional mesh file (scene units), closed: the canonical surface instead of the
-                               sphere. Not together with ``weights``, which carry their own
+    ================ ========= ========================================================================== =======
+    Parameter        Type      Description                                                                Flags
+    ================ ========= ========================================================================== =======
+    ``weights``      string    a saved fit (``ring.pt``). Default: none, the shape is the undeformed
+                               domain
+    ``subdivisions`` integer   level of the icosphere, 0 to 8: 10 · 4ⁿ + 2 vertices. Default: 5
+    ``domain``       string    mesh file (scene units), closed: the canonical surface instead of the
+                               sphere. Not together with ``weights``, which carry their own. Default:
+                               none
     ``center``       point     centre of the normalising sphere [scene units]; with ``weights`` theirs.
-                               Default: the middle of ``domain``, else the origin, but a fit estimates it from
-                               masks or cameras
-    ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of ``domain``, else 1
+                               Default: the middle of ``domain``, else the origin, but a fit estimates
+                               it from masks or cameras
+    ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of
+                               ``domain``, else 1
     ``to_world``     transform applied on top of everything. Default: none
-    ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it to
-                               false to place a fit into a scene of your own. Default: true
-    (nested)         bsdf      usually ``cooktorrance``, which reads the attributes below
-    ================ ========= ===============================================================================
+    ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
+                               to false to place a fit into a scene of your own. Default: true
+    (nested)         bsdf      usually `cooktorrance`, which reads the attributes below; exposed as       P, ∂
+                               ``bsdf``
+    ================ ========= ========================================================================== =======
+
+    ==================== ===== ========================================================================== =======
+    Exposed              Type  Description                                                                Flags
+    ==================== ===== ========================================================================== =======
+    ``vertex_positions`` float 3 per vertex [scene units]                                                 P, ∂, D
+    ``vertex_normals``   float 3 per vertex; computed anew whenever positions change                      P, ∂, D
+    ``faces``            int   3 vertices per triangle                                                    P
+    ``vertex_diffuse``   float 3 per vertex; this and the next two: of a fit with `cooktorrance`          P, ∂
+    ``vertex_specular``  float 1 per vertex                                                               P, ∂
+    ``vertex_roughness`` float 1 per vertex                                                               P, ∂
+    ==================== ===== ========================================================================== =======
 
     The mesh carries smooth normals and, for each parameter that the fit of ``weights`` predicts, the attribute
     ``vertex_<parameter>``: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
@@ -39,12 +54,21 @@ class ShapeNetMesh(mi.Mesh):
     attribute, or for one with another number of channels, is an error. What it does not do: texture coordinates;
     colours in spectral variants, where Mitsuba takes three-channel attributes for the coefficients of a spectrum.
 
-    .. code-block:: xml
+    .. tab-set-code::
 
-        <shape type="shapenet" id="object">
-          <string name="weights" value="ring.pt"/><integer name="subdivisions" value="6"/>
-          <bsdf type="cooktorrance"/>
-        </shape>
+        .. code-block:: xml
+
+            <shape type="shapenet" id="object">
+              <string name="weights" value="ring.pt"/><integer name="subdivisions" value="6"/>
+              <bsdf type="cooktorrance"/>
+            </shape>
+
+        .. code-block:: python
+
+            {
+                "type": "shapenet", "weights": "ring.pt", "subdivisions": 6,
+                "bsdf": {"type": "cooktorrance"},
+            }
     """
 
     def __init__(self, props):

@@ -62,38 +62,64 @@ def project_tangent(to_world, focal, point, tangent):
 class Photograph(mi.Sensor):
     """A calibrated photograph: pinhole camera, image, optional mask, and the light it was taken under.
 
-    ================ ============ ==========================================================================
-    parameter        type         meaning
-    ================ ============ ==========================================================================
-    ``filename``     string       image file, relative to the XML; read by the fit, never by an integrator
-    ``mask``         string       optional mask file of the same size: 0 background, 255 object. If it is
-                                  ``filename`` itself: its alpha channel
+    ================ ============ ====================================================================== =====
+    Parameter        Type         Description                                                            Flags
+    ================ ============ ====================================================================== =====
+    ``filename``     string       image file, relative to the XML; read by the fit, never by an
+                                  integrator
+    ``mask``         string       mask file of the same size: 0 background, 255 object. If it is
+                                  ``filename`` itself: its alpha channel. Default: none
     ``fx``, ``fy``   float        focal lengths [px]
-    ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the centre of the
-                                  first pixel is (0.5, 0.5). Default: the middle of the film
-    ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale
-    ``encoding``     string       ``srgb`` or ``linear``; default ``srgb`` for 8-bit files, ``linear`` for 16-bit
-                                  PNG/TIFF and EXR; linear data of 8 bits is refused
-    ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped: they only say "at
-                                  least this bright". Default 1
-    (nested)         film         its size is the image's
-    (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone. Default: a point
-                                  light of intensity 1 at the camera centre
-    ================ ============ ==========================================================================
+    ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the
+                                  centre of the first pixel is (0.5, 0.5). Default: the middle of the
+                                  film
+    ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale.    P, ∂
+                                  Default: the identity
+    ``encoding``     string       ``srgb`` or ``linear``; linear data of 8 bits is refused. Default:
+                                  ``srgb`` for 8-bit files, ``linear`` for 16-bit PNG/TIFF and EXR
+    ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped:
+                                  they only say "at least this bright". Default: 1
+    (nested)         film         its size is the image's; exposed as ``film``                           P
+    (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone;      P, ∂
+                                  exposed as ``light``. Default: a point light of intensity 1 at the
+                                  camera centre
+    ================ ============ ====================================================================== =====
+
+    ================ ============ ====================================================================== =====
+    Exposed          Type         Description                                                            Flags
+    ================ ============ ====================================================================== =====
+    ``focal``        point (2)    ``fx``, ``fy`` [px]                                                    P, ∂
+    ``centre``       point (2)    ``cx``, ``cy`` [px]                                                    P, ∂
+    ================ ============ ====================================================================== =====
 
     Every integrator sees the nested light while it renders this sensor, through the `flash` emitter that a `shapenet`
     shape carries. What it does not do: depth of field, lens distortion, motion blur; light tracing integrators
     (``ptracer``) and the ``batch`` sensor cannot see the nested light.
 
-    .. code-block:: xml
+    .. tab-set-code::
 
-        <sensor type="photograph" id="000">
-          <string name="filename" value="images/000.png"/>
-          <float name="fx" value="443.4"/> <float name="fy" value="443.4"/>
-          <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
-          <film type="hdrfilm"><integer name="width" value="512"/><integer name="height" value="512"/></film>
-          <emitter type="point"><point name="position" x="0" y="0" z="5"/><rgb name="intensity" value="25"/></emitter>
-        </sensor>
+        .. code-block:: xml
+
+            <sensor type="photograph" id="000">
+              <string name="filename" value="images/000.png"/>
+              <float name="fx" value="443.4"/> <float name="fy" value="443.4"/>
+              <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+              <film type="hdrfilm">
+                <integer name="width" value="512"/> <integer name="height" value="512"/>
+              </film>
+              <emitter type="point">
+                <point name="position" x="0" y="0" z="5"/> <rgb name="intensity" value="25"/>
+              </emitter>
+            </sensor>
+
+        .. code-block:: python
+
+            {
+                "type": "photograph", "filename": "images/000.png", "fx": 443.4, "fy": 443.4,
+                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 512, "height": 512},
+                "light": {"type": "point", "position": [0, 0, 5], "intensity": {"type": "rgb", "value": 25}},
+            }
     """
 
     current = None  #: the photograph being rendered; `Flash` lights the scene with its light
@@ -178,7 +204,19 @@ class Flash(mi.Emitter):
 
     Nested emitters light only their own photograph, so they are no emitters of the scene and stock integrators would
     see none. `shapenet` therefore carries this one, which hands every question on to the light of the current
-    photograph.
+    photograph. It has no parameters.
+
+    Of use in itself only in a scene of `photograph` sensors without a `shapenet` shape:
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <emitter type="flash"/>
+
+        .. code-block:: python
+
+            {"type": "flash"}
     """
 
     def __init__(self, props):

@@ -1,12 +1,13 @@
-"""Photographs of a fitted object: `python -m mi_ring.render RUN SCENE.xml OUT/`."""
+"""Render photographs of a fitted object: `python -m mi_ring.render RUN SCENE.xml OUT/`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from tqdm import tqdm
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring import bridge, capture, command
 from mi_ring.capture import linear_to_srgb, to_bytes
@@ -18,11 +19,11 @@ from mi_ring.results import load_ring, write_image, writing
 class RenderConfig:
     """Render every photograph of a scene with the object of a finished fit, under the same file names."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
-    scene: Positional[Path]
+    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs to take; their image files need not exist."""
-    out: Positional[Path]
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG."""
     subdivisions: int = 6
     """Level of the mesh: 10 · 4^level + 2 vertices."""

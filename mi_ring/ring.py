@@ -17,8 +17,8 @@ class Ring(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
 
     `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
-    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level at which
-    the surface is best sampled; between the vertices of the fit the networks are less certain.
+    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
+    sample the surface at; between the vertices of the fit the networks are less certain.
     """
 
     def __init__(
@@ -33,10 +33,11 @@ class Ring(nn.Module):
         self.domain = domain or Sphere()
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
-        """Surface points (V, 3) [scene units] of domain points (V, 3); at another `time` where the flow has them then."""
+        """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""
         return self.center + self.radius * self.shape_net(s, time)
 
     def state(self, config: dict | None = None) -> dict:
+        """What `ring.pt` holds, to be written by `torch.save`."""
         domain = None
         if not isinstance(self.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
             domain = {"points": torch.tensor(self.domain.points), "faces": torch.tensor(self.domain.faces)}
@@ -48,6 +49,7 @@ class Ring(nn.Module):
 
     @classmethod
     def from_state(cls, state: dict) -> "Ring":
+        """The inverse of `state`."""
         domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
         properties = {name: state[name] for name in ("parameters", "bsdf", "indirect", "steps")}
         if "subdivisions" in state["config"]:
@@ -58,7 +60,7 @@ class Ring(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Ring":
-        """Read `ring.pt`, given itself or its folder. Raises InputError if it is missing, no ring or of another version."""
+        """Read a ring.pt or that of a results folder. Raises InputError if it is missing, none or of another version."""
         path = Path(path)
         path = path / "ring.pt" if path.is_dir() else path
         try:

@@ -1,10 +1,11 @@
-"""`photometric` against Mitsuba's `path`: `python -m mi_ring.validate SCENE.xml` or `… RUN`."""
+"""Compare `photometric` with Mitsuba's path tracer: `python -m mi_ring.validate SCENE.xml` or `… RUN`."""
 
 import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,7 @@ from matplotlib import colormaps
 from PIL import Image, ImageDraw
 from scipy import stats
 from tqdm import tqdm
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring import capture, command, photograph
 from mi_ring.bsdf import attributes_of, check_attributes
@@ -45,7 +46,7 @@ class ValidateConfig:
     differs by more than Monte Carlo noise, 2 if there is nothing to compare.
     """
 
-    scene: Positional[Path]
+    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
     """Mitsuba XML file with photographs, or results folder of a fit."""
     out: Path | None = None
     """Folder of the results. Default: RUN/validate, for a scene file out/validate/<name>."""
@@ -79,17 +80,17 @@ class Comparison:
     """What is found out about one photograph, or about all. Shares are of the mean radiance of `path`."""
 
     name: str
-    radiance: float  # mean of `path` over all pixels and channels
-    difference: float  # mean of photometric − path
-    absolute_difference: float  # mean over pixels of |photometric − path|, of which …
-    noise: float  # … Monte Carlo noise explains this much
-    psnr: float  # photometric against path [dB], sRGB, at most 100
-    shadows: float  # what photometric without shadows has too much
-    interreflection: float  # what path has beyond direct light
-    unexplained: float  # mean of photometric − direct light of path
-    unexplained_noise: float  # its standard error
-    p_direct: float  # of a difference this large if photometric and the direct light of path agree
-    p_path: float  # likewise of photometric and all of path
+    radiance: float  #: mean of `path` over all pixels and channels
+    difference: float  #: mean of photometric − path
+    absolute_difference: float  #: mean over pixels of the size of photometric − path, of which …
+    noise: float  #: … Monte Carlo noise explains this much
+    psnr: float  #: photometric against path [dB], sRGB, at most 100
+    shadows: float  #: what photometric without shadows has too much
+    interreflection: float  #: what path has beyond direct light
+    unexplained: float  #: mean of photometric − direct light of path
+    unexplained_noise: float  #: its standard error
+    p_direct: float  #: of a difference this large if photometric and the direct light of path agree
+    p_path: float  #: likewise of photometric and all of path
 
 
 @dataclass
@@ -97,9 +98,9 @@ class Pictures:
     """Independent renderings (16, H, W, 3) of one photograph: linear radiance."""
 
     photometric: np.ndarray
-    unshadowed: np.ndarray  # same samples as photometric
+    unshadowed: np.ndarray  #: same samples as photometric
     path: np.ndarray
-    direct: np.ndarray  # the direct light of `path`, same samples
+    direct: np.ndarray  #: the direct light of `path`, same samples
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, list]:

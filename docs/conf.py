@@ -1,0 +1,169 @@
+"""Sphinx's settings: `make docs`. What is said elsewhere is taken from there: docstrings, `--help`, the README."""
+
+import contextlib
+import dataclasses
+import importlib
+import inspect
+import io
+import os
+import sys
+import textwrap
+from pathlib import Path
+from typing import Annotated, get_args, get_origin
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+os.environ["COLUMNS"] = "100"  # of the commands' help
+
+from docutils import nodes
+from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import make_refnode
+
+from mi_ring.command import COMMANDS, summary
+from mi_ring.formats import FORMATS
+
+project, author = "mi_ring", "the authors of mi_ring"
+extensions = ["sphinx.ext.autodoc", "myst_parser", "sphinx_design"]
+exclude_patterns = ["make_picture.py"]
+html_theme, html_title, html_static_path, html_css_files = "furo", "mi_ring", ["static"], ["mi_ring.css"]
+html_show_copyright = html_copy_source = False
+pygments_style = "friendly"
+smartquotes = False  # "--" is how options begin
+myst_heading_anchors = 3
+
+# `name` in a docstring is a link where there is something of that name, else just code.
+default_role = "py:obj"
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:obj", ".*"),
+    ("py:.*", r"(?!mi_ring\.).*"),  # types of other packages
+]
+autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+toc_object_entries = False
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+
+#: Classes by the names of the plugins, whose pages are plugins/<name>.rst.
+PLUGINS = {
+    "photograph": "mi_ring.photograph.Photograph",
+    "flash": "mi_ring.photograph.Flash",
+    "shapenet": "mi_ring.mesh.ShapeNetMesh",
+    "cooktorrance": "mi_ring.bsdf.CookTorrance",
+    "photometric": "mi_ring.integrator.Photometric",
+}
+
+
+class Plugin(SphinxDirective):
+    """`.. plugin:: shapenet`: the docstring of the plugin's class."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        path = PLUGINS[self.arguments[0]]
+        module, name = path.rsplit(".", 1)
+        plugin = getattr(importlib.import_module(module), name)
+        self.env.note_dependency(inspect.getsourcefile(plugin))
+        place = nodes.target("", "", ids=[path])
+        self.env.domains.python_domain.note_object(path, "class", path, location=place)
+        text = f"{inspect.getdoc(plugin)}\n\nIn Python the class `{path}`.\n"
+        return [place, *self.parse_text_to_nodes(text)]
+
+
+class Commands(SphinxDirective):
+    """`.. commands::`: of every command what its `--help` prints."""
+
+    def run(self) -> list[nodes.Node]:
+        text = ""
+        for command in COMMANDS:
+            usage, sentence = summary(command)
+            self.env.note_dependency(inspect.getsourcefile(importlib.import_module(f"mi_ring.{command}")))
+            text += f"{title(f'``{usage}``', '-')}{sentence}.\n\n{literal(HELP[command,])}"
+            if command == "convert":
+                for name in FORMATS:
+                    text += f"{title(f'``mi-ring convert {name}``', '~')}{literal(HELP[command, name])}"
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+class Modules(SphinxDirective):
+    """`.. modules:: ring domain`: what these modules of the package offer, each under a heading."""
+
+    required_arguments, final_argument_whitespace = 1, True
+
+    def run(self) -> list[nodes.Node]:
+        text = ""
+        for name in self.arguments[0].split():
+            text += f"{title(f'``mi_ring.{name}``', '~')}.. automodule:: mi_ring.{name}\n   :members:\n\n"
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+def title(text: str, line: str) -> str:
+    """A heading."""
+    return f"{text}\n{line * len(text)}\n\n"
+
+
+def literal(text: str) -> str:
+    """A block of plain text."""
+    return ".. code-block:: text\n\n" + textwrap.indent(text, "   ") + "\n\n"
+
+
+def help_of(command: str, *arguments: str) -> str:
+    """What a command prints when it is asked for help, in lines of at most 100 characters."""
+    page = io.StringIO()
+    with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
+        importlib.import_module(f"mi_ring.{command}").main([*arguments, "--help"])
+    lines = (textwrap.wrap(line, 100) or [""] if line[:1].isalpha() else [line] for line in page.getvalue().split("\n"))
+    return "\n".join(line for wrapped in lines for line in wrapped).strip()
+
+
+#: Of each command and of each format of `convert`.
+HELP = {words: help_of(*words) for words in [(c,) for c in COMMANDS] + [("convert", name) for name in FORMATS]}
+
+
+def plain(function) -> None:
+    """Take from annotations what only the command line needs. It has been asked for its help by now."""
+    bare = {name: get_args(a)[0] if get_origin(a) is Annotated else a for name, a in function.__annotations__.items()}
+    function.__annotations__ = bare
+
+
+def signature(app, what, name, documented, options, arguments, returned):
+    """Where defaults are made anew the fields, below, say more than the arguments."""
+    return ("", None) if "<factory>" in (arguments or "") else None
+
+
+def skip(app, what, name, documented, skipped, options):
+    """Plugins have pages of their own."""
+    path = f"{getattr(documented, '__module__', '')}.{getattr(documented, '__qualname__', '')}"
+    return True if path in PLUGINS.values() else None
+
+
+def clean(app, what, name, documented, options, lines):
+    """What a NamedTuple says of its fields by itself is of no use."""
+    if lines and lines[0].startswith("Alias for field number"):
+        lines.clear()
+
+
+def link_plugins(app, env, node, content):
+    """The name of a plugin, in single backticks, is a link to its page."""
+    here, page = node["refdoc"], f"plugins/{node['reftarget']}"
+    if node["reftype"] == "obj" and node["reftarget"] in PLUGINS and here != page:
+        return make_refnode(app.builder, here, page, None, content)
+    return None
+
+
+def setup(app):
+    """What Sphinx calls."""
+    for module in (*COMMANDS, "config", "formats"):
+        for found in list(vars(importlib.import_module(f"mi_ring.{module}")).values()):
+            if dataclasses.is_dataclass(found):
+                plain(found)
+                plain(found.__init__)
+    app.add_directive("plugin", Plugin)
+    app.add_directive("commands", Commands)
+    app.add_directive("modules", Modules)
+    app.connect("autodoc-process-signature", signature)
+    app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", clean)
+    app.connect("missing-reference", link_plugins)
+    return {"parallel_read_safe": True}

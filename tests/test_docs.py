@@ -1,0 +1,298 @@
+"""The documentation: it builds, and what it says of plugins and commands is what they are."""
+
+import ast
+import contextlib
+import dataclasses
+import html
+import importlib
+import inspect
+import io
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring import bsdf, command, integrator, mesh, photograph
+from mi_ring.config import Config
+from mi_ring.formats import FORMATS
+from mi_ring.ring import Ring
+
+ROOT = Path(__file__).parents[1]
+
+
+def plugins():
+    """By name; the modules are loaded anew with each variant, so that they must be asked each time."""
+    return {
+        "photograph": photograph.Photograph, "flash": photograph.Flash, "shapenet": mesh.ShapeNetMesh,
+        "cooktorrance": bsdf.CookTorrance, "photometric": integrator.Photometric,
+    }  # fmt: skip
+
+
+#: What Mitsuba's own base classes expose of every sensor and every mesh.
+MITSUBAS = {"shutter_open", "shutter_open_time", "silhouette_sampling_weight", "vertex_texcoords"}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The built pages. A warning is an error."""
+    for package in ("sphinx", "furo", "myst_parser", "sphinx_design"):
+        pytest.importorskip(package, reason="needs the optional dependencies 'docs'")
+    folder = tmp_path_factory.mktemp("docs")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", folder / "cache", "docs", folder / "html"],
+        capture_output=True, text=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+def squeezed(text: str) -> str:
+    """Without the space that lines are broken at."""
+    return re.sub(r"\s", "", text)
+
+
+def text_of(page: Path) -> str:
+    """Of an HTML page what is read, squeezed."""
+    return squeezed(html.unescape(re.sub(r"<(script|style).*?</\1>|<[^>]*>", "", page.read_text("utf-8"), flags=re.S)))
+
+
+@pytest.mark.parametrize("name", plugins())
+def test_every_plugin_has_its_page(built, name):
+    text = text_of(built / "plugins" / f"{name}.html")
+    first = inspect.getdoc(plugins()[name]).split("\n")[0]
+    assert squeezed(first.replace("`", "")) in text
+    assert f"({name})" in text and f'"{name}"' in text  # the heading, a snippet
+
+
+def test_every_command_has_its_help_on_the_page(built):
+    text = text_of(built / "commands.html")
+    for name in command.COMMANDS:
+        usage, sentence = command.summary(name)
+        assert squeezed(usage) in text and squeezed(sentence.replace("`", "")) in text
+        assert f"usage:mi_ring.{name}[-h]" in text
+    assert all(f"usage:mi_ring.convert{name}[-h]" in text for name in FORMATS)
+    assert "--laplacian-scaleFLOAT" in text
+
+
+@pytest.mark.parametrize("module", ["ring", "capture", "bridge", "integrator", "losses", "config", "errors", "formats"])
+def test_modules_are_on_the_python_page(built, module):
+    assert f'id="module-mi_ring.{module}"' in (built / "api.html").read_text("utf-8")
+
+
+def test_the_readme_leads_to_pages(built):
+    page = (built / "guide.html").read_text("utf-8")
+    assert all(f'href="{name}.html"' in page for name in ("performance", "gradients", "reflectance", "light"))
+
+
+def tables(plugin) -> dict[str, list[tuple[str, str, str, str]]]:
+    """The tables of a docstring, rows of four cells, by the first cell of the heading."""
+    found = {}
+    for table in re.split(r"\n\n", inspect.getdoc(plugin)):
+        lines = table.split("\n")
+        if not lines[0].startswith("==="):
+            continue
+        starts = [m.start() for m in re.finditer("=+", lines[0])]
+        ends = [*starts[1:], None]
+        cells = [[line[a:b].strip() for a, b in zip(starts, ends)] for line in lines if not line.startswith("=")]
+        rows = []
+        for row in cells:
+            if row[0]:
+                rows.append(row)
+            else:
+                rows[-1] = [f"{a} {b}".strip() for a, b in zip(rows[-1], row)]
+        found[rows[0][0]] = rows[1:]
+    return found
+
+
+def names(cell: str) -> list[str]:
+    return re.findall("``(.*?)``", cell)
+
+
+@pytest.fixture
+def values(tmp_path):
+    """Of each plugin a value for each parameter, none of them the default; what must not be together is apart."""
+    trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
+    ring = Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)
+    torch.save(ring.state(), tmp_path / "ring.pt")
+    moved = mi.ScalarTransform4f().translate([3, -1, 2])
+    film = {"type": "hdrfilm", "width": 7, "height": 5}
+    light = {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": [4, 5, 6]}}
+    grey = {"type": "rgb", "value": [0.1, 0.2, 0.3]}
+    return {
+        "photograph": [{
+            "filename": "a.png", "mask": "b.png", "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0, "to_world": moved,
+            "encoding": "linear", "saturation": 0.9, "film": film, "emitter": light,
+        }],
+        "flash": [{}],
+        "shapenet": [
+            {"weights": str(tmp_path / "ring.pt"), "subdivisions": 1, "to_world": moved, "flash": False},
+            {"domain": str(tmp_path / "ball.ply"), "center": [1, 2, 3], "radius": 2.0, "subdivisions": 1,
+             "bsdf": {"type": "cooktorrance", "diffuse": grey, "specular": 0.2, "roughness": 0.4}},
+        ],
+        "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "distribution": "beckmann"}],
+        "photometric": [{"shadows": False}],
+    }  # fmt: skip
+
+
+class Recorder(mi.Properties):
+    """Properties that remember what they were asked for."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.asked = set()
+
+    def get(self, name, *default):
+        self.asked.add(name)
+        return super().get(name, *default)
+
+    def __getitem__(self, name):
+        self.asked.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name):
+        self.asked.add(name)
+        return super().__contains__(name)
+
+
+@pytest.mark.parametrize("name", plugins())
+def test_documented_parameters_are_those_that_the_plugin_takes(name, values):
+    plugin = plugins()[name]
+    rows = tables(plugin).get("Parameter", [])
+    documented = {parameter for row in rows for parameter in names(row[0])}
+    nested = {row[1] for row in rows if row[0] == "(nested)"}
+    given = set().union(*values[name])
+    assert given == documented | nested
+    for value in values[name]:  # Mitsuba raises for a property that nobody has asked for
+        mi.load_dict({"type": name} | value)
+    with pytest.raises(RuntimeError, match="nonsense"):
+        mi.load_dict({"type": name, "nonsense": 1.0} | values[name][0])
+
+    asked = set()
+    for value in values[name]:
+        props = Recorder(name)
+        for key, v in value.items():
+            props[key] = mi.load_dict(v) if isinstance(v, dict) else v
+        plugin(props)
+        asked |= props.asked
+    if name == "photometric":  # what all of Mitsuba's differentiable integrators take, and this one does not use
+        asked -= {"max_depth", "rr_depth"}
+    assert asked - nested == documented
+
+
+@pytest.mark.parametrize("name", ["photograph", "shapenet", "cooktorrance", "photometric"])
+def test_flags_are_those_of_traverse(name, values):
+    found = {}
+    exposed = mi.traverse(mi.load_dict({"type": name} | values[name][-1]))
+    for key in exposed.properties:
+        first, flags = key.split(".")[0], exposed.flags(key)
+        if first not in MITSUBAS:
+            differentiable = not flags & mi.ParamFlags.NonDifferentiable.value
+            discontinuous = bool(flags & mi.ParamFlags.Discontinuous.value)
+            found.setdefault(first, {"P"}).update({"∂"} if differentiable else (), {"D"} if discontinuous else ())
+    documented = {}
+    for rows in tables(plugins()[name]).values():
+        for first, _, description, flags in rows:
+            if flags:
+                as_what = re.search(r"exposed as\s+``(.*?)``", description)
+                for key in [as_what[1]] if as_what else names(first):
+                    documented[key] = set(flags.split(", "))
+    assert documented == found
+
+
+@pytest.mark.parametrize("name", plugins())
+def test_snippets_load_and_say_the_same(name, tmp_path):
+    torch.save(Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5).state(), tmp_path / "ring.pt")
+    blocks = {}
+    for kind, block in re.findall(r"\.\. code-block:: (\w+)\n\n((?: {8}.*\n?|\n)+)", inspect.getdoc(plugins()[name])):
+        blocks[kind] = inspect.cleandoc(block).replace("ring.pt", str(tmp_path / "ring.pt"))
+    if name == "shapenet":  # the same, only faster
+        blocks = {kind: re.sub(r"(subdivisions\W+(?:value=\W)?)6", r"\g<1>2", block) for kind, block in blocks.items()}
+    element = ElementTree.fromstring(blocks["xml"])
+    element.set("version", "3.0.0")
+    by_xml = mi.load_string(ElementTree.tostring(element, "unicode"))
+    by_dict = mi.load_dict(eval(blocks["python"], {"mi": mi}))
+    assert type(by_xml) is type(by_dict) is plugins()[name]
+    a, b = (dict(mi.traverse(plugin)) for plugin in (by_xml, by_dict))
+    assert a.keys() == b.keys()
+    for key in a:
+        numbers = [np.array(v.matrix if hasattr(v, "matrix") else v, float).ravel() for v in (a[key], b[key])]
+        assert numbers[0] == pytest.approx(numbers[1]), key
+
+
+def help_of(name: str, *arguments: str) -> str:
+    page = io.StringIO()
+    with contextlib.redirect_stdout(page), pytest.raises(SystemExit) as stop:
+        importlib.import_module(f"mi_ring.{name}").main([*arguments, "--help"])
+    assert not stop.value.code
+    return page.getvalue()
+
+
+def config_of(name: str) -> type:
+    """The dataclass that is the command line of a command."""
+    if name == "fit":
+        return Config
+    module = importlib.import_module(f"mi_ring.{name}")
+    (found,) = (c for key, c in vars(module).items() if key.lower() == f"{name}config")
+    return found
+
+
+PAGES = [(name,) for name in command.COMMANDS if name != "convert"] + [("convert", name) for name in FORMATS]
+
+
+def descriptions(config: type) -> dict[str, str]:
+    """What stands below each field of a dataclass, or of those that it is made of."""
+    found = {}
+    for base in reversed(config.__mro__[:-1]):
+        body = ast.parse(inspect.getsource(base)).body[0].body
+        for field, below in zip(body, body[1:]):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                found[field.target.id] = below.value.value
+    return found
+
+
+@pytest.mark.parametrize("words", PAGES, ids=" ".join)
+def test_help_describes_every_field(words):
+    config = FORMATS[words[1]] if words[1:] else config_of(words[0])
+    text = squeezed(re.sub("[│╭╮╰╯─]", "", help_of(*words)))
+    assert squeezed(inspect.getdoc(config)) in text
+    described = descriptions(config)
+    for field in dataclasses.fields(config):
+        assert len(described[field.name].split()) > 1, field.name
+        assert squeezed(described[field.name]) in text, field.name
+        annotation = str(field.type)
+        name = re.search("metavar='(.*?)'", annotation)[1] if "metavar" in annotation else f"--{field.name}"
+        assert name.replace("_", "-") in text, field.name
+
+
+def test_convert_lists_its_formats():
+    text = help_of("convert")
+    assert all(f"• {name} " in text or f"- {name} " in text for name in FORMATS)
+    assert "scene file" in text.split("options")[0]
+
+
+def test_the_program_says_what_each_command_does(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["mi-ring", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for name in command.COMMANDS:
+        assert re.search(rf"^  mi-ring {name} [A-Z]\S+.*\n      \S+ \S+", text, re.M), name
+
+
+@pytest.mark.parametrize("arguments, wrong", [([], "is missing"), (["fitt"], "is fitt; must be one of convert, ")])
+def test_a_command_that_there_is_not_is_one_line(arguments, wrong, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["mi-ring", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 2
+    printed = capsys.readouterr()
+    assert wrong in printed.err and printed.err.count("\n") == 1 and not printed.out
