@@ -23,8 +23,11 @@ DRAWING = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # without 
 COLOUR = np.array([230, 170, 120])  # of the box, sRGB
 
 
-def glb(positions, normals, uv, faces, image):
-    """A GLB of a matte mesh whose colour is an image, (H, W, 3) uint8; made by hand: glTF 2.0, section 4."""
+def glb(positions, normals, uv, faces, image, scale=1.0):
+    """A GLB of a matte mesh whose colour is an image, (H, W, 3) uint8; made by hand: glTF 2.0, section 4.
+
+    `scale`: by which its exporter multiplied the true colour.
+    """
     Image.fromarray(image).save(png := io.BytesIO(), "PNG")
     arrays = [np.asarray(values, "<f4") for values in (positions, normals, uv)] + [np.asarray(faces, "<u4").ravel()]
     parts = [array.tobytes() for array in arrays] + [png.getvalue() + b"\0" * (-len(png.getvalue()) % 4)]
@@ -35,7 +38,8 @@ def glb(positions, normals, uv, faces, image):
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0},
-                       "extensions": {"KHR_materials_specular": {"specularFactor": 0.0}}}],
+                       "extensions": {"KHR_materials_specular": {"specularFactor": 0.0}},
+                       "extras": {"mi_ring": {"scale": scale}}}],
         "extensionsUsed": ["KHR_materials_specular"],
         "textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/png"}],
         "buffers": [{"byteLength": offsets[-1]}],
@@ -201,7 +205,7 @@ def test_left_of_the_divider_is_the_photograph(open_page, page_file):
 
 def test_without_webgl_the_rest_of_the_page_works(open_page, page_file):
     page = open_page(page_file, script="HTMLCanvasElement.prototype.getContext = () => null")
-    assert "no WebGL" in page.locator("#viewer").inner_text() and not page.locator("canvas").count()
+    assert "no WebGL" in page.locator("#object").inner_text() and not page.locator("canvas").count()
     page.locator(".compare input").first.fill("10")
     assert "10%" in page.locator(".compare").first.get_attribute("style")
 
@@ -210,14 +214,14 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     """A parallelogram with a matte image, by hand: ρ / π · cos · I / d² at the middle of each pixel."""
     corner, u, v = np.array([40.0, -15.0, 9.0]), np.array([5.0, 1.0, 0.5]), np.array([-1.0, 4.0, 1.5])
     normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
-    intensity = np.array([300.0, 360.0, 500.0])
+    intensity = np.array([240.0, 290.0, 400.0])
     image = np.zeros((8, 16, 3), np.uint8)  # in each quarter another colour; its top is at v = 0
     quarters = np.array([[[218, 168, 108], [120, 190, 150]], [[200, 90, 170], [160, 160, 60]]])
     image[:] = quarters.repeat(4, 0).repeat(8, 1)
     corners = corner + np.array([0 * u, u, u + v, v])
     file = tmp_path / "parallelogram.html"
     uv, faces = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
-    file.write_text(report.html(*fitted, glb(corners, [normal] * 4, uv, faces, image)), "utf-8")
+    file.write_text(report.html(*fitted, glb(corners, [normal] * 4, uv, faces, image, 0.8)), "utf-8")
 
     origin, light = corner + np.array([[4.0, 0.5, 16.0], [-3.0, 5.0, 11.0]])
     forward = corner + 0.4 * u + 0.6 * v - origin
@@ -234,7 +238,7 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     to_light = light - points
     distance = np.linalg.norm(to_light, axis=-1)
     colour = capture.srgb_to_linear(quarters / 255)[(b > 0.5).astype(int), (a > 0.5).astype(int)]
-    radiance = colour / np.pi * intensity * (to_light @ normal / distance**3)[..., None]
+    radiance = colour / 0.8 / np.pi * intensity * (to_light @ normal / distance**3)[..., None]
     edge = np.minimum(np.minimum(a, 1 - a) * 5, np.minimum(b, 1 - b) * 4)  # about how far inside
     clear = (edge > 0.4) & (abs(a - 0.5) > 0.1) & (abs(b - 0.5) > 0.1)  # not where colours blend
     truth = capture.linear_to_srgb(radiance)

@@ -8,7 +8,7 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 // What can be shown in place of radiance. The last two are plain numbers: sRGB's curve is undone.
 const SHOWN = {
   diffuse: "diffuseColor.rgb",
-  specular: "vec3(material.specularF90)",
+  specular: "material.specularColorBlended",
   roughness: "sRGBTransferEOTF(vec4(vec3(roughnessFactor), 1.0)).rgb",
   normals: "sRGBTransferEOTF(vec4(transformNormalByInverseViewMatrix(normal, viewMatrix) * 0.5 + 0.5, 1.0)).rgb",
 };
@@ -52,7 +52,9 @@ async function open(figure, glb, view) {
   const unit = new Group().add(object);
   unit.scale.setScalar(1 / ball.radius);
   unit.position.copy(ball.center).divideScalar(-ball.radius);
-  const light = new PointLight(0xffffff, 1, 0, 2);
+  // Reflectances above 1 were scaled to fit into textures: the light makes up for it.
+  const [{ userData }] = materials;
+  const light = new PointLight(0xffffff, 1 / (userData.mi_ring?.scale ?? 1), 0, 2);
   const scene = new Scene().add(unit, light);
 
   const camera = new PerspectiveCamera(2 * HALF_FIELD);
@@ -125,7 +127,7 @@ async function open(figure, glb, view) {
 }
 
 const data = (id) => document.getElementById(id).textContent;
-const figure = document.getElementById("viewer");
+const figure = document.getElementById("object");
 if (document.createElement("canvas").getContext("webgl2")) {
   const glb = Uint8Array.from(atob(data("glb")), (character) => character.charCodeAt(0)).buffer;
   window.opened = open(figure, glb, JSON.parse(data("view"))).then((viewer) => (window.viewer = viewer));
