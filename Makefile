@@ -9,12 +9,14 @@ ARGS   ?=
 
 RUN = $(VENV)/bin/python -m
 
-.PHONY: help setup fit test lint docs clean
+.PHONY: help setup fit test browser viewer lint docs clean
 
 help:
 	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
 	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE)'
 	@echo 'make test [ARGS=...]         run pytest'
+	@echo 'make browser                 install Chromium for the tests of the report, if there is none (as root)'
+	@echo 'make viewer                  bundle the viewer of the report anew (needs Node.js)'
 	@echo 'make lint                    run ruff'
 	@echo 'make docs                    build the documentation: build/docs/index.html'
 	@echo 'make clean                   remove caches; $(VENV) stays'
@@ -48,6 +50,16 @@ fit: setup
 test: setup
 	$(RUN) pytest $(ARGS)
 
+# Without a browser the tests that need one are skipped.
+browser:
+	@if command -v chromium || command -v google-chrome; then :; \
+	elif test "$$(id -u)" = 0; then apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; \
+	else echo 'make browser: found no Chromium, and only root can install it (apt-get install chromium)' >&2; fi
+
+# three.js and mi_ring/viewer/viewer.js in one file, which is part of the repository.
+viewer:
+	cd mi_ring/viewer && npm ci --ignore-scripts --no-audit --no-fund && npm run build
+
 lint: setup
 	$(RUN) ruff check .
 
@@ -56,5 +68,5 @@ docs: setup
 	@echo build/docs/index.html
 
 clean:
-	rm -rf .pytest_cache .ruff_cache build *.egg-info
+	rm -rf .pytest_cache .ruff_cache build *.egg-info mi_ring/viewer/node_modules
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +

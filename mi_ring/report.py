@@ -10,14 +10,18 @@ import jinja2
 import matplotlib
 import numpy as np
 from PIL import Image
+from scipy import ndimage
+from skimage.registration import phase_cross_correlation
 
 from mi_ring import bridge
-from mi_ring.capture import linear_to_srgb, to_bytes
+from mi_ring.capture import camera_of, linear_to_srgb, to_bytes
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-THUMBNAIL = 192  # width and height of the pictures, at most [px]
+PICTURE = 480  # width and height of the pictures, at most [px]
+MISFIT, COVERED, SATURATED = 3.0, 0.9, 0.01  # a PSNR this far below the others' [dB], IoU, share of pixels: say so
+SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
 
 
 @dataclass
@@ -27,11 +31,13 @@ class Row:
     name: str
     psnr: float
     iou: float | None
+    saturated: float  # share of the object's pixels
+    shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
     pictures: dict[str, str]
 
 
-def html(fit, log: list[dict]) -> str:
-    """The page for a `Fit` whose surface is shown at its final resolution."""
+def html(fit, log: list[dict], glb: bytes | None = None) -> str:
+    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer."""
     capture, ring = fit.capture, fit.ring
     rows, errors = [], []
     for k in capture.spread():
@@ -50,22 +56,88 @@ def html(fit, log: list[dict]) -> str:
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
     }
-    template = resources.files("mi_ring").joinpath("report.html.jinja").read_text()
-    environment = jinja2.Environment(autoescape=True)
-    return environment.from_string(template).render(
-        name=fit.config.name, rows=rows, numbers=numbers, curve=loss_curve(log, fit), settings=fit.config.settings()
-    )
+    files = resources.files("mi_ring")
+    template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
+    return template.render(
+        name=fit.config.name, rows=rows, numbers=numbers, curve=loss_curve(log, fit), settings=fit.config.settings(),
+        findings=findings(rows, fit.iteration, fit.iterations), view=view(fit),
+        glb=glb and base64.b64encode(glb).decode(), viewer=files.joinpath("viewer", "viewer.min.js").read_text("utf-8"),
+    )  # fmt: skip
+
+
+def view(fit) -> dict[str, list[float]]:
+    """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
+    cameras = np.stack([camera_of(sensor)[0] for sensor in fit.capture.sensors])
+    lights = np.array(fit.capture.photographs.lights).reshape(-1, 8)
+    distance2 = ((lights[:, :3] - fit.ring.center.cpu().numpy()) ** 2).sum(1)
+    irradiance = np.median(lights[:, 4:7] / np.where(lights[:, 3:4] > 0, 1.0, distance2[:, None]), axis=0)
+    up = cameras[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < 0.1:  # held in every way
+        up = cameras[0, :3, 1]
+    return {"up": up.tolist(), "eye": cameras[0, :3, 3].tolist(), "irradiance": irradiance.tolist()}
+
+
+def findings(rows: list[Row], iteration: int, iterations: int) -> list[str]:
+    """What stands out, each in one sentence that says what to do."""
+    found = []
+    if iteration < iterations:
+        found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
+
+    typical, scatter = middle([row.psnr for row in rows])
+    limit = typical - max(MISFIT, 3 * scatter)
+    if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
+        found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there, then mend pose, "
+                     "light or mask, or leave the photograph out.")  # fmt: skip
+    masked = [row for row in rows if row.iou is not None]
+    if few := worst((row.iou, row.name, f"IoU {row.iou:.2f}") for row in masked if row.iou < COVERED):
+        found.append(f"{few}: the prediction does not cover what the mask does; see with mi_ring.check whether mask "
+                     "and pose are right.")  # fmt: skip
+    if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
+        found.append(f"{few}: so much of the object is saturated, where it is known to be at least this bright and no "
+                     "more; expose less.")  # fmt: skip
+
+    rows = [row for row in rows if row.shift is not None]
+    if rows:
+        shift, scatter = middle([row.shift for row in rows])
+        scatter = np.hypot(*scatter)
+        if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(rows))):
+            found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cx and cy, or the "
+                         "poses, seem off by as much or more; the first pixel's centre is (0.5, 0.5).")  # fmt: skip
+        away = [(row.name, np.subtract(row.shift, shift)) for row in rows]
+        limit = max(SHIFTED, 3 * scatter)
+        if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
+            found.append(f"{few} of the prediction: shifted as the others are not; mend the pose, or leave the "
+                         "photograph out.")  # fmt: skip
+    return found
+
+
+def middle(values) -> tuple[np.ndarray, np.ndarray]:
+    """Median of values (n, ...) and, from the median absolute deviation, their standard deviation."""
+    median = np.median(values, axis=0)
+    return median, 1.4826 * np.median(np.abs(values - median), axis=0)
+
+
+def worst(photographs, most: int = 5) -> str:
+    """Names and numbers of the lowest (rank, name, number), in one line; empty if there are none."""
+    ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
+    return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
+
+
+def sides(x: float, y: float) -> str:
+    """A shift in words."""
+    return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
 def compare(fit, k: int, name: str) -> tuple[Row, float]:
     """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
     capture = fit.capture
-    observed, _, mask, masked = capture.observe([k])
-    predicted, coverage = bridge.draw(
+    observed, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k]))
+    predicted, coverage = (t[0].numpy() for t in bridge.draw(
         fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
-    )
-    photo, guess = linear_to_srgb(observed[0].numpy()), linear_to_srgb(predicted[0].numpy())
-    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // THUMBNAIL))
+    ))  # fmt: skip
+    photo, guess, found = linear_to_srgb(observed), linear_to_srgb(predicted), coverage > 0.5
+    inside = mask > 0.5 if masked else found
+    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
     parameters = fit.ring.brdf_net.bsdf_parameters
     maps = {key: m[0] for key, m in bridge.maps(fit.surface, small, parameters).items()}
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
@@ -81,22 +153,35 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
-    iou = None
-    if masked:
-        inside, found = mask[0].numpy() > 0.5, coverage[0].numpy() > 0.5
-        iou = float((inside & found).sum() / max(1, (inside | found).sum()))
     error = float(np.mean((photo - guess) ** 2))
-    pictures = {title: data_uri(picture) for title, picture in pictures.items()}
-    return Row(name, -10 * np.log10(max(error, 1e-10)), iou, pictures), error
+    row = Row(
+        name=name,
+        psnr=-10 * np.log10(max(error, 1e-10)),
+        iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked else None,
+        saturated=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
+        shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
+        pictures={title: data_uri(picture) for title, picture in pictures.items()},
+    )
+    return row, error
+
+
+def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
+    """How far `photo` (H, W, 3) is right of and below `guess` [px], where `inside` (H, W); None if one is black."""
+    if not (photo.any() and guess.any() and inside.any()):
+        return None
+    rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]
+    a, b = (picture[rows, columns].mean(-1) for picture in (photo, guess))
+    down, right = phase_cross_correlation(a, b, upsample_factor=20, normalization=None)[0]
+    return float(right), float(down)
 
 
 def data_uri(picture: np.ndarray) -> str:
-    """An (H, W) or (H, W, 3) picture in [0, 1] as a JPEG thumbnail."""
+    """An (H, W) or (H, W, 3) picture in [0, 1] as a small WebP."""
     image = Image.fromarray(to_bytes(picture))
-    image.thumbnail((THUMBNAIL, THUMBNAIL))
+    image.thumbnail((PICTURE, PICTURE))
     buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=88)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    image.save(buffer, "WEBP", quality=85)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def loss_curve(log: list[dict], fit) -> str:

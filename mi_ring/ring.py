@@ -60,7 +60,7 @@ class Ring(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Ring":
-        """Read a ring.pt or that of a results folder. Raises InputError if it is missing, none or of another version."""
+        """Read a ring.pt or that of a results folder. Raises InputError if missing, none or of another version."""
         path = Path(path)
         path = path / "ring.pt" if path.is_dir() else path
         try:

@@ -65,7 +65,7 @@ def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkey
     monkeypatch.setattr(capture.Capture.spread, "__defaults__", (5,))
     assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK]) == 0
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "12; below are 5 of them" in page and page.count('class="name"') == 5
+    assert "12; below are 5 of them" in page and page.count('class="photograph"') == 5
     assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 160)
 
 
@@ -109,13 +109,6 @@ def test_render_takes_every_photograph_under_its_name(finished, small_capture, t
         a, b = (np.array(mi.Bitmap(str(folder / f"{k:03}.png"))) / 255.0 for folder in folders)
         errors.append(np.mean((a - b) ** 2))
     assert -10 * np.log10(np.mean(errors)) > 22
-
-
-def test_report_is_one_self_contained_file(finished):
-    page = (finished / "report.html").read_text()
-    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
-    assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
-    assert "<link" not in page and "<script" not in page and "011.png" in page
 
 
 def test_the_python_of_the_readme_runs(finished, tmp_path, monkeypatch):
