@@ -147,7 +147,7 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
             mesh, scene = self.truth
             guess = evaluate.scene_of(vertices, faces)
             diagonal = np.linalg.norm(mesh.extents)
-            return evaluate.compare_surfaces(self.capture, guess, scene, diagonal)["normal_mean"]
+            return evaluate.compare_surfaces(self.capture, guess, scene, diagonal)[0]["normal_mean"]
 
     fit.Fit = Watched
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown

@@ -74,7 +74,7 @@ def fit(file: Path, out: Path, options: list[str]) -> dict:
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
         fitting.main([str(scene), "--out", str(out / "run"), *options])
     _, surface = evaluate.load_mesh(out / "run" / "mesh.ply")
-    seen, _, normals = evaluate.hits(surface, capture.load(scene).photograph(0))
+    seen, _, normals, _ = evaluate.hits(surface, capture.load(scene).photograph(0))
     inside = ((data["mask"] > 0) & data["normal_gt"].any(-1)).ravel()  # along the cat's outline none are measured
     angles = np.full(len(inside), 90.0)  # where the surface is not: as wrong as can be
     cosine = (normals * AXES * data["normal_gt"].reshape(-1, 3)).sum(1)

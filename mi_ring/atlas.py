@@ -48,7 +48,7 @@ def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 
 def positions(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
     """The surface (V, 3) [scene units] at domain points (V, 3)."""
     with torch.no_grad():
-        return ring.surface(torch.from_numpy(s.astype(np.float32)), time).numpy()
+        return ring.surface(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
 
 def subdivide(ring: Ring, s, uv, faces, *more):
@@ -140,5 +140,5 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
 def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
     """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
     with torch.no_grad():
-        parts = [ring.brdf_net(chunk) for chunk in torch.from_numpy(s).split(CHUNK)]
-    return {name: torch.cat([part[name] for part in parts]).numpy() for name in parts[0]}
+        parts = [ring.brdf_net(chunk) for chunk in torch.from_numpy(s).to(ring.center.device).split(CHUNK)]
+    return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

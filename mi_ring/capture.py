@@ -118,6 +118,13 @@ class Capture:
         distance2 = np.where(lights[:, 3] > 0, 1.0, ((lights[:, :3] - center) ** 2).sum(1))
         return float(exposure / np.median(lights[:, 4:7].mean(1) / distance2))
 
+    @property
+    def up(self) -> np.ndarray:
+        """The mean direction (3,) that is up in the photographs; in the first if they were held in every way."""
+        ups = np.stack([camera_of(sensor)[0][:3, 1] for sensor in self.sensors])
+        up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
+        return up / np.linalg.norm(up)
+
     def silhouettes(self) -> list[Silhouette]:
         """The masks with their cameras, one for all photographs that share both."""
         once = {}

@@ -199,5 +199,5 @@ def signed_distance(mask: np.ndarray) -> np.ndarray:
 
 
 def genus(mesh: trimesh.Trimesh) -> int:
-    """Number of handles of a closed surface of one piece."""
-    return 1 - mesh.euler_number // 2
+    """Number of handles of a closed surface, of all its pieces together."""
+    return mesh.body_count - mesh.euler_number // 2

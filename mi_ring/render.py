@@ -1,70 +1,267 @@
-"""Render photographs of a fitted object: `python -m mi_ring.render RUN SCENE.xml OUT/`."""
+"""Render a fitted object, photographs or films of it: `python -m mi_ring.render RUN SCENE.xml OUT`."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import imageio.v2 as imageio
+import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring import bridge, capture, command
-from mi_ring.capture import linear_to_srgb, to_bytes
+from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
-from mi_ring.results import load_ring, write_image, writing
+from mi_ring.integrator import Photographs, light_of
+from mi_ring.material import MaterialOptions, dress
+from mi_ring.photograph import Flash, Photograph
+from mi_ring.results import write_image, writing
+from mi_ring.ring import Ring
+
+SLANT = 45.0  #: between the light and the camera in a light orbit, seen from the object [deg]
 
 
-@dataclass(frozen=True)
-class RenderConfig:
-    """Render every photograph of a scene with the object of a finished fit, under the same file names."""
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig(MaterialOptions):
+    """Render every photograph of a scene with the object of a finished fit, under the same file names.
+
+    Or a film of it: the camera goes round, the light does, or the start surface flows into the object. OUT is then a
+    folder of numbered pictures, or an MP4 file.
+    """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs to take; their image files need not exist."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG."""
-    subdivisions: int = 6
-    """Level of the mesh: 10 · 4^level + 2 vertices."""
+    """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG. Or FILE.mp4."""
+    turntable: int = 0
+    """So many pictures from a camera that goes once around the object with its light, about the cameras' mean up."""
+    light_orbit: int = 0
+    """So many pictures with a light that goes once around the line from the object to the camera, at 45°."""
+    flow: int = 0
+    """So many pictures of the flow, from where the fit started to the object."""
+    view: str | None = None
+    """File name of the photograph whose camera and light these three take. Default: the first."""
+    envmap: Path | None = None
+    """Environment, an EXR or HDR file of latitude and longitude, that lights the object; the photographs' lights are off."""
+    integrator: str | None = None
+    """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection."""
+    format: Literal["png", "exr"] | None = None
+    """Of the pictures. Default: as the scene's file names say; png for the three films."""
+    fps: float = 24.0
+    """Pictures per second of an MP4 file."""
+    time: float = 1.0
+    """Of the flow: 0 is where it starts, 1 the object."""
+    subdivisions: int | None = None
+    """Level of the mesh: about 10 · 4^level vertices. Default: that of the fit."""
     spp: int = 64
     """Samples per pixel."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture to render."""
+
+    sensor: Photograph
+    name: str
+    time: float  # of the flow
 
 
 def main(arguments: Sequence[str]) -> None:
     """The command."""
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
-    if not 0 <= config.subdivisions <= 8:
+    check(config)
+    ring = Ring.load(config.run)
+    dress(ring, config)
+    scene = capture.load(config.scene, images=False)
+    frames = frames_of(scene, ring, config)
+    film = config.out.suffix.lower() == ".mp4"
+    check_frames(frames, scene, config)
+    integrator = integrator_of(config)
+    with writing(config.out):
+        for folder in {(config.out if film else config.out / frame.name).parent for frame in frames}:
+            folder.mkdir(parents=True, exist_ok=True)
+    pictures = render(scene, ring, frames, integrator, config)
+    if film:
+        write_film(pictures, config.out, config.fps)
+        print(config.out)
+    else:
+        for frame, picture in zip(frames, pictures):
+            write_picture(picture, config.out / frame.name)
+        print(f"{len(frames)} photographs in {config.out}/")
+
+
+def check(config: RenderConfig) -> None:
+    """Raise InputError for options out of range or that contradict each other."""
+    if config.subdivisions is not None and not 0 <= config.subdivisions <= 8:
         raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
+    for name in ("turntable", "light_orbit", "flow"):
+        if getattr(config, name) < 0:
+            raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be a number of pictures")
+    if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
+        raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
-    ring = load_ring(config.run)
-    scene = capture.load(config.scene, images=False)
-    names = scene.names
-    if len(set(names)) < len(names):
-        double = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{config.scene}: filename: {double} occurs twice; pictures would overwrite each other")
-    for sensor, name in zip(scene.sensors, names):
-        if sensor.filename.suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):
-            raise InputError(f"{config.scene}: filename: {sensor.filename.name} must end in .png, .jpg or .exr")
-        if (config.out / name).resolve() == sensor.filename.resolve():
+    if not 0 <= config.time <= 1:
+        raise InputError(f"--time: is {config.time}, must be 0 to 1")
+    if not 0 < config.fps <= 240:
+        raise InputError(f"--fps: is {config.fps}, must be above 0, 240 at most")
+    if config.envmap and config.integrator == "photometric":
+        raise InputError("--integrator: photometric is for the photographs' own lights; with --envmap give path or direct")
+    if config.envmap and config.light_orbit:
+        raise InputError("--light-orbit: moves a photograph's light, which --envmap switches off; give one of the two")
+    if config.out.suffix.lower() == ".mp4" and config.format:
+        raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out, or name a folder")
+
+
+def check_frames(frames: list[Frame], scene: Capture, config: RenderConfig) -> None:
+    """Raise InputError for pictures that could not be written, or would overwrite each other or the photographs."""
+    if config.out.suffix.lower() == ".mp4":
+        sizes = sorted({frame.sensor.size for frame in frames})
+        if len(sizes) > 1:
+            raise InputError(f"{config.scene}: film: photographs have several sizes, {sizes[0]} and {sizes[1]} [px]; "
+                             "a film has one: name a folder")  # fmt: skip
+        if config.out.is_dir():
+            raise InputError(f"{config.out}: is a folder; a film needs the name of a file")
+        return
+    names, own = set(), {sensor.filename.resolve() for sensor in scene.sensors}
+    for frame in frames:
+        if Path(frame.name).suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):
+            raise InputError(f"{config.scene}: filename: {frame.name} must end in .png, .jpg or .exr; or give --format")
+        if frame.name in names:
+            raise InputError(f"{config.scene}: filename: {frame.name} occurs twice; one would overwrite the other")
+        if (config.out / frame.name).resolve() in own:
             raise InputError(f"{config.out}: holds the scene's own photographs; choose another folder")
-    with writing(config.out):
-        for name in names:
-            (config.out / name).parent.mkdir(parents=True, exist_ok=True)
-    surface = bridge.Surface(scene.scene, scene.shape, ring)
-    surface.show(ring, *ring.domain.sample(config.subdivisions))
-    for k, name in enumerate(tqdm(names, desc="rendering", unit="photograph")):
-        photograph = scene.photograph(k)
-        rgb, _ = bridge.draw(surface, photograph, spp=config.spp, shadows=scene.shadows, indirect=ring.indirect)
-        write_picture(rgb[0].numpy(), config.out / name)
-    print(f"{len(scene.sensors)} photographs in {config.out}/")
+        names.add(frame.name)
+
+
+def integrator_of(config: RenderConfig) -> mi.Integrator | None:
+    """The integrator to render with; None for our own photographs. Raises InputError if there is none of that name."""
+    name = config.integrator or ("path" if config.envmap else "photometric")
+    if name == "photometric":
+        return None
+    try:
+        integrator = mi.load_dict({"type": name})
+    except RuntimeError as error:
+        raise InputError(f"--integrator: {name}: {capture.reason(error)}") from error
+    if not isinstance(integrator, mi.SamplingIntegrator):
+        raise InputError(f"--integrator: {name}: is not an integrator that starts at the camera; try path or direct")
+    return integrator
+
+
+def frames_of(scene: Capture, ring: Ring, config: RenderConfig) -> list[Frame]:
+    """What to render: the scene's photographs, or those that a film is made of."""
+    count = config.turntable or config.light_orbit or config.flow
+    if not count:
+        names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in scene.names]
+        return [Frame(sensor, name, config.time) for sensor, name in zip(scene.sensors, names)]
+    if config.view is not None and config.view not in scene.names:
+        raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {scene.names[0]}")
+    sensor = scene.sensors[scene.names.index(config.view) if config.view else 0]
+    matrix, center = camera_of(sensor)[0].astype(float), ring.center.numpy().astype(float)
+    light = np.ravel(light_of(sensor)).astype(float)
+    toward = matrix[:3, 3] - center
+    toward /= np.linalg.norm(toward)
+    frames, digits = [], max(3, len(str(count - 1)))
+    for k in range(count):
+        name, time, camera = f"{k:0{digits}}.{config.format or 'png'}", config.time, matrix
+        if config.flow:
+            time = k / max(count - 1, 1)
+        axis = scene.up if config.turntable else toward
+        turn = Rotation.from_rotvec(2 * np.pi * k / count * axis).as_matrix()
+        lamp = light[:3] if light[3] else light[:3] - center
+        if config.turntable:
+            around = np.eye(4)
+            around[:3, :3], around[:3, 3] = turn, center - turn @ center
+            camera, lamp = around @ matrix, turn @ lamp
+        elif config.light_orbit:
+            aside = matrix[:3, 1] - (matrix[:3, 1] @ toward) * toward
+            slant = np.radians(SLANT)
+            direction = np.cos(slant) * toward + np.sin(slant) * aside / np.linalg.norm(aside)
+            lamp = np.linalg.norm(lamp) * (turn @ direction)
+        frames.append(Frame(moved(sensor, name, camera, lamp + (0 if light[3] else center), light), name, time))
+    return frames
+
+
+def moved(sensor: Photograph, name: str, to_world: np.ndarray, lamp: np.ndarray, light: np.ndarray) -> Photograph:
+    """A photograph as this one, from elsewhere and with its light elsewhere, at `lamp` or from that direction."""
+    _, (fx, fy), (cx, cy) = camera_of(sensor)
+    width, height = sensor.size
+    emitter = {"type": "point", "position": lamp.tolist(), "intensity": {"type": "rgb", "value": light[4:7].tolist()}}
+    if light[3]:
+        emitter = {"type": "directional", "direction": (-lamp).tolist(), "irradiance": emitter["intensity"]}
+    return mi.load_dict({
+        "type": "photograph", "filename": name, "fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy),
+        "to_world": mi.ScalarTransform4f(to_world), "film": {"type": "hdrfilm", "width": width, "height": height},
+        "light": emitter,
+    })  # fmt: skip
+
+
+def render(scene: Capture, ring: Ring, frames: list[Frame], integrator, config: RenderConfig) -> Iterator[np.ndarray]:
+    """The pictures, (H, W, 3) linear radiance each."""
+    surface = under(config.envmap, scene, ring) if config.envmap else bridge.Surface(scene.scene, scene.shape, ring)
+    s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
+    shown = None
+    for k, frame in enumerate(tqdm(frames, desc="rendering", unit="picture")):
+        if frame.time != shown:
+            surface.show(ring, s, faces, frame.time)
+            shown = frame.time
+        if integrator:
+            picture = mi.render(surface.scene, sensor=frame.sensor, integrator=integrator, spp=config.spp, seed=k)
+            yield np.array(picture)[..., :3]
+        else:
+            one = Photographs.of([frame.sensor])
+            rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=scene.shadows, indirect=ring.indirect)
+            yield rgb[0].numpy()
+
+
+def under(envmap: Path, scene: Capture, ring: Ring) -> bridge.Surface:
+    """The object and what else is in the scene, lit by an environment whose up is the cameras', and by fixed lamps."""
+    turn = Rotation.align_vectors([scene.up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's is y
+    to_world = np.eye(4)
+    to_world[:3, :3] = turn
+    shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
+    parts = [s for s in scene.scene.shapes() if s != scene.shape]
+    for emitter in scene.scene.emitters():  # those of shapes come along with them
+        of_shape = isinstance(emitter, Flash) or mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+        if not (of_shape or emitter.is_environment()):
+            parts.append(emitter)
+    try:
+        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world)})
+    except RuntimeError as error:
+        raise InputError(f"{envmap}: --envmap: {capture.reason(error)}") from error
+    everything = {"type": "scene", "object": shape, "light": light} | {f"part{k}": p for k, p in enumerate(parts)}
+    return bridge.Surface(mi.load_dict(everything), shape, ring)
 
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
     """Write (H, W, 3) linear radiance: EXR as it is, anything else 8-bit sRGB."""
     exr = path.suffix.lower() == ".exr"
     write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
+
+
+def write_film(pictures: Iterator[np.ndarray], path: Path, fps: float) -> None:
+    """Write an MP4 file that browsers play, H.264 with an even number of rows and columns, whole or not at all."""
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    writer = imageio.get_writer(
+        partial, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=None, macro_block_size=1,
+        output_params=["-crf", "16", "-movflags", "+faststart"],
+    )  # fmt: skip
+    try:
+        with writing(path):
+            with writer:
+                for picture in pictures:
+                    height, width = picture.shape[:2]
+                    image = to_bytes(linear_to_srgb(picture))
+                    writer.append_data(np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), "edge"))
+            os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

@@ -67,14 +67,11 @@ def html(fit, log: list[dict], glb: bytes | None = None) -> str:
 
 def view(fit) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
-    cameras = np.stack([camera_of(sensor)[0] for sensor in fit.capture.sensors])
+    eye = camera_of(fit.capture.sensors[0])[0][:3, 3]
     lights = np.array(fit.capture.photographs.lights).reshape(-1, 8)
     distance2 = ((lights[:, :3] - fit.ring.center.cpu().numpy()) ** 2).sum(1)
     irradiance = np.median(lights[:, 4:7] / np.where(lights[:, 3:4] > 0, 1.0, distance2[:, None]), axis=0)
-    up = cameras[:, :3, 1].mean(0)
-    if np.linalg.norm(up) < 0.1:  # held in every way
-        up = cameras[0, :3, 1]
-    return {"up": up.tolist(), "eye": cameras[0, :3, 3].tolist(), "irradiance": irradiance.tolist()}
+    return {"up": fit.capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
 
 
 def findings(rows: list[Row], iteration: int, iterations: int) -> list[str]:

@@ -12,13 +12,15 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from mi_ring import bridge, report
+from mi_ring import bridge, gltf, report
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.config import Config
 from mi_ring.errors import InputError
 from mi_ring.mesh import FACES, POSITIONS
 from mi_ring.reflectance import bsdf_element
 from mi_ring.ring import Ring
+
+VIEWED, TEXELS = 5, 1024  #: level of the report's object, and texels across its textures
 
 
 @contextlib.contextmanager
@@ -124,8 +126,16 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
     replace(folder / "scene.xml", fitted_scene)
     s, faces = fit.ring.domain.sample(fit.config.subdivisions)
     fit.surface.show(fit.ring, s, faces)
-    replace(folder / "report.html", report.html(fit, read_log(folder)))
+    replace(folder / "report.html", report.html(fit, read_log(folder), viewed(fit.ring)))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
+
+
+def viewed(ring: Ring) -> bytes | None:
+    """The object for the report's viewer as GLB, if its material can be told in glTF's terms."""
+    try:
+        return gltf.glb(ring, min(VIEWED, ring.subdivisions), TEXELS)
+    except InputError:
+        return None
 
 
 def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> None:

@@ -1,0 +1,223 @@
+"""`mi_ring.evaluate`: each number against a closed form or a second way to find it, and the command as a whole."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import AXES, CENTER
+from trimesh.creation import box, icosphere, torus
+
+from mi_ring import capture, evaluate, render, results
+from mi_ring.command import run
+from mi_ring.hull import genus
+from mi_ring.ring import Ring
+
+
+def rectangle(width, height, z=0.0):
+    """In the plane of this z, a corner at the origin."""
+    corners = [[0, 0, z], [width, 0, z], [width, height, z], [0, height, z]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def moved(mesh, scale=1.0, to=(400.0, -1500.0, 90.0)):
+    """Somewhere else, where coordinates are large."""
+    return trimesh.Trimesh(mesh.vertices * scale + to, mesh.faces, process=False)
+
+
+# Chamfer distance and F-score.
+
+
+def test_parallel_planes_are_as_far_apart_as_they_are():
+    # The diagonal is 5: 0.015 of it is 0.3 %, to both sides.
+    numbers = evaluate.compare_shapes(moved(rectangle(3, 4, 0.015)), moved(rectangle(3, 4)))
+    assert numbers["chamfer"] == pytest.approx(0.3, abs=1e-9)
+    assert numbers["f_score_0.1"] == 0 and numbers["f_score_0.5"] == 1
+
+
+def test_equal_surfaces_of_other_triangles_have_no_distance():
+    numbers = evaluate.compare_shapes(moved(box((3, 4, 5)).subdivide()), moved(box((3, 4, 5))))
+    assert numbers["chamfer"] < 1e-9
+    assert numbers["f_score_0.1"] == numbers["f_score_0.5"] == 1
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_what_is_missing_or_too_much_counts_half(swapped):
+    half, whole = moved(rectangle(1, 1), 7), moved(rectangle(2, 1), 7)
+    numbers = evaluate.compare_shapes(*(whole, half) if swapped else (half, whole))
+    diagonal = np.sqrt(2 if swapped else 5)
+    # A point of the other half is between 0 and 1 away from the first, 1/2 in the mean. Tolerances: 100,000 points.
+    assert numbers["chamfer"] == pytest.approx(100 / diagonal * (0 + 1 / 4) / 2, rel=0.02)
+    for threshold in (0.1, 0.5):
+        share = (1 + threshold / 100 * diagonal) / 2
+        assert numbers[f"f_score_{threshold}"] == pytest.approx(2 * share / (1 + share), abs=0.005)
+
+
+def test_spheres_of_two_radii():
+    numbers = evaluate.compare_shapes(moved(icosphere(5, 1.004), 30), moved(icosphere(5), 30))
+    assert numbers["chamfer"] == pytest.approx(100 * 0.004 / (2 * np.sqrt(3)), rel=0.01)
+    numbers = evaluate.compare_shapes(icosphere(5, 1.004), icosphere(5))
+    assert numbers["f_score_0.1"] == 0 and numbers["f_score_0.5"] == 1  # 0.115 %
+
+
+# Triangles that cross.
+
+
+def crossing_triangles(mesh):
+    """The obvious way, in double precision: every edge of every triangle against every triangle."""
+
+    def volume(p, q, r, s):
+        return np.einsum("...i,...i", np.cross(q - p, r - p), s - p)
+
+    a, b, c = mesh.triangles.transpose(1, 0, 2)
+    crossing = np.zeros(len(mesh.faces), bool)
+    for face, corners in enumerate(mesh.faces):
+        for edge in zip(corners, np.roll(corners, 1)):
+            p, q = mesh.vertices[list(edge)]
+            sides = np.sign([volume(a, b, p, q), volume(b, c, p, q), volume(c, a, p, q)])
+            pierced = (volume(a, b, c, p) * volume(a, b, c, q) < 0) & (np.abs(sides.sum(0)) == 3)
+            pierced &= ~np.isin(mesh.faces, edge).any(1)
+            crossing |= pierced
+            crossing[face] |= pierced.any()
+    return int(crossing.sum())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_spheres_that_interpenetrate(seed):
+    random = np.random.default_rng(seed)
+    other = icosphere(2, 0.7)
+    other.apply_transform(trimesh.transformations.random_rotation_matrix(random.random(3)))
+    other.apply_translation(random.uniform(0.3, 0.6, 3))
+    both = icosphere(2) + other
+    expected = crossing_triangles(both)
+    assert expected > 30
+    for mesh in (both, moved(both, 30), moved(both, 0.01)):  # at the last, float32 would see nothing
+        assert evaluate.self_intersections(mesh) == expected
+
+
+def test_a_crumpled_sphere_where_an_edge_pierces_many():
+    mesh = icosphere(2)
+    mesh = moved(trimesh.Trimesh(mesh.vertices + np.random.default_rng(1).normal(0, 0.3, mesh.vertices.shape),
+                                 mesh.faces, process=False), 20)  # fmt: skip
+    expected = crossing_triangles(mesh)
+    assert expected > 0.5 * len(mesh.faces)
+    assert evaluate.self_intersections(mesh) == expected
+
+
+def test_one_needle_through_three_sheets():
+    sheets = [rectangle(4, 3, z) for z in (0.0, 0.5, 1.0)]
+    needle = trimesh.Trimesh([[2.5, 1, -1], [2.5, 1, 2], [9, 1.2, 0.1]], [[0, 1, 2]], process=False)
+    mesh = trimesh.util.concatenate([*sheets, needle])
+    assert evaluate.self_intersections(mesh) == crossing_triangles(mesh) >= 4
+
+
+@pytest.mark.parametrize(
+    "mesh", [icosphere(4), torus(1, 0.3), box((1, 2, 3)).subdivide(), icosphere(2) + icosphere(2, 0.9)],
+    ids=["sphere", "torus", "box", "nested spheres"],
+)  # fmt: skip
+def test_what_does_not_cross_itself(mesh):
+    for surface in (mesh, moved(mesh, 3)):
+        assert evaluate.self_intersections(surface) == 0
+
+
+def test_genus_of_all_pieces():
+    ring, far = torus(1, 0.3), moved(torus(1, 0.3))
+    assert genus(icosphere(2)) == 0 and genus(ring) == 1
+    assert genus(ring + far) == 2 and genus(icosphere(2) + far) == 1
+
+
+# Views.
+
+
+def test_a_surface_that_is_inside_out_is_flipped(small_capture):
+    scene = capture.load(small_capture)
+    ball = moved(icosphere(4), 20, CENTER)
+    inverted = trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False)
+    outside, inside = (evaluate.scene_of(mesh.vertices, mesh.faces) for mesh in (ball, inverted))
+    numbers, views = evaluate.compare_surfaces(scene, outside, outside, 10.0)
+    assert numbers["flipped"] == 0 and numbers["normal_mean"] < 0.1
+    numbers, _ = evaluate.compare_surfaces(scene, inside, outside, 10.0)
+    assert numbers["flipped"] == 1 and numbers["normal_mean"] > 179.9
+    numbers, _ = evaluate.compare_surfaces(scene, outside, inside, 10.0)
+    assert numbers["flipped"] == 0  # that of the fit, not of the truth
+    assert [view["name"] for view in views] == [f"{k:03}.png" for k in range(12)]
+
+
+def test_ssim_is_that_of_the_paper():
+    random = np.random.default_rng(2)
+    a = random.random((11, 12, 3))
+    b = np.clip(0.7 * a + 0.3 * random.random(a.shape) + 0.05, 0, 1)
+    weights = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    weights = np.outer(weights, weights) / weights.sum() ** 2
+    values = []
+    for column in (0, 1):  # the window fits in twice
+        for channel in range(3):
+            x, y = (image[:, column : column + 11, channel] for image in (a, b))
+            mx, my = (weights * x).sum(), (weights * y).sum()
+            vx, vy, vxy = ((weights * p).sum() for p in ((x - mx) ** 2, (y - my) ** 2, (x - mx) * (y - my)))
+            values.append((2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
+    assert evaluate.ssim(a, b)["ssim"] == pytest.approx(np.mean(values), abs=1e-9)
+    assert evaluate.ssim(a, a)["ssim"] == pytest.approx(1)
+    assert evaluate.ssim(a[:10], b[:10]) == {}  # it does not fit in
+
+
+# The command.
+
+
+@pytest.fixture(scope="module")
+def sphere_run(small_capture, tmp_path_factory):
+    """The results folder of a fit that has not begun."""
+    folder = tmp_path_factory.mktemp("run")
+    torch.save(Ring(CENTER, 25.0, scale=0.5).state(), folder / "ring.pt")
+    results.write_mesh(folder / "ring.pt", 3, folder / "mesh.ply")
+    scene = results.scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
+    (folder / "scene.xml").write_bytes(scene)
+    ellipsoid = trimesh.Trimesh(CENTER + icosphere(4).vertices * AXES, icosphere(4).faces)
+    ellipsoid.export(folder / "truth.ply")
+    return folder
+
+
+def test_the_command_agrees_with_the_pictures_that_render_writes(sphere_run, small_capture, tmp_path, capsys):
+    out = tmp_path / "numbers" / "all.json"
+    evaluate.main([str(sphere_run), "--mesh", str(sphere_run / "truth.ply"), "--novel", str(small_capture),
+                   "--out", str(out)])  # fmt: skip
+    printed = capsys.readouterr()
+    totals, everything = json.loads(printed.out), json.loads(out.read_text())
+    assert printed.out.count("\n") == 1 and str(out) in printed.err
+    assert f"{totals['psnr_input']}" in printed.err and f"{totals['chamfer']}" in printed.err
+    views, novel = everything.pop("views"), everything.pop("novel_views")
+    assert everything == totals
+    assert totals["genus"] == totals["genus_true"] == totals["self_intersections"] == totals["flipped"] == 0
+    assert np.mean([view["iou"] for view in views]) == pytest.approx(totals["iou"], abs=1e-4)
+    assert novel == [{key: view[key] for key in ("name", "psnr", "ssim")} for view in views]  # the same photographs
+
+    render.main([str(sphere_run), str(small_capture), str(tmp_path / "pictures")])
+    squares = []
+    for view in views:
+        names = small_capture.parent / "images" / view["name"], tmp_path / "pictures" / view["name"]
+        a, b = (np.array(mi.Bitmap(str(name)))[..., :3] / 255 for name in names)
+        squares.append(np.mean((a - b) ** 2))
+        assert view["psnr"] == pytest.approx(-10 * np.log10(squares[-1]), abs=1e-4)
+    assert totals["psnr_input"] == pytest.approx(-10 * np.log10(np.mean(squares)), abs=1e-4)
+    assert totals["ssim_input"] == pytest.approx(np.mean([view["ssim"] for view in views]), abs=1e-4)
+
+
+def test_what_cannot_be_done_is_one_line(sphere_run, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    points = tmp_path / "points.ply"
+    trimesh.PointCloud(np.eye(3)).export(points)
+    truth = str(sphere_run / "truth.ply")
+    for options, words in (
+        (["--mesh", truth, "--out", str(tmp_path / "file" / "all.json")], ["all.json", "--out", "cannot be written"]),
+        (["--mesh", truth, "--out", str(sphere_run / "mesh.ply")], ["mesh.ply", "--out", ".json"]),
+        (["--mesh", str(points)], ["points.ply", "mesh", "no triangles"]),
+        (["--mesh", truth, "--spp", "0"], ["--spp", "at least 1"]),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            run("mi_ring.evaluate", evaluate.main, [str(sphere_run), *options])
+        complaint = capsys.readouterr().err
+        assert stop.value.code == 2 and complaint.count("\n") == 1, complaint
+        assert all(word in complaint for word in words), complaint
+    assert not (sphere_run / "evaluation.json").exists()
