@@ -14,6 +14,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring import bridge, capture, command
+from mi_ring.atlas import positions
 from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, light_of
@@ -40,15 +41,17 @@ class RenderConfig(MaterialOptions):
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG. Or FILE.mp4."""
     turntable: int = 0
-    """So many pictures from a camera that goes once around the object with its light, about the cameras' mean up."""
+    """So many pictures from a camera that goes once around the object, and its light with it."""
     light_orbit: int = 0
     """So many pictures with a light that goes once around the line from the object to the camera, at 45°."""
     flow: int = 0
     """So many pictures of the flow, from where the fit started to the object."""
     view: str | None = None
-    """File name of the photograph whose camera and light these three take. Default: the first."""
+    """File name of the photograph from whose place, and under whose light, these three are seen. Default: the first."""
+    up: tuple[float, float, float] | None = None
+    """Axis of the turntable, and up in the environment. Default: the cameras' mean up."""
     envmap: Path | None = None
-    """Environment, an EXR or HDR file of latitude and longitude, that lights the object; the photographs' lights are off."""
+    """Environment, an EXR or HDR file of latitude and longitude, to light the object instead."""
     integrator: str | None = None
     """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection."""
     format: Literal["png", "exr"] | None = None
@@ -111,12 +114,14 @@ def check(config: RenderConfig) -> None:
         raise InputError(f"--time: is {config.time}, must be 0 to 1")
     if not 0 < config.fps <= 240:
         raise InputError(f"--fps: is {config.fps}, must be above 0, 240 at most")
+    if config.up is not None and not 0 < np.linalg.norm(config.up) < np.inf:
+        raise InputError(f"--up: is {config.up}, must be a direction")
     if config.envmap and config.integrator == "photometric":
-        raise InputError("--integrator: photometric is for the photographs' own lights; with --envmap give path or direct")
+        raise InputError("--integrator: photometric is for photographs' own lights; with --envmap give path or direct")
     if config.envmap and config.light_orbit:
         raise InputError("--light-orbit: moves a photograph's light, which --envmap switches off; give one of the two")
     if config.out.suffix.lower() == ".mp4" and config.format:
-        raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out, or name a folder")
+        raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out")
 
 
 def check_frames(frames: list[Frame], scene: Capture, config: RenderConfig) -> None:
@@ -163,48 +168,74 @@ def frames_of(scene: Capture, ring: Ring, config: RenderConfig) -> list[Frame]:
     if config.view is not None and config.view not in scene.names:
         raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {scene.names[0]}")
     sensor = scene.sensors[scene.names.index(config.view) if config.view else 0]
-    matrix, center = camera_of(sensor)[0].astype(float), ring.center.numpy().astype(float)
+    up = up_of(scene, config)
+    to_world, focal, middle = framed(sensor, ring, up)
     light = np.ravel(light_of(sensor)).astype(float)
-    toward = matrix[:3, 3] - center
-    toward /= np.linalg.norm(toward)
+    lamp = light[:3] if light[3] else light[:3] - middle
+    toward = to_world[:3, 2]
     frames, digits = [], max(3, len(str(count - 1)))
     for k in range(count):
-        name, time, camera = f"{k:0{digits}}.{config.format or 'png'}", config.time, matrix
-        if config.flow:
-            time = k / max(count - 1, 1)
-        axis = scene.up if config.turntable else toward
-        turn = Rotation.from_rotvec(2 * np.pi * k / count * axis).as_matrix()
-        lamp = light[:3] if light[3] else light[:3] - center
+        camera, shining, time = to_world, lamp, config.time
         if config.turntable:
-            around = np.eye(4)
-            around[:3, :3], around[:3, 3] = turn, center - turn @ center
-            camera, lamp = around @ matrix, turn @ lamp
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec(2 * np.pi * k / count * up).as_matrix()
+            turn[:3, 3] = middle - turn[:3, :3] @ middle
+            camera, shining = turn @ to_world, turn[:3, :3] @ lamp
         elif config.light_orbit:
-            aside = matrix[:3, 1] - (matrix[:3, 1] @ toward) * toward
+            turn = Rotation.from_rotvec(2 * np.pi * k / count * toward)
             slant = np.radians(SLANT)
-            direction = np.cos(slant) * toward + np.sin(slant) * aside / np.linalg.norm(aside)
-            lamp = np.linalg.norm(lamp) * (turn @ direction)
-        frames.append(Frame(moved(sensor, name, camera, lamp + (0 if light[3] else center), light), name, time))
+            shining = np.linalg.norm(lamp) * turn.apply(np.sin(slant) * to_world[:3, 1] - np.cos(slant) * toward)
+        else:
+            time = k / max(count - 1, 1)
+        name = f"{k:0{digits}}.{config.format or 'png'}"
+        where = shining if light[3] else middle + shining
+        frames.append(Frame(photograph(sensor.size, camera, focal, where, light), name, time))
     return frames
 
 
-def moved(sensor: Photograph, name: str, to_world: np.ndarray, lamp: np.ndarray, light: np.ndarray) -> Photograph:
-    """A photograph as this one, from elsewhere and with its light elsewhere, at `lamp` or from that direction."""
-    _, (fx, fy), (cx, cy) = camera_of(sensor)
-    width, height = sensor.size
-    emitter = {"type": "point", "position": lamp.tolist(), "intensity": {"type": "rgb", "value": light[4:7].tolist()}}
+def up_of(scene: Capture, config: RenderConfig) -> np.ndarray:
+    """The direction (3,) that is up, unit length."""
+    return scene.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
+
+
+def framed(sensor: Photograph, ring: Ring, up: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """A camera in the place of a photograph's, turned so that all of the object and of its start are in the middle.
+
+    Returns to_world (4, 4), the focal length [px] and the middle (3,) of the object.
+    """
+    s = ring.domain.sample(3)[0].numpy()
+    points = np.concatenate([positions(ring, s, time) for time in (0.0, 1.0)]).astype(float)
+    middle = (points[len(s) :].min(0) + points[len(s) :].max(0)) / 2
+    matrix = camera_of(sensor)[0].astype(float)
+    eye = matrix[:3, 3]
+    distance = np.linalg.norm(eye - middle)
+    forward = (middle - eye) / distance
+    if np.linalg.norm(np.cross(up, forward)) < 1e-2:  # from above: up is where it was in the photograph
+        up = matrix[:3, 1]
+    left = np.cross(up, forward)
+    left /= np.linalg.norm(left)
+    matrix[:3, :3] = np.stack([left, np.cross(forward, left), forward], 1)
+    sine = min(np.linalg.norm(points - middle, axis=1).max() / distance, 0.98)
+    return matrix, 0.47 * min(sensor.size) * np.sqrt(1 - sine**2) / sine, middle
+
+
+def photograph(size: tuple[int, int], to_world: np.ndarray, focal: float, where: np.ndarray, light) -> Photograph:
+    """A photograph of (width, height) `size` with a `light` as `light_of` gives it, but elsewhere."""
+    strength = {"type": "rgb", "value": light[4:7].tolist()}
+    emitter = {"type": "point", "position": where.tolist(), "intensity": strength}
     if light[3]:
-        emitter = {"type": "directional", "direction": (-lamp).tolist(), "irradiance": emitter["intensity"]}
+        emitter = {"type": "directional", "direction": (-where).tolist(), "irradiance": strength}
     return mi.load_dict({
-        "type": "photograph", "filename": name, "fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy),
-        "to_world": mi.ScalarTransform4f(to_world), "film": {"type": "hdrfilm", "width": width, "height": height},
-        "light": emitter,
+        "type": "photograph", "filename": "none", "fx": focal, "fy": focal, "to_world": mi.ScalarTransform4f(to_world),
+        "film": {"type": "hdrfilm", "width": size[0], "height": size[1]}, "light": emitter,
     })  # fmt: skip
 
 
 def render(scene: Capture, ring: Ring, frames: list[Frame], integrator, config: RenderConfig) -> Iterator[np.ndarray]:
     """The pictures, (H, W, 3) linear radiance each."""
-    surface = under(config.envmap, scene, ring) if config.envmap else bridge.Surface(scene.scene, scene.shape, ring)
+    surface = bridge.Surface(scene.scene, scene.shape, ring)
+    if config.envmap:
+        surface = under(config.envmap, up_of(scene, config), scene, ring)
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, frame in enumerate(tqdm(frames, desc="rendering", unit="picture")):
@@ -220,11 +251,10 @@ def render(scene: Capture, ring: Ring, frames: list[Frame], integrator, config: 
             yield rgb[0].numpy()
 
 
-def under(envmap: Path, scene: Capture, ring: Ring) -> bridge.Surface:
-    """The object and what else is in the scene, lit by an environment whose up is the cameras', and by fixed lamps."""
-    turn = Rotation.align_vectors([scene.up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's is y
+def under(envmap: Path, up: np.ndarray, scene: Capture, ring: Ring) -> bridge.Surface:
+    """The object and what else is in the scene, lit by an environment and by fixed lamps."""
     to_world = np.eye(4)
-    to_world[:3, :3] = turn
+    to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
     shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     parts = [s for s in scene.scene.shapes() if s != scene.shape]
     for emitter in scene.scene.emitters():  # those of shapes come along with them
