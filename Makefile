@@ -8,14 +8,15 @@ SCENE  ?= scenes/pot2.xml
 ARGS   ?=
 
 RUN = $(VENV)/bin/python -m
+NPM_CI = cd mi_ring/viewer && npm ci --ignore-scripts --no-audit --no-fund
 
-.PHONY: help setup fit test browser viewer lint docs clean
+.PHONY: help setup fit test tools viewer lint docs clean
 
 help:
 	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
 	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE)'
 	@echo 'make test [ARGS=...]         run pytest'
-	@echo 'make browser                 install Chromium for the tests of the report, if there is none (as root)'
+	@echo 'make tools                   install what some tests need: Chromium (as root), the validator of glTF (with npm)'
 	@echo 'make viewer                  bundle the viewer of the report anew (needs Node.js)'
 	@echo 'make lint                    run ruff'
 	@echo 'make docs                    build the documentation: build/docs/index.html'
@@ -50,15 +51,16 @@ fit: setup
 test: setup
 	$(RUN) pytest $(ARGS)
 
-# Without a browser the tests that need one are skipped.
-browser:
+# Without these the tests that need them are skipped.
+tools:
 	@if command -v chromium || command -v google-chrome; then :; \
 	elif test "$$(id -u)" = 0; then apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; \
-	else echo 'make browser: found no Chromium, and only root can install it (apt-get install chromium)' >&2; fi
+	else echo 'make tools: found no Chromium, and only root can install it (apt-get install chromium)' >&2; fi
+	@if command -v npm; then $(NPM_CI); else echo 'make tools: found no npm; Node.js brings it' >&2; fi
 
 # three.js and mi_ring/viewer/viewer.js in one file, which is part of the repository.
 viewer:
-	cd mi_ring/viewer && npm ci --ignore-scripts --no-audit --no-fund && npm run build
+	$(NPM_CI) && npm run build
 
 lint: setup
 	$(RUN) ruff check .

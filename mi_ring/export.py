@@ -191,6 +191,7 @@ def camera(photograph: Photograph, vertices: np.ndarray) -> ElementTree.Element:
     matrix, (fx, fy), (cx, cy) = camera_of(photograph)
     distance = np.linalg.norm(vertices - matrix[:3, 3], axis=1)
     width, height = photograph.size
+    height, cy = round(height * fx / fy), cy * fx / fy
     sensor = ElementTree.Element("sensor", type="perspective")
     for name, value in {
         "fov": math.degrees(2 * math.atan(width / 2 / fx)),
@@ -202,7 +203,7 @@ def camera(photograph: Photograph, vertices: np.ndarray) -> ElementTree.Element:
     to_world = ElementTree.SubElement(sensor, "transform", name="to_world")
     ElementTree.SubElement(to_world, "matrix", value=" ".join(f"{v:.9g}" for v in matrix.ravel()))
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
-    for name, pixels in (("width", width), ("height", round(height * fx / fy))):
+    for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
     return sensor
 

@@ -81,7 +81,7 @@ def page_file(fitted, tmp_path_factory):
 def browser():
     executable = shutil.which("chromium") or shutil.which("google-chrome")
     if not executable:
-        pytest.skip("needs Chromium, which `make browser` installs")
+        pytest.skip("needs Chromium, which `make tools` installs")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=executable, args=DRAWING)
         yield browser

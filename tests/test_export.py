@@ -1,0 +1,419 @@
+"""Files for other programs: what they say of the surface and of its material, read by others than their writer."""
+
+import json
+import math
+import os
+import shutil
+import struct
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scipy.ndimage import map_coordinates
+from test_bsdf import directions, twin
+
+from mi_ring import atlas, export, gltf
+from mi_ring.brdfnet import Parameter
+from mi_ring.capture import camera_of
+from mi_ring.domain import Domain
+from mi_ring.errors import InputError
+from mi_ring.integrator import light_of
+from mi_ring.ring import Ring
+
+CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
+RESOLUTION = 256
+
+
+def wild(domain=None, bsdf='<bsdf type="cooktorrance"/>', subdivisions=4, **properties) -> Ring:
+    """A ring whose surface is no sphere and whose material is not the same everywhere."""
+    torch.manual_seed(7)
+    ring = Ring(CENTER, RADIUS, 0.1, domain, bsdf=bsdf, steps=4, subdivisions=subdivisions, **properties)
+    with torch.no_grad():
+        ring.shape_net.output.weight *= 8
+        ring.brdf_net.output.weight *= 60
+    return ring
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return wild()
+
+
+@pytest.fixture(scope="module")
+def run(ring, small_capture, tmp_path_factory):
+    """A results folder with what export reads of it."""
+    folder = tmp_path_factory.mktemp("run")
+    torch.save(ring.state({"subdivisions": 4}), folder / "ring.pt")
+    (folder / "scene.xml").write_text(small_capture.read_text())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def baked(ring):
+    """(atlas, texels) of a mesh coarser than the surface."""
+    opened = atlas.unwrap(ring, 3, RESOLUTION)
+    return opened, atlas.rasterise(ring, opened, RESOLUTION)
+
+
+@pytest.fixture(scope="module")
+def glb_file(run, tmp_path_factory):
+    file = tmp_path_factory.mktemp("glb") / "object.glb"
+    export.main([str(run), str(file), "--subdivisions", "3", "--resolution", str(RESOLUTION), "--metres", "0.001"])
+    return file
+
+
+def complaint(*arguments) -> str:
+    with pytest.raises(InputError) as error:
+        export.main([str(a) for a in arguments])
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def attributes(file) -> dict:
+    """The attributes of a PLY file, as Mitsuba reads them."""
+    params = mi.traverse(mi.load_dict({"type": "ply", "filename": str(file)}))
+    return {key: np.array(value) for key, value in params if key.startswith("vertex_")}
+
+
+def chunks(file):
+    """The JSON and the binary part of a GLB file (glTF 2.0, section 4.4)."""
+    content = file.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size = struct.unpack_from("<I4s", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[20 + size + 8 :]
+
+
+def bilinear(image, uv):
+    """An image (H, W, C) at (N, 2), as renderers read it; the first texel's centre at half a texel."""
+    y, x = uv[:, 1] * image.shape[0] - 0.5, uv[:, 0] * image.shape[1] - 0.5
+    return np.stack([map_coordinates(image[..., c].astype(float), [y, x], order=1, mode="nearest")
+                     for c in range(image.shape[2])], 1)  # fmt: skip
+
+
+def closed(opened) -> trimesh.Trimesh:
+    """The mesh of an atlas before it was cut."""
+    vertices = np.zeros((opened.whole.max() + 1, 3))
+    vertices[opened.whole] = opened.vertices
+    return trimesh.Trimesh(vertices, opened.whole[opened.faces], process=False)
+
+
+def normals_at(ring, s):
+    """The analytic normal (N, 3) of the surface at points of the sphere, by the derivative of the flow."""
+    s = torch.from_numpy(s.astype(np.float32))
+    aside = torch.linalg.cross(s, torch.tensor([0.3, 0.5, 0.8]).expand_as(s))
+    pair = aside, torch.linalg.cross(s, aside)
+
+    def surface(x):
+        for _ in range(ring.shape_net.steps):
+            x = x + ring.shape_net.velocity(x) / ring.shape_net.steps
+        return x
+
+    a, b = (torch.func.jvp(surface, (s,), (t,))[1] for t in pair)
+    n = torch.linalg.cross(a, b)
+    return (n / n.norm(dim=1, keepdim=True)).detach().numpy()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The material in glTF's terms
+
+
+def gltf_brdf(c, m, roughness, weight, color, n, i, o, v):
+    """The BRDF of glTF 2.0 (appendix B) with KHR_materials_specular, of a dielectric; `v`: the visibility of α."""
+    assert not m.any()
+    h = (i + o) / np.linalg.norm(i + o, axis=1, keepdims=True)
+    alpha = roughness**2
+    noh, voh = (n * h).sum(1), (o * h).sum(1)
+    d = alpha**2 / (math.pi * (noh**2 * (alpha**2 - 1) + 1) ** 2)
+    f0, f90 = np.minimum(0.04 * color, 1) * weight, weight
+    f = f0 + (f90 - f0) * (1 - voh) ** 5
+    return (1 - f)[:, None] * c / math.pi + (f * d * v(alpha, (n * i).sum(1), (n * o).sum(1)))[:, None]
+
+
+def uncorrelated(alpha, ni, no):
+    """Smith's G as a product, divided by 4 (n·i)(n·o): that of `cooktorrance`."""
+    def g(cosine):
+        return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2))
+
+    return g(ni) * g(no) / (4 * ni * no)
+
+
+def correlated(alpha, ni, no):
+    """glTF's, of appendix B.3.2."""
+    def part(a, b):
+        return a * np.sqrt(b**2 * (1 - alpha**2) + alpha**2)
+
+    return 0.5 / (part(ni, no) + part(no, ni))
+
+
+def test_the_mapping_is_exact_but_for_the_visibility():
+    random = np.random.default_rng(3)
+    values = {"diffuse": random.uniform(0, 0.2, (40, 3)), "specular": random.uniform(0, 0.08, 40),
+              "roughness": random.uniform(0.05, 0.9, 40)}  # fmt: skip
+    i, o, n = directions(40, 1), directions(40, 2), np.array([[0.0, 0.0, 1.0]])
+    material = gltf.metallic_roughness('<bsdf type="cooktorrance"/>', values)
+    assert material.scale == 1 and material.base_color.max() <= 1 and material.specular.max() <= 1
+    ours = [twin(a[None], b[None], *v)[0] / a[2] for a, b, *v in zip(i, o, *values.values())]
+    np.testing.assert_allclose(gltf_brdf(*material[:5], n, i, o, uncorrelated), ours, rtol=2e-4)
+    theirs = gltf_brdf(*material[:5], n, i, o, correlated)
+    assert (theirs > (1 - 1e-6) * gltf_brdf(*material[:5], n, i, o, uncorrelated)).all()  # G is larger if correlated
+    assert not np.allclose(theirs, ours, rtol=1e-3)
+
+
+def test_reflectances_beyond_one_are_scaled_and_the_scale_is_told():
+    values = {"diffuse": np.full((200, 3), [0.5, 0.3, 0.1], np.float32), "specular": np.full(200, 0.2, np.float32),
+              "roughness": np.full(200, 0.25, np.float32)}  # fmt: skip
+    material = gltf.metallic_roughness('<bsdf type="cooktorrance"/>', values)
+    albedo = math.pi * 0.5 + 0.8
+    np.testing.assert_allclose(material.scale, 1 / albedo, rtol=1e-5)
+    np.testing.assert_allclose(material.specular, 0.8 / albedo, rtol=1e-5)
+    np.testing.assert_allclose(material.base_color[0], [1, 0.6, 0.2], rtol=1e-4)
+    np.testing.assert_allclose(material.roughness, 0.5)
+
+
+def test_constants_of_the_bsdf_count():
+    numbers = '<float name="specular" value="0.05"/><float name="roughness" value="0.36"/>'
+    bsdf = f'<bsdf type="cooktorrance">{numbers}</bsdf>'
+    material = gltf.metallic_roughness(bsdf, {"diffuse": np.full((5, 3), 0.1, np.float32)})
+    np.testing.assert_allclose(material.specular, 0.2, rtol=1e-6)
+    np.testing.assert_allclose(material.roughness, 0.6, rtol=1e-6)
+    np.testing.assert_allclose(material.base_color, 0.1 * math.pi / 0.8, rtol=1e-5)
+
+
+@pytest.mark.parametrize("inner, color", [("", 1.0), ('<float name="specular" value="0.25"/>', 0.5),
+                                          ('<float name="eta" value="2"/>', 1 / 9 / 0.04)])  # fmt: skip
+def test_principled_keeps_its_numbers(inner, color):
+    bsdf = f'<bsdf type="principled"><float name="metallic" value="0.3"/>{inner}</bsdf>'
+    values = {"base_color": np.full((5, 3), [0.1, 0.5, 0.9], np.float32), "roughness": np.full(5, 0.4, np.float32)}
+    material = gltf.metallic_roughness(bsdf, values)
+    np.testing.assert_allclose(material.base_color, values["base_color"])
+    np.testing.assert_allclose(material.roughness, 0.4)
+    np.testing.assert_allclose(material.metallic, 0.3)
+    np.testing.assert_allclose(material.specular_color, color, rtol=1e-5)
+
+
+@pytest.mark.parametrize("bsdf, named", [
+    ('<bsdf type="plastic"/>', "plastic"),
+    ('<bsdf type="principled"><float name="clearcoat" value="0.5"/></bsdf>', "clearcoat"),
+])  # fmt: skip
+def test_what_gltf_cannot_tell_is_refused(bsdf, named):
+    with pytest.raises(InputError, match=f"{named}.*PLY"):
+        gltf.metallic_roughness(bsdf, {"diffuse_reflectance": np.zeros((5, 3), np.float32)})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The atlas
+
+
+def test_charts_do_not_overlap_and_lose_nothing(ring, baked):
+    opened, texels = baked
+    assert opened.uv.min() >= 0 and opened.uv.max() <= 1
+    corners = opened.uv[opened.faces]
+    area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 2
+    assert abs(len(texels.s) / RESOLUTION**2 - area) < 0.01 * area  # a texel in two triangles would count once
+    assert len(opened.faces) == 20 * 4**3 and opened.whole.max() + 1 == 10 * 4**3 + 2
+    assert closed(opened).is_watertight and closed(opened).euler_number == 2
+
+
+def test_texels_show_the_point_of_the_surface_that_is_there(ring, baked):
+    opened, texels = baked
+    s = texels.s / np.linalg.norm(texels.s, axis=1, keepdims=True)
+    where = bilinear(s[texels.index], opened.uv)
+    away = np.linalg.norm(where - opened.s, axis=1)
+    assert np.median(away) < 0.01 and away.max() < 0.05  # a triangle's edge is 0.16 long
+
+
+def test_there_are_no_seams(ring, baked):
+    """Along a seam both charts show the same colour: the midpoints of its edges are looked up in both."""
+    opened, texels = baked
+    material = gltf.metallic_roughness(ring.bsdf, atlas.reflectances(ring, texels.s))
+    colour = gltf.textures(material, texels)["baseColorTexture"] / 255
+    assert colour.std((0, 1)).min() > 0.02
+    sides = {}
+    for a, b in np.concatenate([opened.faces[:, [k, (k + 1) % 3]] for k in range(3)]):
+        sides.setdefault(frozenset(opened.whole[[a, b]]), []).append((a, b))
+    seams = [pair for pair in sides.values() if len({frozenset(edge) for edge in pair}) > 1]
+    assert len(seams) > 20
+    one, two = (bilinear(colour, np.array([opened.uv[list(pair[k])].mean(0) for pair in seams])) for k in (0, 1))
+    assert np.abs(one - two).mean() < 0.004 and np.abs(one - two).max() < 0.03
+
+
+def test_the_normal_map_holds_the_normals_of_the_flow():
+    """Decoded by the frame of the coarse mesh, as glTF asks, they are the derivatives of the flow."""
+    ring = wild(subdivisions=6)
+    opened = atlas.unwrap(ring, 3, RESOLUTION)
+    texels = atlas.rasterise(ring, opened, RESOLUTION)
+    material = gltf.metallic_roughness(ring.bsdf, atlas.reflectances(ring, texels.s))
+    image = gltf.textures(material, texels)["normalTexture"] / 127.5 - 1
+    triangles = opened.uv[opened.faces]
+    inverse = np.linalg.inv((triangles[:, 1:] - triangles[:, :1]).swapaxes(1, 2))
+    random, found, coarse, points = np.random.default_rng(1), [], [], []
+    while len(points) < 300:
+        row, column = random.integers(RESOLUTION, size=2)
+        uv = (np.array([column, row]) + 0.5) / RESOLUTION
+        b = (inverse @ (uv - triangles[:, 0])[..., None])[..., 0]
+        inside = np.flatnonzero((b.min(1) > 0) & (b.sum(1) < 1))
+        if len(inside) != 1:
+            continue
+        w, corner = np.array([1 - b[inside[0]].sum(), *b[inside[0]]]), opened.faces[inside[0]]
+        n, t, sign = w @ opened.normals[corner], w @ opened.tangents[corner, :3], opened.tangents[corner[0], 3]
+        n, t = n / np.linalg.norm(n), t / np.linalg.norm(t)
+        x, y, z = image[row, column]
+        found.append(x * t + y * sign * np.cross(n, t) + z * n)
+        coarse.append(n)
+        points.append(texels.s[texels.index[row, column]])
+    truth = normals_at(ring, points / np.linalg.norm(points, axis=1, keepdims=True))
+    error, before = (np.degrees(np.arccos(np.clip((m * truth).sum(1) / np.linalg.norm(m, axis=1), -1, 1)))
+                     for m in (np.array(found), np.array(coarse)))  # fmt: skip
+    assert np.mean(error) < 0.6 < 1.2 < np.mean(before)  # eight bits alone: 0.3 degrees
+
+
+def test_a_domain_with_a_handle_is_cut_open_too():
+    torus = trimesh.creation.torus(1.0, 0.4, major_sections=30, minor_sections=14)
+    ring = wild(Domain(torus.vertices, torus.faces))
+    opened = atlas.unwrap(ring, 3, RESOLUTION)
+    assert closed(opened).is_watertight and closed(opened).euler_number == 0
+    x, y, z = ring.domain.project(torus.triangles_center * 1.1).T
+    tube = np.hypot(np.hypot(x, y) - 1, z)
+    assert tube.min() > 0.38 and tube.max() < 0.4001
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Files
+
+
+def test_khronos_validator_finds_nothing(glb_file):
+    modules = gltf.__file__.replace("gltf.py", "viewer/node_modules")
+    if not shutil.which("node") or not os.path.isdir(f"{modules}/gltf-validator"):
+        pytest.skip("needs the validator of glTF, which `make tools` installs")
+    script = f"""const validator = require({json.dumps(modules + "/gltf-validator")});
+        validator.validateBytes(new Uint8Array(require("fs").readFileSync({json.dumps(str(glb_file))})))
+            .then((report) => console.log(JSON.stringify(report.issues)));"""
+    issues = json.loads(subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True).stdout)
+    assert (issues["numErrors"], issues["numWarnings"], issues["messages"]) == (0, 0, [])
+
+
+def test_glb_read_by_another_library(ring, glb_file):
+    """Its colours, at its texture coordinates, are those of the network at the attributes that are beside them."""
+    scene = trimesh.load(glb_file)
+    mesh = next(iter(scene.geometry.values()))
+    names = ("diffuse", "specular", "roughness")
+    exact = {name: np.asarray(mesh.vertex_attributes[f"_{name.upper()}"]).squeeze() for name in names}
+    uv = mesh.visual.uv * [1, -1] + [0, 1]  # trimesh turns v over
+    found = bilinear(np.asarray(mesh.visual.material.baseColorTexture.convert("RGB")), uv) / 255
+    expected = math.pi * exact["diffuse"] / (1 - 4 * exact["specular"][:, None])
+    expected = np.where(expected <= 0.0031308, 12.92 * expected, 1.055 * expected ** (1 / 2.4) - 0.055)
+    assert expected.std(0).min() > 0.02 and np.abs(found - expected).max() < 0.03
+    rough = bilinear(np.asarray(mesh.visual.material.metallicRoughnessTexture.convert("RGB")), uv) / 255
+    assert np.abs(rough[:, 1] - np.sqrt(exact["roughness"])).max() < 0.03 and (rough[:, 2] == 0).all()
+    np.testing.assert_allclose(scene.extents, 0.001 * mesh.extents, rtol=1e-5)
+    with torch.no_grad():
+        surface = ring.surface(ring.domain.sample(3)[0]).numpy()
+    np.testing.assert_allclose(mesh.bounds, [surface.min(0), surface.max(0)], rtol=1e-6)
+
+
+def test_glb_says_what_it_holds(glb_file):
+    content, _ = chunks(glb_file)
+    material, node = content["materials"][0], content["nodes"][0]
+    assert node["scale"] == [0.001] * 3 and node["extras"]["unit"] == "0.001 m"
+    assert material["extras"]["mi_ring"]["bsdf"] == '<bsdf type="cooktorrance"/>'
+    assert material["extensions"]["KHR_materials_specular"]["specularColorFactor"] == [25] * 3
+    attributes = content["meshes"][0]["primitives"][0]["attributes"]
+    assert set(material["extras"]["mi_ring"]["attributes"].values()) <= set(attributes)
+    assert {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"} <= set(attributes)
+
+
+def test_obj_is_closed_and_wears_its_texture(ring, run, tmp_path):
+    export.main([str(run), str(tmp_path / "a b.obj"), "--subdivisions", "3", "--resolution", str(RESOLUTION)])
+    text = (tmp_path / "a b.obj").read_text()
+    assert text.count("\nv ") == 10 * 4**3 + 2 and text.count("\nf ") == 20 * 4**3
+    mesh = trimesh.load(tmp_path / "a b.obj", process=False, maintain_order=True)
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert whole.is_watertight and whole.volume > 0
+    library = dict(line.split(maxsplit=1) for line in (tmp_path / "a b.mtl").read_text().splitlines())
+    maps = {key: Image.open(tmp_path / library[key]) for key in ("map_Kd", "map_Ks", "map_Pr", "norm")}
+    assert all(image.size == (RESOLUTION, RESOLUTION) for image in maps.values())
+    uv = mesh.visual.uv * [1, -1] + [0, 1]
+    s = ring.domain.sample(3)[0].numpy()
+    with torch.no_grad():
+        vertices = ring.surface(torch.from_numpy(s)).numpy()
+    nearest = np.linalg.norm(mesh.vertices[:, None] - vertices[None], axis=2).argmin(1)
+    rough = np.sqrt(atlas.reflectances(ring, s)["roughness"])[nearest]
+    found = bilinear(np.asarray(maps["map_Pr"])[..., None], uv)[:, 0] / 255
+    assert rough.std() > 0.02 and np.abs(found - rough).max() < 0.03
+
+
+def test_mitsuba_folder_needs_nothing_of_ours(run, tmp_path):
+    """Stock Mitsuba draws from it, in another process, what our plugins draw of the run."""
+    export.main([str(run), str(tmp_path / "stock" / "scene.xml"), "--resolution", str(RESOLUTION)])
+    script = f"""import sys, mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_file({str(tmp_path / "stock" / "scene.xml")!r})
+picture = mi.render(scene, integrator=mi.load_dict({{"type": "direct"}}), spp=64)
+assert "mi_ring" not in sys.modules
+np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
+    stock = np.load(tmp_path / "stock.npy")
+    sensor = export.first_photograph(run)
+    matrix, (fx, fy), (cx, cy) = camera_of(sensor)
+    assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
+    x, y, z, _, *strength = np.ravel(light_of(sensor))[:7].tolist()
+    scene = mi.load_dict({
+        "type": "scene", "object": {"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 4,
+                                    "bsdf": {"type": "cooktorrance"}},
+        "sensor": {"type": "photograph", "filename": "none", "fx": float(fx), "fy": float(fx), "cx": float(cx),
+                   "cy": float(cy * fx / fy), "to_world": mi.ScalarTransform4f(matrix),
+                   "film": {"type": "hdrfilm", "width": 56, "height": stock.shape[0]},
+                   "light": {"type": "point", "position": [x, y, z], "intensity": {"type": "rgb", "value": strength}}},
+    })  # fmt: skip
+    ours = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., :3]
+    assert ours.mean() > 0.02 and np.abs(ours - stock).mean() < 0.01 * ours.mean() + 1e-4
+
+
+def test_ply_at_time_0_is_the_domain(run, tmp_path):
+    export.main([str(run), str(tmp_path / "start.ply"), "--time", "0", "--subdivisions", "2"])
+    mesh = trimesh.load(tmp_path / "start.ply")
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTER, axis=1), RADIUS, rtol=1e-5)
+    assert len(mesh.vertices) == 162
+
+
+def test_material_options_reach_the_files(ring, run, tmp_path):
+    edit = ["--specular-scale", "2", "--tint", "1", ".5", "0"]
+    export.main([str(run), str(tmp_path / "m.ply"), "--subdivisions", "2", *edit])
+    found = attributes(tmp_path / "m.ply")
+    exact = atlas.reflectances(ring, ring.domain.sample(2)[0].numpy())
+    np.testing.assert_allclose(found["vertex_specular"], 2 * exact["specular"], rtol=1e-5)
+    np.testing.assert_allclose(found["vertex_diffuse"], (exact["diffuse"] * [1, 0.5, 0]).ravel(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["o.stl"], "o.stl: must end in .ply, .obj, .glb, .xml"),
+    (["o.glb", "--resolution", "7"], "--resolution: is 7"),
+    (["o.glb", "--subdivisions", "9"], "--subdivisions: is 9"),
+    (["o.ply", "--time", "1.5"], "--time: is 1.5"),
+    (["o.glb", "--metres", "-1"], "--metres: is -1"),
+    (["o.ply", "--tint", "1", "-1", "1"], "--tint"),
+])  # fmt: skip
+def test_mistakes_are_one_line(arguments, words, run, tmp_path):
+    assert words in complaint(run, tmp_path / arguments[0], *arguments[1:])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_for_mitsuba_needs_the_results_folder(run, tmp_path):
+    assert "give the folder" in complaint(run / "ring.pt", tmp_path / "scene.xml")
+
+
+def test_a_material_that_gltf_lacks_is_refused_before_the_work(tmp_path, monkeypatch):
+    parameters = (Parameter("specular_reflectance", 3, 0.0, 1.0),)
+    bsdf = '<bsdf type="conductor"><texture name="specular_reflectance" type="mesh_attribute"><string name="name" ' \
+           'value="vertex_specular_reflectance"/></texture></bsdf>'  # fmt: skip
+    torch.save(wild(bsdf=bsdf, parameters=parameters).state(), tmp_path / "ring.pt")
+    monkeypatch.setattr(atlas.xatlas, "Atlas", None)
+    assert "conductor" in complaint(tmp_path / "ring.pt", tmp_path / "o.glb")
+    export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.ply"), "--subdivisions", "2"])
+    assert "vertex_specular_reflectance" in attributes(tmp_path / "o.ply")
