@@ -6,10 +6,11 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mi_ring import capture, command, gltf
 from mi_ring.atlas import Atlas, Texels, rasterise, reflectances, unwrap
@@ -35,9 +36,9 @@ class ExportConfig(MaterialOptions):
     and a stock BSDF, that needs no mi_ring. Positions are in the scene's units and frame.
     """
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
-    file: Positional[Path]
+    file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write; OBJ and XML bring others of the same name along."""
     subdivisions: int | None = None
     """Level of the mesh: about 10 · 4^level vertices. Default: that of the fit; for .glb 5, it has a normal map."""

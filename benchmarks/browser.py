@@ -1,0 +1,95 @@
+"""What a browser draws of a fit's GLB beside what we render of the fit, photograph by photograph.
+
+    python benchmarks/browser.py out/pot2 [--picture docs/glb.png]
+
+The viewer of the run's report.html draws every photograph of the fit in headless Chromium; `photometric` renders the
+same from the networks. The viewer has neither shadows nor interreflection, so that ours is first without them. Prints a
+Markdown table with machine and date: mean absolute difference of sRGB values, in % of full scale, over all pixels and
+over those that show the object, and PSNR.
+"""
+
+import argparse
+import base64
+import datetime
+import io
+import shutil
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+from accuracy import processor
+from playwright.sync_api import sync_playwright
+
+from mi_ring import bridge, capture
+from mi_ring.capture import camera_of, linear_to_srgb, to_bytes
+from mi_ring.integrator import light_of
+from mi_ring.ring import Ring
+
+
+def photograph(sensor) -> dict:
+    """A photograph as the viewer's `draw` takes it. Raises ValueError if its light is no point."""
+    matrix, (fx, fy), (cx, cy) = camera_of(sensor)
+    x, y, z, distant, *intensity = np.ravel(light_of(sensor))[:7].tolist()
+    if distant:
+        raise ValueError("the viewer has a point light, this photograph a distant one")
+    width, height = sensor.size
+    return {
+        "to_world": matrix.ravel().tolist(), "fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy),
+        "width": width, "height": height, "light": {"position": [x, y, z], "intensity": intensity},
+    }  # fmt: skip
+
+
+def drawn(page_file: Path, sensors) -> list[np.ndarray]:
+    """The photographs (H, W, 3) that the viewer of a report draws, sRGB in [0, 1]."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium") or shutil.which("google-chrome"),
+            args=["--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+        )
+        page = browser.new_page()
+        page.goto(page_file.resolve().as_uri())
+        page.wait_for_function("window.viewer !== undefined")
+        pictures = []
+        for sensor in sensors:
+            url = page.evaluate("photograph => window.viewer.draw(photograph)", photograph(sensor))
+            pictures.append(imageio.imread(io.BytesIO(base64.b64decode(url.split(",")[1])))[..., :3] / 255)
+        browser.close()
+    return pictures
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="results folder of a fit")
+    parser.add_argument("--picture", type=Path, help="file for a picture of three photographs")
+    arguments = parser.parse_args()
+    scene, ring = capture.load(arguments.run / "scene.xml", images=False), Ring.load(arguments.run)
+    theirs = drawn(arguments.run / "report.html", scene.sensors)
+    surface = bridge.Surface(scene.scene, scene.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    print(f"{processor()}; {datetime.date.today()}; {arguments.run.name}, {len(theirs)} photographs\n")
+    print("| ours | all pixels, % | the object's, % | PSNR, dB |\n| --- | --- | --- | --- |")
+    plain = None
+    for title, options in {
+        "direct light, no shadows": {"shadows": False},
+        "all light": {"shadows": True, "indirect": True},
+    }.items():
+        ours, covered = zip(*(bridge.draw(surface, scene.photograph(k), spp=64, **options) for k in range(len(scene))))
+        ours = [linear_to_srgb(picture[0].numpy()) for picture in ours]
+        plain = plain or ours
+        difference = [np.abs(a - b) for a, b in zip(ours, theirs)]
+        inside = np.concatenate([d[c[0].numpy() > 0.5] for d, c in zip(difference, covered)])
+        square = np.mean([(d**2).mean() for d in difference])
+        print(f"| {title} | {100 * np.mean([d.mean() for d in difference]):.2f} | {100 * inside.mean():.2f} "
+              f"| {-10 * np.log10(square):.1f} |")  # fmt: skip
+        sys.stdout.flush()
+    if arguments.picture:
+        some = [k * len(theirs) // 3 for k in range(3)]
+        rows = [[pictures[k] for k in some] for pictures in (plain, theirs)]
+        rows.append([4 * np.abs(a - b) for a, b in zip(*rows)])
+        imageio.imwrite(arguments.picture, to_bytes(np.concatenate([np.concatenate(row, 1) for row in rows])))
+
+
+if __name__ == "__main__":
+    main()
