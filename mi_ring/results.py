@@ -133,7 +133,8 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
 def viewed(ring: Ring) -> bytes | None:
     """The object for the report's viewer as GLB, if its material can be told in glTF's terms."""
     try:
-        return gltf.glb(ring, min(VIEWED, ring.subdivisions), TEXELS)
+        level = min(VIEWED, ring.subdivisions)
+        return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)))
     except InputError:
         return None
 
