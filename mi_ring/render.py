@@ -299,7 +299,10 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
         [
             imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
             "-s", f"{size[0] + odd_columns}x{size[1] + odd_rows}", "-r", str(fps), "-i", "-",
-            "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart", f"file:{partial}",
+            "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
+            # Which colours are meant: browsers would guess by the size of the pictures.
+            "-vf", "scale=out_color_matrix=bt709,setparams=color_primaries=bt709:color_trc=iec61966-2-1",
+            f"file:{partial}",
         ],
         stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # Ctrl-C is for us alone
     )  # fmt: skip
