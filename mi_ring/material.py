@@ -32,9 +32,10 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
     if options.material:
         other = Ring.load(options.material)
         if not same_domain(ring, other):
-            raise InputError(f"{options.material}: --material: was fitted from {about(other)}, the shape from "
-                             f"{about(ring)}; a material is a function on where the fit started: fit both with the "
-                             "same --domain")  # fmt: skip
+            own = "another" if about(ring) == about(other) else about(ring)
+            raise InputError(f"{options.material}: --material: was fitted from {about(other)}, the shape from {own}; a "
+                             "material is a function on where the fit started: fit both with the same --domain, "
+                             "sphere or mesh FILE")  # fmt: skip
         ring.brdf_net, ring.bsdf = other.brdf_net, other.bsdf
         ring.indirect = ring.indirect and other.indirect
     gains, offsets = {}, {}
@@ -50,7 +51,7 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
             if not names:
                 raise InputError(f"{option}: this material has no such parameter; it has "
                                  + ", ".join(p.name for p in parameters))  # fmt: skip
-            into |= dict.fromkeys(names, value)
+            into |= {name: np.multiply(into.get(name, 1.0), value) for name in names}
     if gains or offsets:
         ring.brdf_net = Edited(ring.brdf_net, gains, offsets)
 

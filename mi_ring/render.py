@@ -1,12 +1,14 @@
 """Render a fitted object, photographs or films of it: `python -m mi_ring.render RUN SCENE.xml OUT`."""
 
+import contextlib
 import os
+import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -85,18 +87,18 @@ def main(arguments: Sequence[str]) -> None:
     frames = frames_of(scene, ring, config)
     film = config.out.suffix.lower() == ".mp4"
     check_frames(frames, scene, config)
-    integrator = integrator_of(config)
+    integrator, surface = integrator_of(config), surface_of(scene, ring, config)
     with writing(config.out):
         for folder in {(config.out if film else config.out / frame.name).parent for frame in frames}:
             folder.mkdir(parents=True, exist_ok=True)
-    pictures = render(scene, ring, frames, integrator, config)
+    pictures = render(surface, ring, frames, integrator, scene.shadows, config)
     if film:
-        write_film(pictures, config.out, config.fps)
+        write_film(pictures, config.out, frames[0].sensor.size, config.fps)
         print(config.out)
     else:
-        for frame, picture in zip(frames, pictures):
+        for picture, frame in zip(pictures, frames):  # in this order the progress bar gets to its end
             write_picture(picture, config.out / frame.name)
-        print(f"{len(frames)} photographs in {config.out}/")
+        print(f"{len(frames)} pictures in {config.out}/")
 
 
 def check(config: RenderConfig) -> None:
@@ -108,6 +110,10 @@ def check(config: RenderConfig) -> None:
             raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be a number of pictures")
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
         raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
+    if config.view is not None and not (config.turntable or config.light_orbit or config.flow):
+        raise InputError("--view: is for --turntable, --light-orbit and --flow; without them every photograph is taken")
+    if config.flow and config.time != 1:
+        raise InputError("--time: is one moment of the flow, --flow shows all of them; give one of the two")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
     if not 0 <= config.time <= 1:
@@ -231,11 +237,17 @@ def photograph(size: tuple[int, int], to_world: np.ndarray, focal: float, where:
     })  # fmt: skip
 
 
-def render(scene: Capture, ring: Ring, frames: list[Frame], integrator, config: RenderConfig) -> Iterator[np.ndarray]:
-    """The pictures, (H, W, 3) linear radiance each."""
-    surface = bridge.Surface(scene.scene, scene.shape, ring)
+def surface_of(scene: Capture, ring: Ring, config: RenderConfig) -> bridge.Surface:
+    """The object in its scene, in the light that the options ask for."""
     if config.envmap:
-        surface = under(config.envmap, up_of(scene, config), scene, ring)
+        return under(config.envmap, up_of(scene, config), scene, ring)
+    return bridge.Surface(scene.scene, scene.shape, ring)
+
+
+def render(
+    surface: bridge.Surface, ring: Ring, frames: list[Frame], integrator, shadows: bool, config: RenderConfig
+) -> Iterator[np.ndarray]:
+    """The pictures, (H, W, 3) linear radiance each."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, frame in enumerate(tqdm(frames, desc="rendering", unit="picture")):
@@ -247,7 +259,7 @@ def render(scene: Capture, ring: Ring, frames: list[Frame], integrator, config: 
             yield np.array(picture)[..., :3]
         else:
             one = Photographs.of([frame.sensor])
-            rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=scene.shadows, indirect=ring.indirect)
+            rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 
 
@@ -275,22 +287,39 @@ def write_picture(linear: np.ndarray, path: Path) -> None:
     write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 
 
-def write_film(pictures: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    """Write an MP4 file that browsers play, H.264 with an even number of rows and columns, whole or not at all."""
+def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:
+    """Write an MP4 file that browsers play, H.264 with an even number of rows and columns, whole or not at all.
+
+    Raises InputError if it cannot be written. `size`: (width, height) [px] of the pictures.
+    """
     partial = path.with_name(f".{path.stem}.partial.mp4")
-    writer = imageio.get_writer(
-        partial, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=None, macro_block_size=1,
-        output_params=["-crf", "16", "-movflags", "+faststart"],
+    odd_columns, odd_rows = size[0] % 2, size[1] % 2
+    # Not through imageio, which takes a film that was cut short, on a full disk for instance, for a whole one.
+    ffmpeg = subprocess.Popen(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
+            "-s", f"{size[0] + odd_columns}x{size[1] + odd_rows}", "-r", str(fps), "-i", "-",
+            "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
+            # Which colours are meant: browsers would guess by the size of the pictures.
+            "-vf", "scale=out_color_matrix=bt709,setparams=color_primaries=bt709:color_trc=iec61966-2-1",
+            f"file:{partial}",
+        ],
+        stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # Ctrl-C is for us alone
     )  # fmt: skip
     try:
+        with contextlib.suppress(BrokenPipeError):  # it ended, and says below why
+            for picture in pictures:
+                image = to_bytes(linear_to_srgb(picture))
+                ffmpeg.stdin.write(np.pad(image, ((0, odd_rows), (0, odd_columns), (0, 0)), "edge").tobytes())
+        complaint = ffmpeg.communicate()[1].decode(errors="replace").split("\n")[0]
+        if ffmpeg.returncode:
+            raise InputError(f"{path}: cannot be written ({complaint or 'ffmpeg was killed'}); make room or choose "
+                             "another place")  # fmt: skip
         with writing(path):
-            with writer:
-                for picture in pictures:
-                    height, width = picture.shape[:2]
-                    image = to_bytes(linear_to_srgb(picture))
-                    writer.append_data(np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), "edge"))
             os.replace(partial, path)
     finally:
+        ffmpeg.kill()
+        ffmpeg.wait()
         partial.unlink(missing_ok=True)
 
 

@@ -170,8 +170,9 @@ def test_ssim_is_that_of_the_paper():
 def sphere_run(small_capture, tmp_path_factory):
     """The results folder of a fit that has not begun."""
     folder = tmp_path_factory.mktemp("run")
-    torch.save(Ring(CENTER, 25.0, scale=0.5).state(), folder / "ring.pt")
-    results.write_mesh(folder / "ring.pt", 3, folder / "mesh.ply")
+    ring = Ring(CENTER, 25.0, scale=0.5)
+    torch.save(ring.state(), folder / "ring.pt")
+    results.write_mesh(ring, 3, folder / "mesh.ply")
     scene = results.scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
     (folder / "scene.xml").write_bytes(scene)
     ellipsoid = trimesh.Trimesh(CENTER + icosphere(4).vertices * AXES, icosphere(4).faces)
