@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from PIL import Image, ImageDraw
 from scipy import ndimage
 from tyro.conf import Positional, arg
@@ -19,9 +21,6 @@ from mi_ring.errors import InputError
 from mi_ring.evaluate import hits, scene_of
 from mi_ring.hull import WIDTH, Hull, NoHull, Silhouette, evenly, shrink, small, thinned
 from mi_ring.results import replace, writing
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 CELL = 200  # of the contact sheet [px]
 CLIPPED, DARK, AMBIENT, CONFORMS = 0.1, 0.5, 0.05, 0.9  # shares beyond which something is said
@@ -260,9 +259,10 @@ def plan(scene: Capture, center: np.ndarray, radius: float) -> Image.Image:
     lights = np.array(scene.photographs.lights).reshape(-1, 8)
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights[:, 3:4] > 0, center + reach * lights[:, :3], lights[:, :3])
-    figure, panels = plt.subplots(1, 3, figsize=(12, 4), dpi=100)
+    figure = Figure(figsize=(12, 4), dpi=100)
+    canvas, panels = FigureCanvasAgg(figure), figure.subplots(1, 3)
     for panel, (a, b) in zip(panels, ((0, 1), (0, 2), (1, 2))):
-        panel.add_patch(plt.Circle(center[[a, b]], radius, color="tab:green", alpha=0.3))
+        panel.add_patch(Circle(center[[a, b]], radius, color="tab:green", alpha=0.3))
         panel.scatter(*away[:, [a, b]].T, s=12, c="tab:orange", label="lights")
         panel.quiver(*cameras[:, [a, b], 3].T, *(0.25 * reach * cameras[:, [a, b], 2]).T, color="tab:blue", angles="xy",
                      scale_units="xy", scale=1, width=0.004, label="cameras")  # fmt: skip
@@ -272,10 +272,8 @@ def plan(scene: Capture, center: np.ndarray, radius: float) -> Image.Image:
         panel.autoscale_view()
     panels[0].legend(loc="upper right", fontsize=8)
     figure.tight_layout()
-    figure.canvas.draw()
-    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
-    plt.close(figure)
-    return picture
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def sheet(scene: Capture, rows: list[Row], center: np.ndarray, radius: float) -> Image.Image:

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from importlib import resources
 
 import jinja2
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy import ndimage
 from skimage.registration import phase_cross_correlation
 
 from mi_ring import bridge
 from mi_ring.capture import camera_of, linear_to_srgb, to_bytes
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 PICTURE = 480  # width and height of the pictures, at most [px]
 MISFIT, COVERED, SATURATED = 3.0, 0.9, 0.05  # a PSNR this far below the others' [dB], IoU, share of pixels: say so
@@ -183,7 +180,8 @@ def data_uri(picture: np.ndarray) -> str:
 
 def loss_curve(log: list[dict], fit) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
-    figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    axes = figure.subplots()
     for term in ("loss", *fit.config.weights):
         points = []
         for entry in log:
@@ -203,5 +201,4 @@ def loss_curve(log: list[dict], fit) -> str:
         axes.legend(loc="upper right")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg")
-    plt.close(figure)
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
