@@ -54,9 +54,11 @@ test: setup
 # Without these the tests that need them are skipped.
 tools:
 	@if command -v chromium || command -v google-chrome; then :; \
-	elif test "$$(id -u)" = 0; then apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; \
+	elif test "$$(id -u)" = 0; then apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium \
+	  || echo 'make tools: Chromium could not be installed' >&2; \
 	else echo 'make tools: found no Chromium, and only root can install it (apt-get install chromium)' >&2; fi
-	@if command -v npm; then $(NPM_CI); else echo 'make tools: found no npm; Node.js brings it' >&2; fi
+	@if ! command -v npm; then echo 'make tools: found no npm; Node.js brings it' >&2; \
+	elif ! ($(NPM_CI)); then echo 'make tools: npm could not fetch the validator of glTF' >&2; fi
 
 # three.js and mi_ring/viewer/viewer.js in one file, which is part of the repository.
 viewer:

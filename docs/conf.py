@@ -23,7 +23,6 @@ from mi_ring.formats import FORMATS
 
 project, author = "mi_ring", "the authors of mi_ring"
 extensions = ["sphinx.ext.autodoc", "myst_parser", "sphinx_design"]
-exclude_patterns = ["make_picture.py"]
 html_theme, html_title, html_static_path, html_css_files = "furo", "mi_ring", ["static"], ["mi_ring.css"]
 html_show_copyright = html_copy_source = False
 pygments_style = "friendly"

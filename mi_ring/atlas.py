@@ -8,8 +8,9 @@ import scipy.ndimage
 import torch
 import trimesh
 import xatlas
+from tqdm import tqdm
 
-from mi_ring.mesh import FACES, POSITIONS
+from mi_ring.mesh import mesh_of
 from mi_ring.ring import Ring
 
 CUT = 5  #: level at which surfaces are cut open, at most: the time grows with the square of the triangles
@@ -33,11 +34,11 @@ class Atlas(NamedTuple):
 def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
     """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
     s, faces = ring.domain.sample(min(subdivisions, CUT))
-    chart_options, pack_options = xatlas.ChartOptions(), xatlas.PackOptions()
-    pack_options.resolution, pack_options.padding, pack_options.bilinear = resolution, PADDING, True
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.bilinear = resolution, PADDING, True
     charts = xatlas.Atlas()
-    charts.add_mesh(positions(ring, s.numpy(), time), faces.astype(np.uint32))
-    charts.generate(chart_options, pack_options)
+    charts.add_mesh(flowed(ring, s.numpy(), time), faces.astype(np.uint32))  # of size 1: it drops small triangles
+    charts.generate(pack_options=options)
     origin, faces, uv = charts[0]
     s, uv, faces = s.numpy()[origin], np.clip(uv, 0, 1), faces.astype(np.int64)
     for _ in range(subdivisions - CUT):
@@ -45,10 +46,10 @@ def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 
     return assemble(ring, s, uv, faces, subdivisions, time)
 
 
-def positions(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """The surface (V, 3) [scene units] at domain points (V, 3)."""
+def flowed(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
+    """The surface (V, 3) in the normalised frame at domain points (V, 3)."""
     with torch.no_grad():
-        return ring.surface(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
+        return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
 
 def subdivide(ring: Ring, s, uv, faces, *more):
@@ -63,14 +64,10 @@ def subdivide(ring: Ring, s, uv, faces, *more):
 
 def assemble(ring: Ring, s, uv, faces, subdivisions: int, time: float) -> Atlas:
     """An atlas with its vertices, normals and tangents."""
-    once, whole = np.unique(s, axis=0, return_inverse=True)
-    whole = whole.ravel()
-    vertices = positions(ring, once, time)[whole]
-    normals = normals_of(vertices, whole, faces)
+    points, normals, whole = surface_of(ring, s, faces, time)
     # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
-    (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (vertices, uv))
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    sign = np.sign(area)
+    (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
+    sign = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
     along = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * sign[:, None]
     tangents, signs = np.zeros((len(s), 3)), np.zeros(len(s))
     for corner in faces.T:
@@ -83,14 +80,17 @@ def assemble(ring: Ring, s, uv, faces, subdivisions: int, time: float) -> Atlas:
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     # With u to the right and v down, as glTF has it, the bitangent n × t points to smaller v.
     tangents = np.hstack([tangents, np.where(signs < 0, 1.0, -1.0)[:, None]])
+    vertices = ring.center.cpu().numpy() + float(ring.radius) * points
     return Atlas(s, uv, vertices, normals, tangents, faces, whole, subdivisions)
 
 
-def normals_of(vertices, whole, faces) -> np.ndarray:
-    """Smooth normals (V, 3) that know of no seam."""
-    closed = np.zeros((whole.max() + 1, 3))
-    closed[whole] = vertices
-    return trimesh.Trimesh(closed, whole[faces], process=False).vertex_normals[whole]
+def surface_of(ring: Ring, s, faces, time: float):
+    """Points (V, 3) in the normalised frame, smooth normals (V, 3) that know of no seam, and `Atlas.whole`."""
+    once, whole = np.unique(s, axis=0, return_inverse=True)
+    whole = whole.ravel()
+    points = flowed(ring, once, time)
+    normals = trimesh.Trimesh(points, whole[faces], process=False).vertex_normals
+    return points[whole], normals[whole], whole
 
 
 class Texels(NamedTuple):
@@ -107,13 +107,10 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
     for _ in range(ring.subdivisions - atlas.subdivisions):
         s, uv, faces, *frame = subdivide(ring, s, uv, faces, *frame)
-    fine = assemble(ring, s, uv, faces, ring.subdivisions, time)
+    finer = len(faces) > len(atlas.faces)
+    normals = surface_of(ring, s, faces, time)[1] if finer else atlas.normals
 
-    flat = mi.Mesh("atlas", len(uv), len(faces))
-    params = mi.traverse(flat)
-    params[POSITIONS] = mi.Float(np.hstack([uv, np.zeros((len(uv), 1))]).astype(np.float32).ravel())
-    params[FACES] = mi.UInt32(faces.astype(np.uint32).ravel())
-    params.update()
+    flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
     y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
     centre = mi.Point3f(*((np.stack([x, y]) + 0.5) / resolution).astype(np.float32), 1)
     hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(mi.Ray3f(centre, [0, 0, -1]))
@@ -125,7 +122,7 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
     def at(values):
         return (values[corners] * weights).sum(1).astype(np.float32)
 
-    n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(fine.normals)
+    n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(normals)
     # m = x t + y b + z n, solved: what a renderer does with the interpolated frame, inverted.
     n, t, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, t, b))
     local = np.stack([(np.cross(p, q) * m).sum(1) for p, q in ((b, n), (n, t), (t, b))], 1)
@@ -140,5 +137,6 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
 def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
     """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
     with torch.no_grad():
-        parts = [ring.brdf_net(chunk) for chunk in torch.from_numpy(s).to(ring.center.device).split(CHUNK)]
+        chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
+        parts = [ring.brdf_net(chunk) for chunk in tqdm(chunks, "baking", leave=False, disable=len(chunks) < 3 or None)]
     return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,10 @@ from mi_ring.domain import read_mesh
 from mi_ring.errors import InputError
 from mi_ring.hull import genus
 from mi_ring.integrator import Photographs
+from mi_ring.mesh import mesh_of
 from mi_ring.photograph import camera_ray
 from mi_ring.render import RenderConfig
-from mi_ring.results import replace, writing
+from mi_ring.results import replace, require_place
 from mi_ring.ring import Ring
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
@@ -71,12 +71,7 @@ def load_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 def scene_of(vertices, faces) -> mi.Scene:
     """A scene that holds this mesh alone, with smooth normals."""
-    shape = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True)
-    params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(np.asarray(vertices, np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
-    params.update()
-    return mi.load_dict({"type": "scene", "mesh": shape})
+    return mi.load_dict({"type": "scene", "mesh": mesh_of(vertices, faces)})
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -275,9 +270,7 @@ def main(arguments: Sequence[str]) -> None:
     out = config.out or config.run / "evaluation.json"
     if out.suffix.lower() != ".json":
         raise InputError(f"{out}: --out: must end in .json")
-    with writing(f"{out}: --out"):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out.parent).close()  # now, not after minutes
+    require_place(out, "--out")
     numbers = rounded(evaluate(config.run, config.mesh, config.novel, config.spp))
     replace(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}

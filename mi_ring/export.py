@@ -1,4 +1,4 @@
-"""A fitted object for other programs: `python -m mi_ring.export RUN FILE.{ply,obj,glb,xml}`."""
+"""Write a fitted object for other programs: `python -m mi_ring.export RUN FILE.{ply,obj,glb,xml}`."""
 
 import io
 import math
@@ -18,9 +18,9 @@ from mi_ring.capture import camera_of
 from mi_ring.errors import InputError
 from mi_ring.integrator import light_of
 from mi_ring.material import MaterialOptions, dress
-from mi_ring.mesh import FACES, POSITIONS
+from mi_ring.mesh import mesh_of
 from mi_ring.photograph import Photograph
-from mi_ring.results import replace, write_image, write_mesh, writing
+from mi_ring.results import replace, require_place, write_image, write_mesh
 from mi_ring.ring import Ring
 
 KINDS = (".ply", ".obj", ".glb", ".xml")
@@ -56,14 +56,22 @@ def check(config: ExportConfig) -> None:
         raise InputError(f"{config.file}: must end in {', '.join(KINDS)}")
     if config.subdivisions is not None and not 0 <= config.subdivisions <= 8:
         raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
-    if not 64 <= config.resolution <= 8192:
-        raise InputError(f"--resolution: is {config.resolution}, must be 64 to 8192")
+    if not 64 <= config.resolution <= 4096:
+        raise InputError(f"--resolution: is {config.resolution}, must be 64 to 4096")
     if not 0 <= config.time <= 1:
         raise InputError(f"--time: is {config.time}, must be 0 to 1")
     if config.metres is not None and not 0 < config.metres < math.inf:
         raise InputError(f"--metres: is {config.metres}, must be a positive number")
+    if config.metres is not None and config.file.suffix.lower() != ".glb":
+        raise InputError(f"--metres: is for .glb alone; {config.file.name} keeps the scene's units")
     if config.file.is_dir():
         raise InputError(f"{config.file}: is a folder; name the file to write")
+    run = config.run if config.run.is_dir() else config.run.parent
+    photographs = config.file.suffix.lower() == ".xml" and config.file.is_file() and (
+        b'"photograph"' in config.file.read_bytes()
+    )  # fmt: skip
+    if photographs or config.file.resolve() == (run / "mesh.ply").resolve():
+        raise InputError(f"{config.file}: is a file of the fit or of a capture; choose another name")
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -77,10 +85,9 @@ def main(arguments: Sequence[str]) -> None:
     if level is None:
         level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
     if kind in (".glb", ".obj"):
-        gltf.metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))  # can it be told?
+        gltf.require(ring)
     photograph = first_photograph(config.run) if kind == ".xml" else None
-    with writing(config.file):
-        config.file.parent.mkdir(parents=True, exist_ok=True)
+    require_place(config.file)
     if kind == ".ply":
         write_mesh(ring, level, config.file, config.time)
         files = [config.file]
@@ -101,26 +108,29 @@ def main(arguments: Sequence[str]) -> None:
 
 def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
     """OBJ with MTL and PNG. Positions and normals are those of the closed mesh, seams exist only in the texture."""
-    names = {"baseColorTexture": "diffuse", "metallicRoughnessTexture": "roughness", "specularTexture": "specular",
-             "normalTexture": "normal"}  # fmt: skip
-    files = {}
-    for name, image in gltf.textures(material, texels).items():
-        channel = {"metallicRoughnessTexture": 1, "specularTexture": 3}.get(name)
-        files[names[name]] = path.with_name(f"{path.stem}_{names[name]}.png")
-        write_image(image if channel is None else image[..., channel, None], files[names[name]])
+    baked, files = gltf.textures(material, texels), {}
+    for name, image in {
+        "diffuse": baked["baseColorTexture"], "normal": baked["normalTexture"],
+        "specular": baked["specularTexture"][..., 3, None],
+        "roughness": baked["metallicRoughnessTexture"][..., 1, None],
+        "metallic": baked["metallicRoughnessTexture"][..., 2, None],
+    }.items():  # fmt: skip
+        files[name] = path.with_name(f"{path.stem}_{name}.png")
+        write_image(image, files[name])
     library = path.with_suffix(".mtl")
     replace(library, "\n".join([
         "newmtl fitted", "illum 2", "Kd 1 1 1", f"map_Kd {files['diffuse'].name}",
-        "Ks 1 1 1", f"map_Ks {files['specular'].name}",
-        "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 0", f"norm {files['normal'].name}", "",
+        "Ks {0:.4g} {0:.4g} {0:.4g}".format(min(0.04 * material.specular_color, 1)), f"map_Ks {files['specular'].name}",
+        "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
+        f"norm {files['normal'].name}", "",
     ]))  # fmt: skip
     closed, first = np.unique(atlas.whole, return_index=True)
     whole = np.searchsorted(closed, atlas.whole)
     corners = np.stack([whole, np.arange(len(whole)), whole], 1)[atlas.faces] + 1
     text = io.StringIO()
     text.write(f"mtllib {library.name}\no object\nusemtl fitted\n")
-    np.savetxt(text, atlas.vertices[first], "v %.7g %.7g %.7g")
-    np.savetxt(text, atlas.uv * [1, -1] + [0, 1], "vt %.7g %.7g")  # v points up in OBJ
+    np.savetxt(text, atlas.vertices[first], "v %.9g %.9g %.9g")
+    np.savetxt(text, atlas.uv * [1, -1] + [0, 1], "vt %.9g %.9g")  # v points up in OBJ
     np.savetxt(text, atlas.normals[first], "vn %.5f %.5f %.5f")
     np.savetxt(text, corners.reshape(-1, 9), "f %d/%d/%d %d/%d/%d %d/%d/%d")
     replace(path, text.getvalue())
@@ -137,11 +147,8 @@ def first_photograph(run: Path) -> Photograph:
 def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, photograph: Photograph) -> list[Path]:
     """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone."""
     files = [path]
-    mesh = mi.Mesh("object", len(atlas.s), len(atlas.faces), has_vertex_normals=True, has_vertex_texcoords=True)
+    mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
     params = mi.traverse(mesh)
-    for name, array in ((POSITIONS, atlas.vertices), ("vertex_texcoords", atlas.uv), (FACES, atlas.faces)):
-        params[name] = type(params[name])(array.astype(np.uint32 if name == FACES else np.float32).ravel())
-    params.update()
     params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's know of the seams
     params.update()
     stream = mi.MemoryStream()
@@ -162,9 +169,10 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
     ElementTree.SubElement(scene, "integrator", type="path")
     shape = ElementTree.SubElement(scene, "shape", type="ply", id="object")
     ElementTree.SubElement(shape, "string", name="filename", value=files[1].name)
-    element = ElementTree.fromstring(bsdf)
+    element, scale = ElementTree.fromstring(bsdf), 1.0
     if element.get("type") == "cooktorrance":
         material = gltf.metallic_roughness(bsdf, values)
+        scale = material.scale
         distribution = next((e.get("value") for e in element if e.get("name") == "distribution"), "ggx")
         element = ElementTree.SubElement(shape, "bsdf", type="blendbsdf")
         bitmap(element, "weight", material.specular)
@@ -175,13 +183,13 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
         bitmap(gloss, "alpha", material.roughness**2)
     else:
         shape.append(element)
-        for texture in list(element.iter("texture")):
+        for texture in [t for t in element.iter("texture") if t.get("type") == "mesh_attribute"]:
             name = texture.get("name")
             parent = next(e for e in element.iter() if texture in e)
             parent.remove(texture)
             bitmap(parent, name, values[name])
     scene.append(camera(photograph, atlas.vertices))
-    scene.append(light(photograph))
+    scene.append(light(photograph, scale))
     ElementTree.indent(scene)
     replace(path, ElementTree.tostring(scene, "utf-8"))
     return files
@@ -209,8 +217,8 @@ def camera(photograph: Photograph, vertices: np.ndarray) -> ElementTree.Element:
     return sensor
 
 
-def light(photograph: Photograph) -> ElementTree.Element:
-    """The light of a photograph as an emitter of the scene."""
+def light(photograph: Photograph, scale: float) -> ElementTree.Element:
+    """The light of a photograph as an emitter of the scene, for reflectances that were multiplied by `scale`."""
     x, y, z, distant, *intensity = np.ravel(light_of(photograph))[:7].tolist()
     emitter = ElementTree.Element("emitter", type="directional" if distant else "point")
     if distant:
@@ -218,7 +226,7 @@ def light(photograph: Photograph) -> ElementTree.Element:
     else:
         ElementTree.SubElement(emitter, "point", name="position", x=f"{x:.9g}", y=f"{y:.9g}", z=f"{z:.9g}")
     ElementTree.SubElement(emitter, "rgb", name="irradiance" if distant else "intensity",
-                           value=", ".join(f"{v:.9g}" for v in intensity))  # fmt: skip
+                           value=", ".join(f"{v / scale:.9g}" for v in intensity))  # fmt: skip
     return emitter
 
 

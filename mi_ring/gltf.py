@@ -12,6 +12,7 @@ from PIL import Image
 
 from mi_ring import reflectance
 from mi_ring.atlas import Atlas, Texels, rasterise, reflectances, unwrap
+from mi_ring.bsdf import MIN_ROUGHNESS
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.ring import Ring
@@ -52,6 +53,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     def value(name, channels=1):
         if name in values:
             return values[name]
+        if name not in constants:
+            raise InputError(f"{kind}: {name} is neither fitted nor a constant; write PLY")
         constant = np.broadcast_to(np.asarray(constants[name][0], np.float32).ravel(), (count, channels))
         return constant if channels == 3 else constant[:, 0]
 
@@ -61,7 +64,7 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
         scale = 1 / max(1.0, float(np.quantile(diffuse.max(1) + specular, 0.99)))
         w = np.clip(scale * specular, 0, 1)
         c = np.clip(scale * diffuse / np.maximum(1 - w, 1e-3)[:, None], 0, 1)
-        return Material(c, zero, np.sqrt(value("roughness")), w, 25.0, scale)
+        return Material(c, zero, np.sqrt(np.maximum(value("roughness"), MIN_ROUGHNESS)), w, 25.0, scale)
     if kind == "diffuse":
         return Material(value("reflectance", 3), zero, zero + 1, zero, 1.0, 1.0)
     if kind == "principled":
@@ -72,6 +75,11 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
             return Material(value("base_color", 3), value("metallic"), value("roughness"), zero + 1, f0 / 0.04, 1.0)
         kind = f"principled with {', '.join(further)}"
     raise InputError(f"{kind}: this material cannot be told in glTF's terms; write PLY or a scene for Mitsuba (.xml)")
+
+
+def require(ring: Ring) -> None:
+    """Raise InputError if the material of a ring cannot be told in glTF's terms: before the work of baking it."""
+    metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
@@ -99,6 +107,7 @@ def glb(ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metre
     Positions are in scene units; with `metres`, the length of one, a node scales them to glTF's. The parameters of the
     BSDF are also there as they are, as vertex attributes (_DIFFUSE, …) and, what they mean, in the material's extras.
     """
+    require(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
     texels = rasterise(ring, atlas, resolution, time)
     material = metallic_roughness(ring.bsdf, reflectances(ring, texels.s))

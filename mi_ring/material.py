@@ -39,21 +39,34 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
         ring.brdf_net, ring.bsdf = other.brdf_net, other.bsdf
         ring.indirect = ring.indirect and other.indirect
     gains, offsets = {}, {}
-    parameters = ring.brdf_net.bsdf_parameters
-    for option, value, neutral, names, into in (
-        ("--specular-scale", options.specular_scale, 1.0, [p.name for p in parameters if p.name in SPECULAR], gains),
-        ("--roughness-add", options.roughness_add, 0.0, [p.name for p in parameters if p.name in ROUGHNESS], offsets),
-        ("--tint", options.tint, (1.0, 1.0, 1.0), [p.name for p in parameters if p.channels == 3], gains),
-    ):
-        if not np.isfinite(value).all() or (into is gains and np.min(value) < 0):
-            raise InputError(f"{option}: is {value}, must be {'0 or more' if into is gains else 'a number'}")
-        if value != neutral:
-            if not names:
-                raise InputError(f"{option}: this material has no such parameter; it has "
-                                 + ", ".join(p.name for p in parameters))  # fmt: skip
-            into |= {name: np.multiply(into.get(name, 1.0), value) for name in names}
+    if options.specular_scale != 1:
+        at_least_0("--specular-scale", options.specular_scale)
+        gains = dict.fromkeys(named(ring, "--specular-scale", SPECULAR), options.specular_scale)
+    if options.tint != (1, 1, 1):
+        at_least_0("--tint", options.tint)
+        for name in named(ring, "--tint", [p.name for p in ring.brdf_net.bsdf_parameters if p.channels == 3]):
+            gains[name] = np.multiply(gains.get(name, 1.0), options.tint)
+    if options.roughness_add != 0:
+        if not np.isfinite(options.roughness_add):
+            raise InputError(f"--roughness-add: is {options.roughness_add}, must be a number")
+        offsets = dict.fromkeys(named(ring, "--roughness-add", ROUGHNESS), options.roughness_add)
     if gains or offsets:
         ring.brdf_net = Edited(ring.brdf_net, gains, offsets)
+
+
+def at_least_0(option: str, value) -> None:
+    """Raise InputError for a factor, or one of several, that is negative or not finite."""
+    if not (np.isfinite(value).all() and np.min(value) >= 0):
+        raise InputError(f"{option}: is {value}, must be 0 or more")
+
+
+def named(ring: Ring, option: str, names) -> list[str]:
+    """Which of these parameters the material has. Raises InputError if none."""
+    parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
+    found = [name for name in parameters if name in names]
+    if not found:
+        raise InputError(f"{option}: this material has no such parameter; it has {', '.join(parameters)}")
+    return found
 
 
 def same_domain(a: Ring, b: Ring) -> bool:

@@ -13,6 +13,18 @@ from mi_ring.ring import Ring
 POSITIONS, FACES = "vertex_positions", "faces"
 
 
+def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
+    """A plain mesh of vertices (V, 3) and faces (F, 3), perhaps with smooth normals and texture coordinates (V, 2)."""
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
+    params = mi.traverse(mesh)
+    params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())
+    params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+    if uv is not None:
+        params["vertex_texcoords"] = mi.Float(np.asarray(uv, np.float32).ravel())
+    params.update()
+    return mesh
+
+
 class ShapeNetMesh(mi.Mesh):
     """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
 

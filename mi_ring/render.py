@@ -16,7 +16,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring import bridge, capture, command
-from mi_ring.atlas import positions
+from mi_ring.atlas import flowed
 from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
 from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs, light_of
@@ -126,6 +126,8 @@ def check(config: RenderConfig) -> None:
         raise InputError("--integrator: photometric is for photographs' own lights; with --envmap give path or direct")
     if config.envmap and config.light_orbit:
         raise InputError("--light-orbit: moves a photograph's light, which --envmap switches off; give one of the two")
+    if config.out.suffix.lower() in (".gif", ".mov", ".avi", ".mkv", ".webm", ".png", ".jpg", ".jpeg", ".exr"):
+        raise InputError(f"{config.out}: must be a folder for the pictures, or a film that ends in .mp4")
     if config.out.suffix.lower() == ".mp4" and config.format:
         raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out")
 
@@ -140,7 +142,7 @@ def check_frames(frames: list[Frame], scene: Capture, config: RenderConfig) -> N
         if config.out.is_dir():
             raise InputError(f"{config.out}: is a folder; a film needs the name of a file")
         return
-    names, own = set(), {sensor.filename.resolve() for sensor in scene.sensors}
+    names, own = set(), {file.resolve() for sensor in scene.sensors for file in (sensor.filename, sensor.mask) if file}
     for frame in frames:
         if Path(frame.name).suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):
             raise InputError(f"{config.scene}: filename: {frame.name} must end in .png, .jpg or .exr; or give --format")
@@ -210,7 +212,8 @@ def framed(sensor: Photograph, ring: Ring, up: np.ndarray) -> tuple[np.ndarray, 
     Returns to_world (4, 4), the focal length [px] and the middle (3,) of the object.
     """
     s = ring.domain.sample(3)[0].numpy()
-    points = np.concatenate([positions(ring, s, time) for time in (0.0, 1.0)]).astype(float)
+    points = np.concatenate([flowed(ring, s, time) for time in (0.0, 1.0)]).astype(float)
+    points = ring.center.numpy() + float(ring.radius) * points
     middle = (points[len(s) :].min(0) + points[len(s) :].max(0)) / 2
     matrix = camera_of(sensor)[0].astype(float)
     eye = matrix[:3, 3]

@@ -11,11 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy import ndimage
+from skimage.measure import block_reduce
 from skimage.registration import phase_cross_correlation
 
 from mi_ring import bridge
 from mi_ring.capture import camera_of, linear_to_srgb, to_bytes
 
+REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
 PICTURE = 480  # width and height of the pictures, at most [px]
 MISFIT, COVERED, SATURATED = 3.0, 0.9, 0.05  # a PSNR this far below the others' [dB], IoU, share of pixels: say so
 SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
@@ -47,7 +49,8 @@ def html(fit, log: list[dict], glb: bytes | None = None) -> str:
         "Photographs": f"{len(capture)}" + (f"; below are {len(rows)} of them, as are the next two numbers"
                                              if len(rows) < len(capture) else ""),
         "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels)",
-        "Silhouettes": f"{np.mean(masked):.4f} intersection over union with the masks" if masked else "no masks given",
+        "Silhouettes": (f"{np.mean(masked):.4f} intersection over union with the masks"
+                        if masked else "no masks of the whole object"),
         "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
@@ -84,7 +87,7 @@ def findings(rows: list[Row], iteration: int, iterations: int) -> list[str]:
                      "light or mask, or leave the photograph out.")  # fmt: skip
     masked = [row for row in rows if row.iou is not None]
     if few := worst((row.iou, row.name, f"IoU {row.iou:.2f}") for row in masked if row.iou < COVERED):
-        found.append(f"{few}: the prediction does not cover what the mask does; see with mi_ring.check whether mask "
+        found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
                      "and pose are right.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
         found.append(f"{few}: so much of the object is saturated, where it is known to be at least this bright and no "
@@ -151,7 +154,7 @@ def compare(fit, k: int, name: str) -> tuple[Row, float]:
     row = Row(
         name=name,
         psnr=-10 * np.log10(max(error, 1e-10)),
-        iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked else None,
+        iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
         shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
@@ -165,7 +168,9 @@ def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[flo
         return None
     rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]
     a, b = (picture[rows, columns].mean(-1) for picture in (photo, guess))
-    down, right = phase_cross_correlation(a, b, upsample_factor=20, normalization=None)[0]
+    scale = -(-max(a.shape) // REGISTERED)
+    a, b = (block_reduce(picture, scale, np.mean) for picture in (a, b))
+    down, right = scale * phase_cross_correlation(a, b, upsample_factor=20, normalization=None)[0]
     return float(right), float(down)
 
 

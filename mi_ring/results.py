@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import tempfile
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mi_ring import bridge, gltf, report
 from mi_ring.capture import linear_to_srgb, to_bytes
 from mi_ring.config import Config
 from mi_ring.errors import InputError
-from mi_ring.mesh import FACES, POSITIONS
+from mi_ring.mesh import mesh_of
 from mi_ring.reflectance import bsdf_element
 from mi_ring.ring import Ring
 
@@ -30,6 +31,13 @@ def writing(what: Path | str):
         yield
     except OSError as error:
         raise InputError(f"{what}: cannot be written ({error.strerror}); make room or choose another place") from error
+
+
+def require_place(path: Path, field: str = "") -> None:
+    """Make the folder of a file that is to come after long work. Raises InputError if nothing can be written there."""
+    with writing(f"{path}: {field}" if field else path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path.parent).close()
 
 
 def replace(path: Path, content: bytes | str) -> None:
@@ -126,16 +134,18 @@ def write(folder: Path, fit, fitted_scene: bytes) -> None:
     replace(folder / "scene.xml", fitted_scene)
     s, faces = fit.ring.domain.sample(fit.config.subdivisions)
     fit.surface.show(fit.ring, s, faces)
+    print("Writing the report", flush=True)
     replace(folder / "report.html", report.html(fit, read_log(folder), viewed(fit.ring)))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 
 def viewed(ring: Ring) -> bytes | None:
-    """The object for the report's viewer as GLB, if its material can be told in glTF's terms."""
+    """The object for the report's viewer as GLB, where that is possible."""
+    level = min(VIEWED, ring.subdivisions)
     try:
-        level = min(VIEWED, ring.subdivisions)
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)))
-    except InputError:
+    except Exception as error:  # whatever it is, the report is worth more
+        print(f"The report goes without a view of the object: {' '.join(str(error).split())}")
         return None
 
 
@@ -145,11 +155,7 @@ def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> 
     with torch.no_grad():
         s = s.to(ring.center.device)
         vertices, material = ring.surface(s, time), ring.brdf_net(s)
-    mesh = mi.Mesh("object", len(s), len(faces), has_vertex_normals=True)
-    params = mi.traverse(mesh)
-    params[POSITIONS] = mi.Float(vertices.cpu().numpy().ravel())
-    params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
-    params.update()
+    mesh = mesh_of(vertices.cpu().numpy(), faces)
     for name, value in material.items():
         mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
     stream = mi.MemoryStream()

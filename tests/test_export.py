@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_bsdf import directions, twin
 
-from mi_ring import atlas, export, gltf
+from mi_ring import atlas, export, gltf, results
 from mi_ring.brdfnet import Parameter
 from mi_ring.capture import camera_of
 from mi_ring.domain import Domain
@@ -273,6 +273,29 @@ def test_the_normal_map_holds_the_normals_of_the_flow():
     assert np.mean(error) < 0.6 < 1.2 < np.mean(before)  # eight bits alone: 0.3 degrees
 
 
+def test_small_objects_are_cut_open_like_large_ones():
+    """A ring as before but of 4 mm, in metres: xatlas itself drops triangles that are small."""
+    small = wild()
+    small.radius.fill_(0.004)
+    opened, large = atlas.unwrap(small, 4, RESOLUTION), atlas.unwrap(wild(), 4, RESOLUTION)
+    np.testing.assert_allclose(opened.uv, large.uv)
+    texels = atlas.rasterise(small, opened, RESOLUTION)
+    assert len(texels.s) > 0.4 * RESOLUTION**2 and np.isfinite(texels.normals).all()
+
+
+def test_levels_that_are_not_cut_themselves():
+    """Beyond level 5 triangles are cut in four within the charts of level 5, their corners on the sphere."""
+    ring = wild(subdivisions=6)
+    opened = atlas.unwrap(ring, 6, RESOLUTION)
+    assert len(opened.faces) == 20 * 4**6 and closed(opened).is_watertight
+    np.testing.assert_allclose(np.linalg.norm(opened.s, axis=1), 1, atol=1e-6)
+    with torch.no_grad():
+        expected = ring.surface(torch.from_numpy(opened.s)).numpy()
+    np.testing.assert_allclose(opened.vertices, expected, atol=1e-4)
+    normals = normals_at(ring, opened.s[::97])
+    assert np.degrees(np.arccos(np.clip((opened.normals[::97] * normals).sum(1), -1, 1))).mean() < 0.5
+
+
 def test_a_domain_with_a_handle_is_cut_open_too():
     torus = trimesh.creation.torus(1.0, 0.4, major_sections=30, minor_sections=14)
     ring = wild(Domain(torus.vertices, torus.faces))
@@ -375,6 +398,37 @@ np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     assert ours.mean() > 0.02 and np.abs(ours - stock).mean() < 0.01 * ours.mean() + 1e-4
 
 
+def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
+    """They are scaled to be within [0, 1], and the light is that much stronger."""
+    bright = wild()
+    bright.brdf_net.scale.fill_(20.0)
+    torch.save(bright.state({"subdivisions": 4}), tmp_path / "ring.pt")
+    (tmp_path / "scene.xml").write_text(small_capture.read_text())
+    export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
+    intensity = np.ravel(light_of(export.first_photograph(tmp_path)))[4:7]
+    stock = mi.load_file(str(tmp_path / "stock.xml"))
+    boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
+    assert boost.min() > 20
+    values = atlas.reflectances(bright, bright.domain.sample(4)[0].numpy())
+    base, weight = (np.array(mi.Bitmap(str(tmp_path / f"stock_{name}.exr"))) for name in ("reflectance", "weight"))
+    diffuse = (base * (1 - weight.reshape(*base.shape[:2], 1)) / math.pi).reshape(-1, 3).mean(0) * boost
+    np.testing.assert_allclose(diffuse, values["diffuse"].mean(0), rtol=0.1)
+
+
+def test_obj_of_principled_keeps_metal_and_gloss(tmp_path):
+    inner = '<texture name="{0}" type="mesh_attribute"><string name="name" value="vertex_{0}"/></texture>'
+    bsdf = f'<bsdf type="principled">{inner.format("base_color")}{inner.format("metallic")}' \
+           '<float name="specular" value="0.25"/></bsdf>'  # fmt: skip
+    parameters = (Parameter("base_color", 3, 0.0, 1.0), Parameter("metallic", 1, 0.0, 1.0))
+    ring = wild(bsdf=bsdf, parameters=parameters)
+    torch.save(ring.state(), tmp_path / "ring.pt")
+    export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.obj"), "--subdivisions", "3", "--resolution", "64"])
+    assert "\nKs 0.02 0.02 0.02\n" in (tmp_path / "o.mtl").read_text()  # F₀ = 0.08 · 0.25
+    metal = np.asarray(Image.open(tmp_path / "o_metallic.png")) / 255
+    expected = atlas.reflectances(ring, ring.domain.sample(4)[0].numpy())["metallic"]
+    assert abs(metal.mean() - expected.mean()) < 0.05 and abs(metal.max() - expected.max()) < 0.05
+
+
 def test_ply_at_time_0_is_the_domain(run, tmp_path):
     export.main([str(run), str(tmp_path / "start.ply"), "--time", "0", "--subdivisions", "2"])
     mesh = trimesh.load(tmp_path / "start.ply")
@@ -397,11 +451,26 @@ def test_material_options_reach_the_files(ring, run, tmp_path):
     (["o.glb", "--subdivisions", "9"], "--subdivisions: is 9"),
     (["o.ply", "--time", "1.5"], "--time: is 1.5"),
     (["o.glb", "--metres", "-1"], "--metres: is -1"),
+    (["o.obj", "--metres", "0.01"], "--metres: is for .glb"),
     (["o.ply", "--tint", "1", "-1", "1"], "--tint"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(arguments, words, run, tmp_path):
     assert words in complaint(run, tmp_path / arguments[0], *arguments[1:])
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_fit_and_a_capture_are_made_of_is_not_overwritten(run, small_capture, tmp_path):
+    (tmp_path / "copy.xml").write_text(small_capture.read_text())
+    for file in (run / "scene.xml", run / "mesh.ply", tmp_path / "copy.xml"):
+        assert "choose another name" in complaint(run, file)
+    assert (tmp_path / "copy.xml").read_text() == small_capture.read_text()
+
+
+def test_a_report_goes_without_what_cannot_be_exported(ring, monkeypatch, capsys):
+    assert results.viewed(ring) is not None
+    monkeypatch.setattr(atlas.xatlas, "Atlas", None)
+    assert results.viewed(ring) is None
+    assert len(capsys.readouterr().out.splitlines()) == 1
 
 
 def test_a_scene_for_mitsuba_needs_the_results_folder(run, tmp_path):

@@ -11,7 +11,8 @@ from mi_ring.command import COMMANDS
 PACKAGE = Path(mi_ring.__file__).parent
 NETWORKS = {"encoding", "shapenet", "brdfnet"}
 PLUGINS = {"photograph", "bsdf", "mesh", "integrator", "edges", "indirect"}
-TRAINING = {"losses", "config", "results", "report", "command", "capture", "bridge"} | set(COMMANDS)
+RESULTS = {"results", "report", "atlas", "gltf", "material"}
+TRAINING = {"losses", "config", "command", "capture", "bridge"} | RESULTS | set(COMMANDS)
 
 
 def imports(module: str) -> set[str]:
