@@ -554,7 +554,8 @@ BROKEN = {
     "film of two sizes": (["OUT.mp4"], second('"width" value="7"', '"width" value="9"'),
                           ["scene.xml", "(7, 5)", "(9, 5)"]),
     "film onto a folder": (["--flow", "2", "FOLDER.mp4"], str, ["FOLDER.mp4", "is a folder"]),
-    "onto a file": (["words.exr"], str, ["words.exr", "cannot be written"]),
+    "onto a file": (["words"], str, ["words", "cannot be written"]),
+    "another kind of film": (["words.gif"], str, ["words.gif", "ends in .mp4"]),
     "into a file": (["words.exr/film.mp4"], str, ["film.mp4", "cannot be written"]),
     "onto the photographs": (["images"], str, ["images", "own photographs"]),
     "another run": (["--material", "gone"], str, ["gone", "no such file"]),
@@ -565,11 +566,12 @@ BROKEN = {
 def test_a_users_mistake_is_one_line_before_anything_is_written(case, tmp_path, run, monkeypatch):
     options, edit, words = BROKEN[case]
     write_scene(tmp_path, edit=edit)
-    (tmp_path / "words.exr").write_text("words")
+    for name in ("words", "words.exr"):
+        (tmp_path / name).write_text("words")
     (tmp_path / "FOLDER.mp4").mkdir()
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    places = [o for o in options if o.endswith(".mp4") or o == "images" or (o == "words.exr" and len(options) == 1)]
+    places = [o for o in options if o.endswith(".mp4") or o == "images" or (o in ("words", "words.gif"))]
     rest = [o for o in options if o not in places]
     with pytest.raises(InputError) as error:
         render.main(["ring.pt", "scene.xml", *(places or ["out"]), *rest])
