@@ -50,8 +50,10 @@ class RenderConfig(MaterialOptions):
     """So many pictures of the flow, from where the fit started to the object."""
     view: str | None = None
     """File name of the photograph from whose place, and under whose light, these three are seen. Default: the first."""
+    width: int | None = None
+    """Pixels across the pictures of these three. Default: as many as that photograph has."""
     up: tuple[float, float, float] | None = None
-    """Axis of the turntable, and up in the environment. Default: the cameras' mean up."""
+    """Axis of the turntable, and up in the environment. Default: the mean up of the cameras."""
     envmap: Path | None = None
     """Environment, an EXR or HDR file of latitude and longitude, to light the object instead."""
     integrator: str | None = None
@@ -106,14 +108,18 @@ def check(config: RenderConfig) -> None:
     if config.subdivisions is not None and not 0 <= config.subdivisions <= 8:
         raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
     for name in ("turntable", "light_orbit", "flow"):
-        if getattr(config, name) < 0:
-            raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be a number of pictures")
+        if not 0 <= getattr(config, name) <= 10000:
+            raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be 0 to 10000 pictures")
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
         raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
     if config.view is not None and not (config.turntable or config.light_orbit or config.flow):
         raise InputError("--view: is for --turntable, --light-orbit and --flow; without them every photograph is taken")
     if config.flow and config.time != 1:
         raise InputError("--time: is one moment of the flow, --flow shows all of them; give one of the two")
+    if config.width is not None and not 8 <= config.width <= 8192:
+        raise InputError(f"--width: is {config.width}, must be 8 to 8192")
+    if config.width and not (config.turntable or config.light_orbit or config.flow):
+        raise InputError("--width: is for --turntable, --light-orbit and --flow; photographs have their own size")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
     if not 0 <= config.time <= 1:
@@ -177,7 +183,9 @@ def frames_of(scene: Capture, ring: Ring, config: RenderConfig) -> list[Frame]:
         raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {scene.names[0]}")
     sensor = scene.sensors[scene.names.index(config.view) if config.view else 0]
     up = up_of(scene, config)
-    to_world, focal, middle = framed(sensor, ring, up)
+    width, height = sensor.size
+    size = (config.width, round(height * config.width / width)) if config.width else sensor.size
+    to_world, focal, middle = framed(sensor, size, ring, up)
     light = np.ravel(light_of(sensor)).astype(float)
     lamp = light[:3] if light[3] else light[:3] - middle
     toward = to_world[:3, 2]
@@ -197,7 +205,7 @@ def frames_of(scene: Capture, ring: Ring, config: RenderConfig) -> list[Frame]:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
         where = shining if light[3] else middle + shining
-        frames.append(Frame(photograph(sensor.size, camera, focal, where, light), name, time))
+        frames.append(Frame(photograph(size, camera, focal, where, light), name, time))
     return frames
 
 
@@ -206,10 +214,11 @@ def up_of(scene: Capture, config: RenderConfig) -> np.ndarray:
     return scene.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
-def framed(sensor: Photograph, ring: Ring, up: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+def framed(sensor: Photograph, size: tuple[int, int], ring: Ring, up: np.ndarray):
     """A camera in the place of a photograph's, turned so that all of the object and of its start are in the middle.
 
-    Returns to_world (4, 4), the focal length [px] and the middle (3,) of the object.
+    `size`: (width, height) of its pictures [px]. Returns to_world (4, 4), the focal length [px] and the middle (3,) of
+    the object.
     """
     s = ring.domain.sample(3)[0].numpy()
     points = np.concatenate([flowed(ring, s, time) for time in (0.0, 1.0)]).astype(float)
@@ -225,7 +234,7 @@ def framed(sensor: Photograph, ring: Ring, up: np.ndarray) -> tuple[np.ndarray, 
     left /= np.linalg.norm(left)
     matrix[:3, :3] = np.stack([left, np.cross(forward, left), forward], 1)
     sine = min(np.linalg.norm(points - middle, axis=1).max() / distance, 0.98)
-    return matrix, 0.47 * min(sensor.size) * np.sqrt(1 - sine**2) / sine, middle
+    return matrix, 0.47 * min(size) * np.sqrt(1 - sine**2) / sine, middle
 
 
 def photograph(size: tuple[int, int], to_world: np.ndarray, focal: float, where: np.ndarray, light) -> Photograph:
@@ -276,10 +285,12 @@ def under(envmap: Path, up: np.ndarray, scene: Capture, ring: Ring) -> bridge.Su
         of_shape = isinstance(emitter, Flash) or mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         if not (of_shape or emitter.is_environment()):
             parts.append(emitter)
+    if not envmap.is_file():
+        raise InputError(f"{envmap}: --envmap: no such file; give an EXR or HDR file of latitude and longitude")
     try:
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world)})
     except RuntimeError as error:
-        raise InputError(f"{envmap}: --envmap: {capture.reason(error)}") from error
+        raise InputError(f"{envmap}: --envmap: cannot be read ({capture.reason(error).rsplit('] ', 1)[-1]})") from error
     everything = {"type": "scene", "object": shape, "light": light} | {f"part{k}": p for k, p in enumerate(parts)}
     return bridge.Surface(mi.load_dict(everything), shape, ring)
 

@@ -48,7 +48,7 @@ def html(fit, log: list[dict], glb: bytes | None = None) -> str:
     numbers = {
         "Photographs": f"{len(capture)}" + (f"; below are {len(rows)} of them, as are the next two numbers"
                                              if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels)",
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels, 4 samples each)",
         "Silhouettes": (f"{np.mean(masked):.4f} intersection over union with the masks"
                         if masked else "no masks of the whole object"),
         "Iterations": f"{fit.iteration} of {fit.iterations}",
@@ -90,8 +90,8 @@ def findings(rows: list[Row], iteration: int, iterations: int) -> list[str]:
         found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
                      "and pose are right.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
-        found.append(f"{few}: so much of the object is saturated, where it is known to be at least this bright and no "
-                     "more; expose less.")  # fmt: skip
+        found.append(f"{few}: so much of the object is saturated; the fit only knows that it is at least this bright. "
+                     "Expose less.")  # fmt: skip
 
     rows = [row for row in rows if row.shift is not None]
     if rows:

@@ -1,6 +1,7 @@
 """The results of a fit: everything that is written into its folder."""
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -30,7 +31,8 @@ def writing(what: Path | str):
     try:
         yield
     except OSError as error:
-        raise InputError(f"{what}: cannot be written ({error.strerror}); make room or choose another place") from error
+        advice = "make room" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose another place"
+        raise InputError(f"{what}: cannot be written ({error.strerror}); {advice}") from error
 
 
 def require_place(path: Path, field: str = "") -> None:

@@ -69,7 +69,9 @@ class Ring(nn.Module):
             if version == FORMAT:
                 return cls.from_state(state)
         except FileNotFoundError:
-            raise InputError(f"{path}: no such file; weights must be the ring.pt of a finished fit") from None
+            raise InputError(f"{path}: no such file; give the results folder of a fit, or its ring.pt") from None
         except Exception as error:
-            raise InputError(f"{path}: not a saved fit ({str(error).splitlines()[0]})") from error
+            why = f" ({str(error).splitlines()[0]})" if isinstance(error, OSError) else ""
+            advice = "give the results folder of a fit, or its ring.pt"
+            raise InputError(f"{path}: not a saved fit{why}; {advice}") from error
         raise InputError(f"{path}: format version {version}, this mi_ring reads version {FORMAT}")

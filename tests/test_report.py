@@ -276,7 +276,7 @@ def test_of_a_good_fit_there_is_nothing_to_say():
 @pytest.mark.parametrize("changes, words", [
     ({"psnr": 26.0}, ["4.jpg (26.0 dB)", "31.6 dB", "leave"]),
     ({"iou": 0.62}, ["4.jpg (IoU 0.62)", "mask"]),
-    ({"saturated": 0.064}, ["4.jpg (6.4%)", "expose less"]),
+    ({"saturated": 0.064}, ["4.jpg (6.4%)", "Expose less"]),
     ({"shift": (-1.4, 2.05)}, ["4.jpg (1.4 px to the left and 2.0 px below)", "pose"]),
 ])  # fmt: skip
 def test_one_photograph_that_stands_out_is_named(changes, words):

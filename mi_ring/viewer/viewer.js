@@ -5,11 +5,11 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
-// What can be shown in place of radiance. The last two are plain numbers: sRGB's curve is undone.
+// What can be shown in place of radiance; roughness as the width of the distribution, the square of glTF's. The last two are plain numbers: sRGB's curve is undone.
 const SHOWN = {
   diffuse: "diffuseColor.rgb",
   specular: "material.specularColorBlended",
-  roughness: "sRGBTransferEOTF(vec4(vec3(roughnessFactor), 1.0)).rgb",
+  roughness: "sRGBTransferEOTF(vec4(vec3(roughnessFactor * roughnessFactor), 1.0)).rgb",
   normals: "sRGBTransferEOTF(vec4(transformNormalByInverseViewMatrix(normal, viewMatrix) * 0.5 + 0.5, 1.0)).rgb",
 };
 const HALF_FIELD = 15; // of view [degrees]
