@@ -199,6 +199,16 @@ def test_a_film_is_filled_by_what_it_shows(tmp_path, size):
             np.testing.assert_allclose(np.ptp(pixels, axis=0), 0.94 * 5, rtol=0.01)
 
 
+def test_a_film_may_be_larger_than_its_photographs(tmp_path):
+    """Three times as many pixels both ways: the same picture, three times as large."""
+    with torch.no_grad():
+        vertices = sphere().surface(sphere().domain.sample(3)[0]).numpy()
+    path = write_scene(tmp_path)
+    (small,), (large,) = (frames_of(path, sphere(), "--turntable", 1, *more) for more in ((), ("--width", 21)))
+    assert small.sensor.size == (7, 5) and large.sensor.size == (21, 15)
+    np.testing.assert_allclose(project(large.sensor, vertices), 3 * project(small.sensor, vertices), rtol=1e-4)
+
+
 def test_the_turntable_of_a_camera_on_its_axis_turns_the_picture(tmp_path):
     """There is no up in what it sees but the photograph's own."""
     path, axis = write_scene(tmp_path), EYES[0] - MIDDLE
@@ -532,6 +542,10 @@ BROKEN = {
     "a view without a film": (["--view", "001.png"], str, ["--view", "--turntable"]),
     "a view that is none": (["--flow", "3", "--view", "009.png"], str, ["scene.xml", "--view", "009.png", "000.png"]),
     "a moment of all": (["--flow", "3", "--time", "0.5"], str, ["--time", "--flow"]),
+    "photographs of another width": (["--width", "9"], str, ["--width", "--turntable"]),
+    "no width": (["--flow", "2", "--width", "0"], str, ["--width", "is 0", "8 to 8192"]),
+    "too many pictures": (["--turntable", "100000"], str, ["--turntable", "10000 pictures"]),
+    "no such environment": (["--envmap", "gone.exr"], str, ["gone.exr", "--envmap", "no such file"]),
     "no samples": (["--spp", "0"], str, ["--spp", "0", "at least 1"]),
     "after the end": (["--time", "1.5"], str, ["--time", "1.5", "0 to 1"]),
     "at no time": (["--time", "nan"], str, ["--time", "nan"]),
