@@ -20,7 +20,7 @@ from mi_ring.integrator import light_of
 from mi_ring.material import MaterialOptions, dress
 from mi_ring.mesh import mesh_of
 from mi_ring.photograph import Photograph
-from mi_ring.results import replace, require_place, write_image, write_mesh
+from mi_ring.results import replace, require_place, write_image, write_mesh, write_ply
 from mi_ring.ring import Ring
 
 KINDS = (".ply", ".obj", ".glb", ".xml")
@@ -151,10 +151,8 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
     params = mi.traverse(mesh)
     params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's know of the seams
     params.update()
-    stream = mi.MemoryStream()
-    mesh.write_ply(stream)
     files.append(path.with_name(f"{path.stem}_object.ply"))
-    replace(files[-1], stream.raw_buffer())
+    write_ply(mesh, files[-1])
 
     def bitmap(parent, name: str, image: np.ndarray) -> None:
         """A texture (N, 3) or (N,) of the texels."""

@@ -69,6 +69,16 @@ class RenderConfig(MaterialOptions):
     spp: int = 64
     """Samples per pixel."""
 
+    @property
+    def count(self) -> int:
+        """Pictures of the turntable, the light orbit or the flow; 0 without them."""
+        return self.turntable or self.light_orbit or self.flow
+
+    @property
+    def film(self) -> bool:
+        """Is one file to be written, not a folder of pictures?"""
+        return self.out.suffix.lower() == ".mp4"
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -87,14 +97,13 @@ def main(arguments: Sequence[str]) -> None:
     dress(ring, config)
     scene = capture.load(config.scene, images=False)
     frames = frames_of(scene, ring, config)
-    film = config.out.suffix.lower() == ".mp4"
     check_frames(frames, scene, config)
     integrator, surface = integrator_of(config), surface_of(scene, ring, config)
     with writing(config.out):
-        for folder in {(config.out if film else config.out / frame.name).parent for frame in frames}:
+        for folder in {(config.out if config.film else config.out / frame.name).parent for frame in frames}:
             folder.mkdir(parents=True, exist_ok=True)
     pictures = render(surface, ring, frames, integrator, scene.shadows, config)
-    if film:
+    if config.film:
         write_film(pictures, config.out, frames[0].sensor.size, config.fps)
         print(config.out)
     else:
@@ -112,13 +121,13 @@ def check(config: RenderConfig) -> None:
             raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be 0 to 10000 pictures")
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
         raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
-    if config.view is not None and not (config.turntable or config.light_orbit or config.flow):
+    if config.view is not None and not config.count:
         raise InputError("--view: is for --turntable, --light-orbit and --flow; without them every photograph is taken")
     if config.flow and config.time != 1:
         raise InputError("--time: is one moment of the flow, --flow shows all of them; give one of the two")
     if config.width is not None and not 8 <= config.width <= 8192:
         raise InputError(f"--width: is {config.width}, must be 8 to 8192")
-    if config.width and not (config.turntable or config.light_orbit or config.flow):
+    if config.width and not config.count:
         raise InputError("--width: is for --turntable, --light-orbit and --flow; photographs have their own size")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
@@ -134,13 +143,13 @@ def check(config: RenderConfig) -> None:
         raise InputError("--light-orbit: moves a photograph's light, which --envmap switches off; give one of the two")
     if config.out.suffix.lower() in (".gif", ".mov", ".avi", ".mkv", ".webm", ".png", ".jpg", ".jpeg", ".exr"):
         raise InputError(f"{config.out}: must be a folder for the pictures, or a film that ends in .mp4")
-    if config.out.suffix.lower() == ".mp4" and config.format:
+    if config.film and config.format:
         raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out")
 
 
 def check_frames(frames: list[Frame], scene: Capture, config: RenderConfig) -> None:
     """Raise InputError for pictures that could not be written, or would overwrite each other or the photographs."""
-    if config.out.suffix.lower() == ".mp4":
+    if config.film:
         sizes = sorted({frame.sensor.size for frame in frames})
         if len(sizes) > 1:
             raise InputError(f"{config.scene}: film: photographs have several sizes, {sizes[0]} and {sizes[1]} [px]; "
@@ -175,7 +184,7 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 
 def frames_of(scene: Capture, ring: Ring, config: RenderConfig) -> list[Frame]:
     """What to render: the scene's photographs, or those that a film is made of."""
-    count = config.turntable or config.light_orbit or config.flow
+    count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in scene.names]
         return [Frame(sensor, name, config.time) for sensor, name in zip(scene.sensors, names)]

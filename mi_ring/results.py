@@ -160,6 +160,11 @@ def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> 
     mesh = mesh_of(vertices.cpu().numpy(), faces)
     for name, value in material.items():
         mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
+    write_ply(mesh, path)
+
+
+def write_ply(mesh: mi.Mesh, path: Path) -> None:
+    """A mesh as PLY, whole or not at all."""
     stream = mi.MemoryStream()
     mesh.write_ply(stream)
     replace(path, stream.raw_buffer())
