@@ -20,7 +20,7 @@ from pathlib import Path
 from accuracy import alone, peak_memory, processor, table, watch
 
 VARIED = {
-    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (4, 16, 20), "photographs": (500, 2000),
+    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (3, 10, 20), "photographs": (500, 2000),
 }  # fmt: skip
 WARM_UP, ITERATIONS = 3, 7
 
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     scene = parser.parse_args().scene
     own = len(ElementTree.parse(scene).findall("sensor"))
-    base = {"level": 5, "width": 256, "batch": 8, "steps": 8, "photographs": own}
+    base = {"level": 5, "width": 256, "batch": 8, "steps": 5, "photographs": own}
     settings = [base] + [base | {name: value} for name, values in VARIED.items() for value in values]
     settings += [base | {"level": 6, "width": 512, "photographs": value} for value in (own, 2000)]
     rows = []

@@ -1,6 +1,6 @@
 """Print, as Markdown with machine and date, the two limits of a fit's speed and how near it comes to them.
 
-    python benchmarks/limits.py [SCENE.xml] [--level 5] [--steps 8]
+    python benchmarks/limits.py [SCENE.xml] [--level 5] [--steps 5]
 
 The flow: arithmetic of one forward and backward pass of Shape-Net (three products per weight, step and vertex) over its
 time, against the speed of plain products: of large square matrices, and of the hidden layers' own shape. The renderer:
@@ -117,7 +117,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     parser.add_argument("--level", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=8)
+    parser.add_argument("--steps", type=int, default=5)
     arguments = parser.parse_args()
     fit.set_threads(fit.parse([str(arguments.scene)]))
     fit.keep_memory()

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from mi_ring.encoding import PosEnc
+from mi_ring.mlp import MLP
 
 
 class Parameter(NamedTuple):
@@ -29,7 +29,7 @@ COOK_TORRANCE = (
 )
 
 
-class BRDFNet(nn.Module):
+class BRDFNet(MLP):
     """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons on the domain point s, never on the deformed point.
 
     Or the parameters of another BSDF. `scale` is the order of magnitude of ρ in the scene's units of light: the
@@ -41,20 +41,14 @@ class BRDFNet(nn.Module):
         self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE, width: int = 256,
         frequencies: int = 16,
     ):  # fmt: skip
-        super().__init__()
-        self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
-        self.encoding = PosEnc(frequencies)
-        sizes = [self.encoding.width] + [width] * 5
-        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:]))
-        self.output = nn.Linear(width, sum(p.channels for p in self.bsdf_parameters))
+        parameters = tuple(Parameter(*p) for p in parameters)
+        super().__init__(5, sum(p.channels for p in parameters), width, frequencies)
+        self.bsdf_parameters = parameters
         self.register_buffer("scale", torch.tensor(float(scale)))
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         """The parameters by name at domain points (..., 3): (..., 3) where they are colours, else (...)."""
-        h = self.encoding(s)
-        for layer in self.hidden:
-            h = F.leaky_relu(layer(h))
-        raw = self.output(h).float().split([p.channels for p in self.bsdf_parameters], -1)
+        raw = self.evaluate(s).float().split([p.channels for p in self.bsdf_parameters], -1)
         result = {}
         for parameter, x in zip(self.bsdf_parameters, raw):
             x = x if parameter.channels == 3 else x[..., 0]

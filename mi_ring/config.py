@@ -56,7 +56,7 @@ class Config:
     first stage are exchanged for half as many iterations of the second, which take about as long."""
     batch: int = 8
     """Photographs per iteration."""
-    steps: int = 8
+    steps: int = 5
     """Euler steps of the flow, the paper's T."""
     spp: int = 1
     """Samples per pixel."""
@@ -88,7 +88,7 @@ class Config:
     decay: float = 0.1
     """The learning rates fall exponentially to this share."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Of the networks' matrix products. auto: bfloat16 where there are instructions for it."""
+    """Of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"

@@ -46,6 +46,14 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
     assert all(p.grad.is_meta for p in (*net.parameters(), *brdf_net.parameters(), images, masks))
 
 
+@pytest.mark.parametrize("amx", [True, False])
+def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    for precision, expected in (("auto", amx), ("bfloat16", True), ("float32", False)):
+        with fit.autocast(precision, torch.device("cpu"))():
+            assert torch.is_autocast_enabled("cpu") == expected
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")
 def test_without_a_gpu_the_fit_says_so_and_goes_on(small_capture, tmp_path, capsys):
     assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--variant", "cuda_ad_rgb", *TINY]) == 0

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import expm
+from torch.nn import functional as F
 
+from mi_ring import mlp
 from mi_ring.brdfnet import BRDFNet, Parameter
 from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 from mi_ring.ring import Ring
-from mi_ring.shapenet import ShapeNet, _Flow, euler
+from mi_ring.shapenet import ShapeNet, euler
 
 
 def neurons(net):
@@ -64,21 +66,44 @@ def test_shape_net_takes_its_euler_steps_through_its_velocity():
     torch.testing.assert_close(net.flow(x, 1), x + net.velocity(x) / 3)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_gradient_of_the_flow_is_that_of_plain_euler_steps(threads, monkeypatch):
-    monkeypatch.setattr(_Flow, "CHUNK", 16)
+def plain(net, x):
+    """An MLP, by torch's own layers."""
+    h = net.encoding(x)
+    for layer in net.hidden:
+        h = F.leaky_relu(layer(h), mlp.SLOPE)
+    return net.output(h)
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request, monkeypatch):
+    monkeypatch.setattr(mlp, "CHUNK", 16)
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def test_gradient_of_the_flow_is_that_of_plain_euler_steps(threads):
     torch.manual_seed(1)
     net = ShapeNet(steps=7).double()
     net.output.weight.data.mul_(100)
     x, weight = torch.randn(2, 45, 3, dtype=torch.float64)
     x.requires_grad_()
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        found = torch.autograd.grad((net(x) * weight).sum(), [x, *net.parameters()])
-    finally:
-        torch.set_num_threads(before)
-    expected = torch.autograd.grad((euler(net.velocity, x, 1 / 7, 7) * weight).sum(), [x, *net.parameters()])
+    found = torch.autograd.grad((net(x) * weight).sum(), [x, *net.parameters()])
+    way = euler(lambda p: net.speed * torch.tanh(plain(net, p)), x, 1 / 7, 7)
+    expected = torch.autograd.grad((way * weight).sum(), [x, *net.parameters()])
+    for a, b in zip(found, expected):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+
+
+def test_a_network_and_its_gradient_are_those_of_torchs_layers(threads):
+    torch.manual_seed(4)
+    net = BRDFNet().double()
+    x, weight = torch.randn(5, 7, 3, dtype=torch.float64), torch.randn(5, 7, 5, dtype=torch.float64)
+    x.requires_grad_()
+    values = net.evaluate(x), plain(net, x)
+    torch.testing.assert_close(*values, rtol=1e-12, atol=1e-12)
+    found, expected = (torch.autograd.grad((v * weight).sum(), [x, *net.parameters()]) for v in values)
     for a, b in zip(found, expected):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
 
