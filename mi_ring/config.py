@@ -13,7 +13,7 @@ from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
 HEAD_START = 2 / 3  #: share of the first stage that starts near the object do without
-EXCHANGE = 0.5  #: iterations of the second stage that take about as long as one of the first, of the presets
+EXCHANGE = 0.4  #: iterations of the second stage that take about as long as one of the first, of the presets
 
 
 class Stage(NamedTuple):
@@ -45,15 +45,15 @@ class Config:
     room; none: as if it had none, which finds them in a dark room, too; --weights.mask 0 does without any."""
     seed: int = 0
     """Of every random choice."""
-    iterations: int = 500
+    iterations: int = 400
     """In all, shared out among the stages. From a hull or a mesh it is some fewer, see --shares."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
     widths: tuple[int, ...] = (128, 256, 512)
     """Width of the photographs in each stage, at most [px]."""
-    shares: tuple[float, ...] = (0.45, 0.43, 0.12)
+    shares: tuple[float, ...] = (0.45, 0.46, 0.09)
     """Share of the iterations of each stage. A hull or a mesh is near the object already: from there two thirds of the
-    first stage are exchanged for half as many iterations of the second, which take about as long."""
+    first stage are exchanged for 40 % as many iterations of the second, which take about as long."""
     batch: int = 8
     """Photographs per iteration."""
     steps: int = 5
@@ -164,7 +164,7 @@ class Config:
 
 PRESETS = {
     "fast": {
-        "iterations": 170, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "iterations": 150, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},

@@ -457,7 +457,7 @@ def test_presets_are_valid_and_can_be_overridden(preset):
 def test_starts_near_the_object_spend_less_on_the_coarse_stage():
     config = Config("scene.xml", iterations=100, shares=(0.5, 0.3, 0.2))
     assert [s.last - s.first for s in config.stages()] == [50, 30, 20]
-    assert [s.last - s.first for s in config.stages(near=True)] == [17, 46, 20]  # 16.7, and 30 + 0.5 · 33.3
+    assert [s.last - s.first for s in config.stages(near=True)] == [17, 43, 20]  # 16.7, and 30 + 0.4 · 33.3
     config = Config("scene.xml", iterations=100, levels=(4,), widths=(128,), shares=(1,))
     assert [s.last for s in config.stages(near=True)] == [100]
 
