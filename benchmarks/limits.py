@@ -21,7 +21,8 @@ import torch
 from torch.nn import functional as F
 
 from mi_ring.domain import Sphere
-from mi_ring.shapenet import SLOPE, ShapeNet
+from mi_ring.mlp import SLOPE
+from mi_ring.shapenet import ShapeNet
 
 
 def flow_speed(s, steps: int, dtype) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 
 SLOPE = mlp.SLOPE
+DTYPE = torch.bfloat16 if torch.cpu._is_amx_tile_supported() else torch.float32  # as in a fit
 
 
 def by_autograd(net):
@@ -39,7 +40,7 @@ def flow(net, s, velocity=None):
     """Forward and backward pass: by hand as in the fit, or by autograd of Euler steps along `velocity`."""
 
     def run():
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=DTYPE is torch.bfloat16):
             x = net(s) if velocity is None else shapenet.euler(velocity, s, 1 / net.steps, net.steps)
         x.backward(torch.ones_like(x))
 
@@ -108,12 +109,12 @@ def main() -> None:
     encode = PosEnc()
 
     def step(x, *parameters):
-        h = encode(x).bfloat16()
+        h = encode(x).to(DTYPE)
         for w, b in zip(parameters[:3], parameters[3:]):
             h = F.leaky_relu(F.linear(h, w, b), SLOPE)
         return h
 
-    parameters = [w for kind in ("weight", "bias") for w in (getattr(h, kind).detach().bfloat16() for h in net.hidden)]
+    parameters = [w for kind in ("weight", "bias") for w in (getattr(h, kind).detach().to(DTYPE) for h in net.hidden)]
     compiled = torch.compile(step, dynamic=False)
     with torch.no_grad():
         before = time.perf_counter()
@@ -121,7 +122,7 @@ def main() -> None:
         note = f"compiled in {time.perf_counter() - before:.0f} s; needs a C++ compiler"
         compare("hidden layers of a step, forward: torch.compile", lambda: step(s, *parameters),
                 lambda: compiled(s, *parameters), note)  # fmt: skip
-        h, w, b = torch.randn(len(s), 256).bfloat16(), parameters[1], parameters[4]
+        h, w, b = torch.randn(len(s), 256).to(DTYPE), parameters[1], parameters[4]
         compare("a layer, forward: product, bias and leaky ReLU fused by oneDNN",
                 lambda: F.leaky_relu_(F.linear(h, w, b), SLOPE),
                 lambda: torch.ops.mkldnn._linear_pointwise(h, w, b, "leaky_relu", [SLOPE], ""),
@@ -130,7 +131,7 @@ def main() -> None:
         images = torch.randn(8, 128, 128)
         compare("blur of the masks, 8 of 128², σ = 8 px, by convolutions", lambda: losses.blur(images, 8.0),
                 lambda: convolved(images, 8.0))  # fmt: skip
-    print(f"{processor()}; {datetime.date.today()}; {len(s):,} vertices, {arguments.steps} steps, bfloat16, "
+    print(f"{processor()}; {datetime.date.today()}; {len(s):,} vertices, {arguments.steps} steps, {DTYPE}, "
           f"{torch.get_num_threads()} threads\n")  # fmt: skip
     print(table(["tried", "as it is, ms", "tried, ms", ""], rows))
 

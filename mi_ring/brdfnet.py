@@ -42,7 +42,7 @@ class BRDFNet(MLP):
         frequencies: int = 16,
     ):  # fmt: skip
         parameters = tuple(Parameter(*p) for p in parameters)
-        super().__init__(5, sum(p.channels for p in parameters), width, frequencies)
+        super().__init__(depth=5, outputs=sum(p.channels for p in parameters), width=width, frequencies=frequencies)
         self.bsdf_parameters = parameters
         self.register_buffer("scale", torch.tensor(float(scale)))
 

@@ -21,3 +21,11 @@ class PosEnc(nn.Module):
         omega = torch.arange(1, self.frequencies + 1, dtype=x.dtype, device=x.device)
         phase = (x[..., None, :] * omega[:, None]).flatten(-2)
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
+
+    def back(self, features: Tensor, gradient: Tensor) -> Tensor:
+        """From the gradient of the features (n, 6 · frequencies) to that of the points (n, 3), in float32 at least."""
+        (cosine, sine), (by_cosine, by_sine) = features.chunk(2, dim=1), gradient.chunk(2, dim=1)
+        dtype = torch.promote_types(features.dtype, torch.float32)
+        omega = torch.arange(1, self.frequencies + 1, dtype=dtype, device=features.device)
+        phase = (cosine * by_sine - sine * by_cosine) * omega.repeat_interleave(3)
+        return phase.unflatten(1, (self.frequencies, 3)).sum(1)

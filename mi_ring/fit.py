@@ -29,7 +29,7 @@ from mi_ring.ring import Ring
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 CHECKPOINT_SECONDS = 30.0
 LOG_EVERY = 5
-FIXED_WORK = 3700  # what an iteration costs besides its vertices, in vertices: for the time left
+FIXED_WORK = 3000  # what an iteration costs besides its vertices, in vertices: for the time left
 REGULARISED_POINTS = 512  # of the flow's paths, drawn anew in each iteration
 
 
@@ -248,7 +248,7 @@ def autocast(precision: str, device: torch.device):
     if device.type == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
-        fast = torch.cpu._is_amx_tile_supported()  # by AVX-512 alone bfloat16 is half as fast as float32
+        fast = torch.cpu._is_amx_tile_supported()  # with AVX512-BF16 alone it is half as fast as float32
     if precision == "bfloat16" or (precision == "auto" and fast):
         return lambda: torch.autocast(device.type, torch.bfloat16)
     return contextlib.nullcontext

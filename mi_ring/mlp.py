@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mi_ring.encoding import PosEnc
@@ -13,7 +14,7 @@ CHUNK = 8192  #: points that a thread computes at once, at most
 
 
 class MLP(nn.Module):
-    """`outputs` functions of a point: its encoding, hidden layers of `width` leaky ReLUs, a linear layer."""
+    """`outputs` functions of a point: its encoding, `depth` hidden layers of `width` leaky ReLUs, a linear layer."""
 
     def __init__(self, depth: int, outputs: int, width: int, frequencies: int):
         super().__init__()
@@ -23,91 +24,88 @@ class MLP(nn.Module):
         self.output = nn.Linear(width, outputs)
 
     def evaluate(self, x: Tensor) -> Tensor:
-        """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`."""
-        return _Evaluate.apply(x.reshape(-1, 3), *self.constants(x)).unflatten(0, x.shape[:-1])
+        """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
 
-    def constants(self, x: Tensor) -> list:
-        """What `_Evaluate` takes besides points (..., 3): precision, are gradients wanted, weights and biases."""
+        Differentiable once and by one backward pass, which frees what was kept for it.
+        """
+        values = _Evaluate.apply(x.reshape(-1, 3), *self.operands(x))
+        return values.reshape(*x.shape[:-1], self.output.out_features)
+
+    def operands(self, x: Tensor) -> list:
+        """What `_Evaluate` and Shape-Net's `_Flow` take last.
+
+        The encoding, the precision of the products, whether gradients are wanted, weights and biases in turn.
+        """
         dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # what autocast makes of it, on any device
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
-        return [dtype, torch.is_grad_enabled(), *parameters]
+        return [self.encoding, dtype, torch.is_grad_enabled(), *parameters]
 
 
 class Layers:
-    """Weights and biases in the precision of the products, ahead and back."""
+    """An MLP's weights and biases in the precision of the products: values by `ahead`, gradients by `back`."""
 
-    def __init__(self, dtype: torch.dtype, parameters):
-        self.dtype = dtype
+    def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters):
+        self.encoding, self.dtype = encoding, dtype
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
-        self.frequencies = self.weights[0].shape[1] // 6
-        self.encode = PosEnc(self.frequencies)
 
-    def ahead(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
-        """The encoding and the activations of the hidden layers, and the output, of points (n, 3)."""
-        activations = [self.encode(x).to(self.dtype)]
+    def ahead(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
+        """Encoding and activations of the hidden layers, only the last unless `keep`, and output of points (n, 3)."""
+        activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
             activations.append(F.leaky_relu_(F.linear(activations[-1], w, b), SLOPE))
+            if not keep:
+                del activations[0]
         return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
 
     def zeros(self) -> list[Tensor]:
-        """To sum up the parameters' gradients in, in float32 at least: all weights, then all biases."""
+        """To sum up the parameters' gradients in, in their order, in float32 at least."""
         dtype = torch.promote_types(self.dtype, torch.float32)
-        return [torch.zeros_like(p, dtype=dtype) for p in (*self.weights, *self.biases)]
+        return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
     def back(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
         """From the gradient of the output to that of the points; those of the parameters are added to `sums`."""
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):
-            sums[k] += gradient.T @ activations[k]
-            sums[len(self.weights) + k] += gradient.sum(0)
+            sums[2 * k] += gradient.T @ activations[k]
+            sums[2 * k + 1] += gradient.sum(0)
             gradient = gradient @ self.weights[k]
             if k:
                 gradient = torch.ops.aten.leaky_relu_backward(gradient, activations[k], SLOPE, True)
-        (cosine, sine), (by_cosine, by_sine) = activations[0].chunk(2, dim=1), gradient.chunk(2, dim=1)
-        omega = torch.arange(1, self.frequencies + 1, dtype=sums[0].dtype, device=gradient.device)
-        phase = (cosine * by_sine - sine * by_cosine) * omega.repeat_interleave(3)
-        return phase.unflatten(1, (self.frequencies, 3)).sum(1)
+        return self.encoding.back(activations[0], gradient)
 
 
 class _Evaluate(torch.autograd.Function):
     """An MLP at points (n, 3). Only encoding and activations are kept, in the precision of the products."""
 
     @staticmethod
-    def forward(ctx, x, dtype, keep, *parameters):
-        layers = Layers(dtype, parameters)
+    def forward(ctx, x, encoding, dtype, keep, *parameters):
+        layers = Layers(encoding, dtype, parameters)
 
         @torch.no_grad()
         def ahead(x):
-            activations, output = layers.ahead(x)
+            activations, output = layers.ahead(x, keep)
             return output, activations if keep else None
 
-        ctx.layers = layers
-        outputs, ctx.kept = zip(*in_parallel(ahead, chunks(x.detach())))
+        parts = chunks(x.detach())
+        ctx.layers, ctx.sizes = layers, [len(part) for part in parts]
+        outputs, ctx.kept = zip(*in_parallel(ahead, parts))
         return torch.cat(outputs)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, gradient):
-        layers = ctx.layers
-
         @torch.no_grad()
         def back(gradient, activations):
-            sums = layers.zeros()
-            return layers.back(gradient, activations, sums), sums
+            sums = ctx.layers.zeros()
+            return ctx.layers.back(gradient, activations, sums), sums
 
-        gradients, sums = zip(*in_parallel(back, chunks(gradient), ctx.kept))
+        gradients, sums = zip(*in_parallel(back, gradient.split(ctx.sizes), ctx.kept))
         ctx.kept = None
-        return torch.cat(gradients), None, None, *in_order(sums)
-
-
-def in_order(sums) -> list[Tensor]:
-    """Of each chunk's `Layers.zeros`, added to: the totals, in the order of the parameters."""
-    totals = [sum(parts) for parts in zip(*sums)]
-    half = len(totals) // 2
-    return [total for pair in zip(totals[:half], totals[half:]) for total in pair]
+        return torch.cat(gradients), None, None, None, *(sum(parts) for parts in zip(*sums))
 
 
 def chunks(x: Tensor):
-    """Points (n, 3), or what there is of each, in parts that `in_parallel` computes one per thread."""
+    """Points (n, 3) in parts, of which `in_parallel` computes one per thread; a GPU computes all at once."""
     if x.device.type != "cpu":
         return [x]
     return x.split(max(1, min(CHUNK, -(-len(x) // torch.get_num_threads()))))

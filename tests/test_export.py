@@ -105,18 +105,13 @@ def closed(opened) -> trimesh.Trimesh:
 
 def normals_at(ring, s):
     """The analytic normal (N, 3) of the surface at points of the sphere, by the derivative of the flow."""
-    s = torch.from_numpy(s.astype(np.float32))
+    s = torch.from_numpy(s.astype(np.float32)).requires_grad_()
+    jacobian = torch.stack([torch.autograd.grad(ring.shape_net(s)[:, k].sum(), s)[0] for k in range(3)], 1)
+    s = s.detach()
     aside = torch.linalg.cross(s, torch.tensor([0.3, 0.5, 0.8]).expand_as(s))
-    pair = aside, torch.linalg.cross(s, aside)
-
-    def surface(x):
-        for _ in range(ring.shape_net.steps):
-            x = x + ring.shape_net.velocity(x) / ring.shape_net.steps
-        return x
-
-    a, b = (torch.func.jvp(surface, (s,), (t,))[1] for t in pair)
+    a, b = (torch.einsum("nij,nj->ni", jacobian, t) for t in (aside, torch.linalg.cross(s, aside)))
     n = torch.linalg.cross(a, b)
-    return (n / n.norm(dim=1, keepdim=True)).detach().numpy()
+    return (n / n.norm(dim=1, keepdim=True)).numpy()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

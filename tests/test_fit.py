@@ -269,7 +269,7 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
         return fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), *options]))
 
     before = fresh()
-    assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.6
+    assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
     for _ in range(3):
         before.step()
     results.save(before.state(), tmp_path / "checkpoint.pt")

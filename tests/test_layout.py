@@ -9,7 +9,7 @@ import mi_ring
 from mi_ring.command import COMMANDS
 
 PACKAGE = Path(mi_ring.__file__).parent
-NETWORKS = {"encoding", "shapenet", "brdfnet"}
+NETWORKS = {"encoding", "mlp", "shapenet", "brdfnet"}
 PLUGINS = {"photograph", "bsdf", "mesh", "integrator", "edges", "indirect"}
 RESULTS = {"results", "report", "atlas", "gltf", "material"}
 TRAINING = {"losses", "config", "command", "capture", "bridge"} | RESULTS | set(COMMANDS)

@@ -103,6 +103,7 @@ def test_a_network_and_its_gradient_are_those_of_torchs_layers(threads):
     x.requires_grad_()
     values = net.evaluate(x), plain(net, x)
     torch.testing.assert_close(*values, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(net.evaluate(x[3, 2]), values[1][3, 2], rtol=1e-12, atol=1e-12)
     found, expected = (torch.autograd.grad((v * weight).sum(), [x, *net.parameters()]) for v in values)
     for a, b in zip(found, expected):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
@@ -120,6 +121,22 @@ def test_flow_in_bfloat16_is_near_the_flow_in_float32():
     # bfloat16 keeps 8 bits: half a per cent of each of the few dozen layers that a point passes, mostly averaging out.
     assert rough.dtype == torch.float32 and not torch.equal(rough, exact)
     assert (rough - exact).norm(dim=1).mean() < 0.02 * moved
+
+
+@pytest.mark.parametrize("network", [ShapeNet, BRDFNet])
+def test_gradients_in_bfloat16_are_near_those_in_float32(network):
+    torch.manual_seed(5)
+    net, (s, _) = network(), Sphere().sample(3)
+
+    def gradients(rough):
+        with torch.autocast("cpu", torch.bfloat16, enabled=rough):
+            y = net.evaluate(s)
+        assert y.dtype == (torch.bfloat16 if rough else torch.float32)
+        return torch.autograd.grad(y.float().sum(), list(net.parameters()))
+
+    for exact, rough in zip(gradients(False), gradients(True)):
+        # Summed in float32: in bfloat16 the 642 points of a bias would be off by more.
+        assert rough.dtype == torch.float32 and (rough - exact).norm() < 0.03 * exact.norm()
 
 
 @pytest.mark.parametrize("seed", range(5))
