@@ -17,6 +17,7 @@ from mi_ring import fit, losses, mlp, shapenet
 import torch
 from torch.nn import functional as F
 
+from mi_ring.brdfnet import BRDFNet
 from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 
@@ -25,15 +26,26 @@ DTYPE = torch.bfloat16 if torch.cpu._is_amx_tile_supported() else torch.float32 
 
 
 def by_autograd(net):
-    """The velocity field of Shape-Net by torch's own layers."""
+    """A network by torch's own layers."""
 
-    def velocity(x):
+    def evaluate(x):
         h = net.encoding(x)
         for layer in net.hidden:
             h = F.leaky_relu(layer(h), SLOPE)
-        return net.speed * torch.tanh(net.output(h).to(x.dtype))
+        return net.output(h)
 
-    return velocity
+    return evaluate
+
+
+def there_and_back(evaluate, s):
+    """Forward and backward pass of a network."""
+
+    def run():
+        with torch.autocast("cpu", torch.bfloat16, enabled=DTYPE is torch.bfloat16):
+            y = evaluate(s)
+        y.backward(torch.ones_like(y))
+
+    return run
 
 
 def flow(net, s, velocity=None):
@@ -96,12 +108,18 @@ def main() -> None:
     torch.manual_seed(0)
     s = Sphere().sample(arguments.level)[0]
     net = shapenet.ShapeNet(arguments.steps)
-    rows = []
+    rows, direction = [], by_autograd(net)
+
+    def velocity(x):
+        return net.speed * torch.tanh(direction(x).to(x.dtype))
 
     def compare(idea, as_it_is, tried, note=""):
         rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
-    compare("flow: gradient by autograd instead of by hand", flow(net, s), flow(net, s, by_autograd(net)))
+    compare("flow: gradient by autograd instead of by hand", flow(net, s), flow(net, s, velocity))
+    brdf_net = BRDFNet()
+    compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s),
+            there_and_back(by_autograd(brdf_net), s))  # fmt: skip
     compare("flow: chunks of 2,048 points instead of 8,192 at most", flow(net, s), chunked(net, s, 2048))
     rows.append(["flow: freed memory returned to the system", f"{1000 * median_seconds(flow(net, s))[0]:.3g}",
                  f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
