@@ -22,7 +22,9 @@ from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 
 SLOPE = mlp.SLOPE
-DTYPE = torch.bfloat16 if torch.cpu._is_amx_tile_supported() else torch.float32  # as in a fit
+AUTOCAST = fit.autocast("auto", torch.device("cpu"))  # as in a fit
+with AUTOCAST():
+    DTYPE = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
 
 
 def by_autograd(net):
@@ -38,23 +40,12 @@ def by_autograd(net):
 
 
 def there_and_back(evaluate, s):
-    """Forward and backward pass of a network."""
+    """Forward and backward pass of a network, or of the flow."""
 
     def run():
-        with torch.autocast("cpu", torch.bfloat16, enabled=DTYPE is torch.bfloat16):
+        with AUTOCAST():
             y = evaluate(s)
         y.backward(torch.ones_like(y))
-
-    return run
-
-
-def flow(net, s, velocity=None):
-    """Forward and backward pass: by hand as in the fit, or by autograd of Euler steps along `velocity`."""
-
-    def run():
-        with torch.autocast("cpu", torch.bfloat16, enabled=DTYPE is torch.bfloat16):
-            x = net(s) if velocity is None else shapenet.euler(velocity, s, 1 / net.steps, net.steps)
-        x.backward(torch.ones_like(x))
 
     return run
 
@@ -64,7 +55,7 @@ def chunked(net, s, points):
 
     def run():
         before, mlp.CHUNK = mlp.CHUNK, points
-        flow(net, s)()
+        there_and_back(net, s)()
         mlp.CHUNK = before
 
     return run
@@ -74,7 +65,7 @@ def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
     fit.set_threads(fit.parse(["scene.xml"]))
     torch.manual_seed(0)
-    return median_seconds(flow(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
+    return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
 
 
 def doubled(x):
@@ -116,12 +107,13 @@ def main() -> None:
     def compare(idea, as_it_is, tried, note=""):
         rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
-    compare("flow: gradient by autograd instead of by hand", flow(net, s), flow(net, s, velocity))
+    compare("flow: gradient by autograd instead of by hand", there_and_back(net, s),
+            there_and_back(lambda x: shapenet.euler(velocity, x, 1 / net.steps, net.steps), s))  # fmt: skip
     brdf_net = BRDFNet()
     compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s),
             there_and_back(by_autograd(brdf_net), s))  # fmt: skip
-    compare("flow: chunks of 2,048 points instead of 8,192 at most", flow(net, s), chunked(net, s, 2048))
-    rows.append(["flow: freed memory returned to the system", f"{1000 * median_seconds(flow(net, s))[0]:.3g}",
+    compare("flow: chunks of 2,048 points instead of 8,192 at most", there_and_back(net, s), chunked(net, s, 2048))
+    rows.append(["flow: freed memory returned to the system", f"{1000 * median_seconds(there_and_back(net, s))[0]:.3g}",
                  f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
 
     encode = PosEnc()

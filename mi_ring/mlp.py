@@ -79,36 +79,44 @@ class _Evaluate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x, encoding, dtype, keep, *parameters):
-        layers = Layers(encoding, dtype, parameters)
+        ctx.layers = layers = Layers(encoding, dtype, parameters)
 
-        @torch.no_grad()
         def ahead(x):
             activations, output = layers.ahead(x, keep)
             return output, activations if keep else None
 
-        parts = chunks(x.detach())
-        ctx.layers, ctx.sizes = layers, [len(part) for part in parts]
-        outputs, ctx.kept = zip(*in_parallel(ahead, parts))
-        return torch.cat(outputs)
+        return ahead_in_chunks(ctx, ahead, x)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
-        @torch.no_grad()
-        def back(gradient, activations):
-            sums = ctx.layers.zeros()
-            return ctx.layers.back(gradient, activations, sums), sums
-
-        gradients, sums = zip(*in_parallel(back, gradient.split(ctx.sizes), ctx.kept))
-        ctx.kept = None
-        return torch.cat(gradients), None, None, None, *(sum(parts) for parts in zip(*sums))
+        gradient, sums = back_in_chunks(ctx, ctx.layers.back, gradient)
+        return gradient, None, None, None, *sums
 
 
-def chunks(x: Tensor):
-    """Points (n, 3) in parts, of which `in_parallel` computes one per thread; a GPU computes all at once."""
-    if x.device.type != "cpu":
-        return [x]
-    return x.split(max(1, min(CHUNK, -(-len(x) // torch.get_num_threads()))))
+def ahead_in_chunks(ctx, ahead, x: Tensor) -> Tensor:
+    """Values at points (n, 3) by `ahead`, which returns those of a chunk and what `back_in_chunks` needs of it.
+
+    Chunks are computed one per thread; a GPU computes all points at once.
+    """
+    size = min(CHUNK, -(-len(x) // torch.get_num_threads())) if x.device.type == "cpu" else len(x)
+    parts = x.detach().split(max(1, size))
+    ctx.sizes = [len(part) for part in parts]
+    values, ctx.kept = zip(*in_parallel(torch.no_grad()(ahead), parts))
+    return torch.cat(values)
+
+
+def back_in_chunks(ctx, back, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Gradients of the points and of the parameters of `ctx.layers`, by `back(gradient, kept, sums)` of each chunk."""
+
+    @torch.no_grad()
+    def run(gradient, kept):
+        sums = ctx.layers.zeros()
+        return back(gradient, kept, sums), sums
+
+    gradients, sums = zip(*in_parallel(run, gradient.split(ctx.sizes), ctx.kept))
+    ctx.kept = None
+    return torch.cat(gradients), [sum(parts) for parts in zip(*sums)]
 
 
 def in_parallel(function, *arguments) -> list:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mi_ring.mlp import MLP, Layers, chunks, in_parallel
+from mi_ring.mlp import MLP, Layers, ahead_in_chunks, back_in_chunks
 
 
 class ShapeNet(MLP):
@@ -52,34 +52,27 @@ class _Flow(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x, dt, steps, speed, encoding, dtype, keep, *parameters):
-        layers = Layers(encoding, dtype, parameters)
+        ctx.layers, ctx.scale = layers, scale = Layers(encoding, dtype, parameters), dt * speed
 
-        @torch.no_grad()
         def flow(x):
             kept = []
             for _ in range(steps):
                 activations, output = layers.ahead(x, keep)
                 direction = torch.tanh(output.to(x.dtype))
-                x = x + dt * speed * direction
+                x = x + scale * direction
                 if keep:
                     kept.append((activations, direction))
             return x, kept
 
-        parts = chunks(x.detach())
-        ctx.layers, ctx.scale, ctx.sizes = layers, dt * speed, [len(part) for part in parts]
-        ends, ctx.kept = zip(*in_parallel(flow, parts))
-        return torch.cat(ends)
+        return ahead_in_chunks(ctx, flow, x)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
-        @torch.no_grad()
-        def back(g, kept):
-            sums = ctx.layers.zeros()
+        def back(g, kept, sums):
             for activations, direction in reversed(kept):
                 g = g + ctx.layers.back(ctx.scale * g * (1 - direction * direction), activations, sums)
-            return g, sums
+            return g
 
-        gradients, sums = zip(*in_parallel(back, gradient.split(ctx.sizes), ctx.kept))
-        ctx.kept = None
-        return torch.cat(gradients), *[None] * 6, *(sum(parts) for parts in zip(*sums))
+        gradient, sums = back_in_chunks(ctx, back, gradient)
+        return gradient, *[None] * 6, *sums
