@@ -52,7 +52,8 @@ class _Flow(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x, dt, steps, speed, encoding, dtype, keep, *parameters):
-        ctx.layers, ctx.scale = layers, scale = Layers(encoding, dtype, parameters), dt * speed
+        ctx.layers = layers = Layers(encoding, dtype, parameters)
+        ctx.scale = scale = dt * speed
 
         def flow(x):
             kept = []
