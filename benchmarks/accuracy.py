@@ -103,6 +103,17 @@ def median_seconds(*functions) -> list[float]:
     return [statistics.median(results[1:]) for results in times]
 
 
+def there_and_back(function, x, autocast):
+    """To be timed: the forward pass of a network, or of the flow, in a context of this kind, and the backward pass."""
+
+    def run():
+        with autocast():
+            y = function(x)
+        y.backward(y.new_ones(y.shape))
+
+    return run
+
+
 def product_speed(rows: int, width: int, dtype) -> float:
     """FLOP/s of (rows, width) @ (width, width)."""
     import torch  # here, for the reason given in watch()

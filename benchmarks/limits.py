@@ -11,7 +11,7 @@ import argparse
 import datetime
 from pathlib import Path
 
-from accuracy import median_seconds, processor, product_speed, table
+from accuracy import median_seconds, processor, product_speed, table, there_and_back
 
 from mi_ring import bridge, capture, fit, integrator
 
@@ -25,17 +25,11 @@ from mi_ring.mlp import SLOPE
 from mi_ring.shapenet import ShapeNet
 
 
-def flow_speed(s, steps: int, dtype) -> tuple[float, float]:
+def flow_speed(s, steps: int, precision: str) -> tuple[float, float]:
     """FLOP/s, and seconds, of forward and backward."""
     net = ShapeNet(steps)
     weights = sum(layer.weight.numel() for layer in [*net.hidden, net.output])
-
-    def run():
-        with torch.autocast("cpu", torch.bfloat16, enabled=dtype is torch.bfloat16):
-            x = net(s)
-        x.backward(torch.ones_like(x))
-
-    t = median_seconds(run)[0]
+    t = median_seconds(there_and_back(net, s, fit.autocast(precision, s.device)))[0]
     return 3 * 2 * weights * steps * len(s) / t, t
 
 
@@ -44,11 +38,12 @@ def flow(level: int, steps: int) -> str:
     s, _ = Sphere().sample(level)
     rows = []
     for dtype in (torch.float32, torch.bfloat16):
+        precision = str(dtype).removeprefix("torch.")
         square, own = product_speed(4096, 4096, dtype), product_speed(len(s), 256, dtype)
-        reached, t = flow_speed(s, steps, dtype)
+        reached, t = flow_speed(s, steps, precision)
         speeds = [f"{speed / 1e9:.0f}" for speed in (square, own, reached)]
         shares = [f"{reached / square:.0%}", f"{reached / own:.0%}"]
-        rows.append([str(dtype).removeprefix("torch."), *speeds, f"{t * 1000:.0f}", *shares])
+        rows.append([precision, *speeds, f"{t * 1000:.0f}", *shares])
     heads = ["precision", "4096³, GFLOP/s", "V × 256 × 256, GFLOP/s", "flow, GFLOP/s", "flow, ms"]
     return f"{len(s):,} vertices, {steps} steps:\n\n" + table([*heads, "of 4096³", "of V × 256 × 256"], rows)
 

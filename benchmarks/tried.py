@@ -9,7 +9,7 @@ import argparse
 import datetime
 import time
 
-from accuracy import alone, median_seconds, processor, table
+from accuracy import alone, median_seconds, processor, table, there_and_back
 
 from mi_ring import fit, losses, mlp, shapenet
 
@@ -39,23 +39,12 @@ def by_autograd(net):
     return evaluate
 
 
-def there_and_back(evaluate, s):
-    """Forward and backward pass of a network, or of the flow."""
-
-    def run():
-        with AUTOCAST():
-            y = evaluate(s)
-        y.backward(torch.ones_like(y))
-
-    return run
-
-
 def chunked(net, s, points):
     """The flow in chunks of another size."""
 
     def run():
         before, mlp.CHUNK = mlp.CHUNK, points
-        there_and_back(net, s)()
+        there_and_back(net, s, AUTOCAST)()
         mlp.CHUNK = before
 
     return run
@@ -65,7 +54,7 @@ def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
     fit.set_threads(fit.parse(["scene.xml"]))
     torch.manual_seed(0)
-    return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0]))[0]
+    return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0], AUTOCAST))[0]
 
 
 def doubled(x):
@@ -107,14 +96,16 @@ def main() -> None:
     def compare(idea, as_it_is, tried, note=""):
         rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
-    compare("flow: gradient by autograd instead of by hand", there_and_back(net, s),
-            there_and_back(lambda x: shapenet.euler(velocity, x, 1 / net.steps, net.steps), s))  # fmt: skip
+    compare("flow: gradient by autograd instead of by hand", there_and_back(net, s, AUTOCAST),
+            there_and_back(lambda x: shapenet.euler(velocity, x, 1 / net.steps, net.steps), s, AUTOCAST))  # fmt: skip
     brdf_net = BRDFNet()
-    compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s),
-            there_and_back(by_autograd(brdf_net), s))  # fmt: skip
-    compare("flow: chunks of 2,048 points instead of 8,192 at most", there_and_back(net, s), chunked(net, s, 2048))
-    rows.append(["flow: freed memory returned to the system", f"{1000 * median_seconds(there_and_back(net, s))[0]:.3g}",
-                 f"{1000 * returned:.3g}", "one after the other, not in turn"])  # fmt: skip
+    compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s, AUTOCAST),
+            there_and_back(by_autograd(brdf_net), s, AUTOCAST))  # fmt: skip
+    compare("flow: chunks of 2,048 points instead of 8,192 at most", there_and_back(net, s, AUTOCAST),
+            chunked(net, s, 2048))  # fmt: skip
+    kept = median_seconds(there_and_back(net, s, AUTOCAST))[0]
+    rows.append(["flow: freed memory returned to the system", f"{1000 * kept:.3g}", f"{1000 * returned:.3g}",
+                 "one after the other, not in turn"])  # fmt: skip
 
     encode = PosEnc()
 

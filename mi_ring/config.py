@@ -164,7 +164,7 @@ class Config:
 
 PRESETS = {
     "fast": {
-        "iterations": 150, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "iterations": 130, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},
