@@ -6,14 +6,14 @@ A capture is a scene file or a folder with a scene.xml. For each, and seed, the 
 fit time, then a table of the paper's columns and one of where the time went; the worst of several seeds, column by
 column, is a line of its own. The truth of SCENE.xml is in truth/mesh.ply beside it, and that of novel views in
 truth/scene.xml, or both in <scene name>/truth/ or where --truth says. Each fit is a process of its own. Fit time is the
-iterations' alone; wall time and peak memory are the whole process's, start-up and report included; the time of the
-evaluations for the curve is taken off, their memory is not. GFLOP/s is the speed of float32 products of 4096³ right
-after the fit: what the machine could do then.
+iterations' alone; wall time and peak memory are the whole process's, start-up and report included. GFLOP/s is the speed
+of float32 products of 4096³ right after the fit: what the machine could do then.
 """
 
 import argparse
 import collections
 import contextlib
+import copy
 import datetime
 import functools
 import json
@@ -134,38 +134,33 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     import numpy as np
     import torch
 
-    curve, apart = [], 0.0
+    course, running = [], None
 
     class Watched(fit.Fit):
         def step(self):
-            nonlocal apart
-            before = dict(seconds)
+            nonlocal running
+            running, before = self, dict(seconds)
             terms = super().step()
             parts.update({part: seconds[part] - before[part] for part in seconds})
-            if self.iteration * points // self.iterations > len(curve):
-                paused = time.perf_counter()
-                curve.append((self.seconds, self.error()))
-                apart += time.perf_counter() - paused
+            if self.iteration * points // self.iterations > len(course):
+                course.append((self.seconds, copy.deepcopy(self.ring.state_dict())))
             return terms
-
-        @functools.cached_property
-        def truth(self):
-            return evaluate.load_mesh(truth / "mesh.ply")
-
-        def error(self):
-            s, faces = self.ring.domain.sample(self.config.subdivisions)
-            with torch.no_grad():
-                vertices = self.ring.surface(s.to(self.device)).cpu().numpy()
-            mesh, scene = self.truth
-            guess = evaluate.scene_of(vertices, faces)
-            diagonal = np.linalg.norm(mesh.extents)
-            return evaluate.compare_surfaces(self.capture, guess, scene, diagonal)[0]["normal_mean"]
 
     fit.Fit = Watched
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
         fit.main(arguments)
-    wall = time.perf_counter() - started - apart
+    wall = time.perf_counter() - started
     memory, speed = peak_memory(), product_speed(4096, 4096, torch.float32)
+
+    (mesh, true), ring = evaluate.load_mesh(truth / "mesh.ply"), running.ring
+    diagonal = np.linalg.norm(mesh.extents)
+    s, faces = ring.domain.sample(running.config.subdivisions)
+    curve = []
+    for at, state in course:
+        ring.load_state_dict(state)
+        with torch.no_grad():
+            guess = evaluate.scene_of(ring.surface(s.to(running.device)).cpu().numpy(), faces)
+        curve.append((at, evaluate.compare_surfaces(running.capture, guess, true, diagonal)[0]["normal_mean"]))
     return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": memory, "speed": speed}
 
 
@@ -181,7 +176,7 @@ def measure(scene: Path, out: Path, options: list[str], truth: Path, points: int
     evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply")]
     if (novel := truth / "scene.xml").is_file():
         evaluate += ["--novel", str(novel)]
-    numbers = json.loads(subprocess.run(evaluate, check=True, capture_output=True, text=True).stdout)
+    numbers = json.loads(subprocess.run(evaluate, check=True, stdout=subprocess.PIPE, text=True).stdout)
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     return {"psnr_novel": math.nan} | numbers | watched | {"fit_seconds": log[-1]["seconds"]}
 

@@ -16,10 +16,10 @@ from accuracy import measure, processor, scene_file, table, truth_of
 from mi_ring.command import name_of
 
 CHOICES = [
-    "", "--seed 1", "--seed 2", "--velocity-decay 1", "--velocity-decay 0.003", "--weights.velocity 0.001",
-    "--steps 3", "--steps 8", "--steps 20", "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3",
-    "--loss l2", "--loss log", "--batch 4", "--batch 16", "--spp 4", "--blur 0", "--precision float32",
-    "--precision bfloat16", "--no-indirect",
+    "", "--seed 1", "--seed 2", "--velocity-decay 0.03", "--weights.velocity 0.001", "--steps 3", "--steps 8",
+    "--steps 20", "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3", "--decay 0.03",
+    "--loss l2", "--loss log", "--batch 4", "--batch 16", "--spp 4", "--blur 0", "--precision bfloat16",
+    "--no-indirect", "--domain sphere",
 ]  # fmt: skip
 
 

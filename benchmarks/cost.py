@@ -3,9 +3,10 @@
     python benchmarks/cost.py [SCENE.xml]
 
 One setting at a time is varied about those of the first line: level of the sphere (four times the vertices each), width
-of the photographs, photographs per iteration, steps of the flow, photographs of the scene (its own, again and again);
-the last lines are the last stage of the default preset. Each line is a process of its own; seconds of an iteration are
-the median of some. Photographs are as large as the scene has them, at most: that of the default has 256 pixels.
+of the photographs, photographs per iteration, steps of the flow, samples per pixel, photographs of the scene (its own,
+again and again); the last lines are the last stage of the default preset, and the stages of `--preset paper` in size.
+Each line is a process of its own; seconds of an iteration are the median of some. Photographs are as large as the scene
+has them, at most: that of the default has 256 pixels.
 """
 
 import argparse
@@ -19,8 +20,11 @@ from pathlib import Path
 
 from accuracy import alone, peak_memory, processor, table, watch
 
+from mi_ring.config import Config
+
 VARIED = {
-    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (3, 10, 20), "photographs": (500, 2000),
+    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (3, 10, 20), "spp": (4,),
+    "photographs": (500, 2000),
 }  # fmt: skip
 WARM_UP, ITERATIONS = 3, 7
 
@@ -42,18 +46,20 @@ def repeated(scene: Path, photographs: int, folder: Path) -> Path:
     return folder / scene.name
 
 
-def iterations(scene: Path, level: int, width: int, batch: int, steps: int) -> dict:
+def iterations(scene: Path, level: int, width: int, batch: int, steps: int, spp: int) -> dict:
     """Median seconds of an iteration and of its parts, seconds until the first, peak memory [GiB]."""
     seconds = watch()
     from mi_ring import capture, fit
 
-    settings = {"levels": level, "widths": width, "shares": 1, "batch": batch, "steps": steps}
+    settings = {"levels": level, "widths": width, "shares": 1, "batch": batch, "steps": steps, "spp": spp}
     config = fit.parse([str(scene), *(word for name, v in settings.items() for word in (f"--{name}", str(v)))])
     fit.set_threads(config)
     fit.keep_memory()
     started = time.perf_counter()
     running = fit.Fit(capture.load(scene), config)
     loading, times, parts = time.perf_counter() - started, [], []
+    for k, sensor in enumerate(running.capture.sensors):  # as later in a fit, where what is decoded is remembered
+        running.capture.observe([k], -(-sensor.size[0] // width))
     for _ in range(WARM_UP + ITERATIONS):
         started, already = time.perf_counter(), dict(seconds)
         running.step()
@@ -69,9 +75,10 @@ def main() -> None:
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     scene = parser.parse_args().scene
     own = len(ElementTree.parse(scene).findall("sensor"))
-    base = {"level": 5, "width": 256, "batch": 8, "steps": 5, "photographs": own}
+    base = {"level": 5, "width": 256, "batch": Config.batch, "steps": Config.steps, "spp": 1, "photographs": own}
     settings = [base] + [base | {name: value} for name, values in VARIED.items() for value in values]
     settings += [base | {"level": 6, "width": 512, "photographs": value} for value in (own, 2000)]
+    settings += [base | {"level": level, "width": 512, "steps": 20, "spp": 4} for level in (5, 6)]
     rows = []
     for setting in settings:
         named = [f"**{v}**" if v != base[name] else str(v) for name, v in setting.items()]
@@ -83,7 +90,7 @@ def main() -> None:
         spent = [f"{1000 * s:.0f}" for s in (*parts.values(), total - sum(parts.values()), total)]
         rows.append([*named, *spent, f"{measured['loading']:.1f}", f"{measured['peak']:.2f}"])
     print(f"{processor()}; {datetime.date.today()}; {scene}\n")
-    heads = ["level (vertices)", "width px", "photographs at once", "T", "photographs in all"]
+    heads = ["level (vertices)", "width px", "photographs at once", "T", "spp", "photographs in all"]
     heads += [*(f"{part}, ms" for part in parts), "rest, ms", "iteration, ms", "loading, s", "GiB at most"]
     print(table(heads, rows))
 

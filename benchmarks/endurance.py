@@ -16,11 +16,9 @@ from mi_ring import bridge  # before Mitsuba, for it chooses LLVM
 # isort: split
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import torch
 from accuracy import processor
 from render import METHODS, Scene
-from scipy.spatial.transform import Rotation
 
 from mi_ring.domain import Sphere
 
@@ -38,14 +36,13 @@ def main() -> None:
     print(f"{processor()}; {datetime.date.today()}\n")
     scene = Scene(METHODS["`photometric`"])
     surface = bridge.Surface(scene.scene, next(s for s in scene.scene.shapes() if s.is_mesh()))
-    domain, random = Sphere(), np.random.default_rng(0)
+    domain, random = Sphere(), torch.Generator().manual_seed(0)
     weights = torch.from_numpy(scene.weights).permute(0, 2, 3, 1)
     surface.set_faces(domain.sample(5)[1])
     compiled = 0
     print("| iteration | memory held, MiB | kernels compiled so far |\n|---|---|---|")
     for iteration in range(1, options.iterations + 1):
-        turn = Rotation.random(random_state=random).as_matrix()
-        s, _ = domain.sample(5, torch.as_tensor(turn, dtype=torch.float32))
+        s, _ = domain.sample(5, random)
         x, y, z = s.T
         radius = 1 + 0.1 * torch.sin(4 * x + 0.01 * iteration) * torch.cos(3 * y) + 0.08 * torch.cos(5 * z + x)
         material = {"diffuse": 0.3 + 0.1 * s, "specular": 0.05 + 0.01 * y, "roughness": 0.35 + 0.1 * z}

@@ -20,6 +20,7 @@ import drjit as dr
 import torch
 from torch.nn import functional as F
 
+from mi_ring.config import Config
 from mi_ring.domain import Sphere
 from mi_ring.mlp import SLOPE
 from mi_ring.shapenet import ShapeNet
@@ -113,7 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     parser.add_argument("--level", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
     fit.set_threads(fit.parse([str(arguments.scene)]))
     fit.keep_memory()

@@ -18,6 +18,7 @@ import torch
 from torch.nn import functional as F
 
 from mi_ring.brdfnet import BRDFNet
+from mi_ring.config import Config
 from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 
@@ -80,7 +81,7 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--level", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
     returned = alone(with_returned_memory, arguments.level, arguments.steps)
     fit.set_threads(fit.parse(["scene.xml"]))
@@ -90,14 +91,16 @@ def main() -> None:
     net = shapenet.ShapeNet(arguments.steps)
     rows, direction = [], by_autograd(net)
 
-    def velocity(x):
-        return net.speed * torch.tanh(direction(x).to(x.dtype))
+    def euler(x):
+        for _ in range(net.steps):
+            x = x + shapenet.SPEED / net.steps * torch.tanh(direction(x).to(x.dtype))
+        return x
 
     def compare(idea, as_it_is, tried, note=""):
         rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
     compare("flow: gradient by autograd instead of by hand", there_and_back(net, s, AUTOCAST),
-            there_and_back(lambda x: shapenet.euler(velocity, x, 1 / net.steps, net.steps), s, AUTOCAST))  # fmt: skip
+            there_and_back(euler, s, AUTOCAST))  # fmt: skip
     brdf_net = BRDFNet()
     compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s, AUTOCAST),
             there_and_back(by_autograd(brdf_net), s, AUTOCAST))  # fmt: skip

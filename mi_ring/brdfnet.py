@@ -37,12 +37,9 @@ class BRDFNet(MLP):
     an upper end above its lower one, a sigmoid the others in their ranges.
     """
 
-    def __init__(
-        self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE, width: int = 256,
-        frequencies: int = 16,
-    ):  # fmt: skip
+    def __init__(self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE):
         parameters = tuple(Parameter(*p) for p in parameters)
-        super().__init__(depth=5, outputs=sum(p.channels for p in parameters), width=width, frequencies=frequencies)
+        super().__init__(depth=5, outputs=sum(p.channels for p in parameters))
         self.bsdf_parameters = parameters
         self.register_buffer("scale", torch.tensor(float(scale)))
 

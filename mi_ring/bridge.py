@@ -49,9 +49,7 @@ class Surface:
             check_attributes(shape)
         self.scene = scene
         self.params = mi.traverse(scene)
-        self.prefix = next(
-            name.removesuffix(POSITIONS) for name, _ in self.params if name == f"{shape.id()}.{POSITIONS}"
-        )
+        self.prefix = f"{shape.id()}."
         self.faces, self.edges = None, None
         self.written = 0
 

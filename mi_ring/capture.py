@@ -16,10 +16,11 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from mi_ring import mesh, photograph
+from mi_ring.bsdf import check_attributes
 from mi_ring.edges import Edges
 from mi_ring.errors import InputError
 from mi_ring.hull import Hull, NoParallax, Silhouette, evenly, nearest_point
-from mi_ring.integrator import Photographs, check_attributes
+from mi_ring.integrator import Photographs
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23

@@ -12,8 +12,8 @@ from tyro.conf import Positional, arg
 from mi_ring.command import name_of
 from mi_ring.errors import InputError
 
-HEAD_START = 2 / 3  #: share of the first stage that starts near the object do without
-EXCHANGE = 0.4  #: iterations of the second stage that take about as long as one of the first, of the presets
+HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
+EXCHANGE = 0.4  #: iterations of the second stage that it gets for each; by the presets they take about as long
 
 
 class Stage(NamedTuple):
@@ -173,6 +173,6 @@ PRESETS = {
         "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
-        "precision": "float32", "domain": "sphere", "masks": "given",
+        "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
     },
 }  # fmt: skip

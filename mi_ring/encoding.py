@@ -22,7 +22,7 @@ class PosEnc(nn.Module):
         phase = (x[..., None, :] * omega[:, None]).flatten(-2)
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
-    def back(self, features: Tensor, gradient: Tensor) -> Tensor:
+    def backward(self, features: Tensor, gradient: Tensor) -> Tensor:
         """From the gradient of the features (n, 6 · frequencies) to that of the points (n, 3), in float32 at least."""
         (cosine, sine), (by_cosine, by_sine) = features.chunk(2, dim=1), gradient.chunk(2, dim=1)
         dtype = torch.promote_types(features.dtype, torch.float32)

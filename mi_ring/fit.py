@@ -84,6 +84,7 @@ class Fit:
         net = self.ring.shape_net
         with torch.no_grad(), self.autocast():
             x = net.flow(s[chosen], steps)
+        # The velocity in float32 always: its second differences would drown in bfloat16.
         return losses.velocity_loss(net.velocity, x, self.config.laplacian_scale)
 
     def step(self) -> dict[str, float]:
@@ -111,7 +112,7 @@ class Fit:
 
         terms = {"rgb": losses.rgb_loss(predicted, observed, clipped, self.exposure, config.loss)}
         if masked.any() and config.weights.get("mask"):
-            sigma = config.blur * (1 - 1.25 * progress) * size[0] / scale
+            sigma = config.blur * (1 - progress / 0.8) * size[0] / scale  # a pixel for the last fifth
             if self.capture.threshold is not None:  # of the object, such masks show what is bright
                 lit = torch.maximum(observed, predicted.detach()).amax(-1) > self.capture.threshold
                 coverage = torch.where(lit, coverage, 0)
@@ -126,11 +127,13 @@ class Fit:
         with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
             loss.backward()
         clip = torch.nn.utils.clip_grad_norm_
+        # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
         healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
         self.failures = 0 if healthy else self.failures + 1
         if self.failures >= 10:
-            raise InputError(f"{config.scene}: diverged at iteration {self.iteration}; try a lower --muon-rate")
+            rate = "--muon-rate" if config.optimizer == "muon" else "--learning-rate"
+            raise InputError(f"{config.scene}: diverged at iteration {self.iteration}; try a lower {rate}")
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * config.decay**progress

@@ -9,19 +9,20 @@ from torch.nn import functional as F
 
 from mi_ring.encoding import PosEnc
 
+WIDTH = 256  #: of the hidden layers
 SLOPE = 0.01  #: of the leaky ReLU
 CHUNK = 8192  #: points that a thread computes at once, at most
 
 
 class MLP(nn.Module):
-    """`outputs` functions of a point: its encoding, `depth` hidden layers of `width` leaky ReLUs, a linear layer."""
+    """`outputs` functions of a point: its encoding, `depth` hidden layers of leaky ReLUs, a linear layer."""
 
-    def __init__(self, depth: int, outputs: int, width: int, frequencies: int):
+    def __init__(self, depth: int, outputs: int):
         super().__init__()
-        self.encoding = PosEnc(frequencies)
-        sizes = [self.encoding.width] + [width] * depth
+        self.encoding = PosEnc()
+        sizes = [self.encoding.width] + [WIDTH] * depth
         self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:]))
-        self.output = nn.Linear(width, outputs)
+        self.output = nn.Linear(WIDTH, outputs)
 
     def evaluate(self, x: Tensor) -> Tensor:
         """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
@@ -42,13 +43,13 @@ class MLP(nn.Module):
 
 
 class Layers:
-    """An MLP's weights and biases in the precision of the products: values by `ahead`, gradients by `back`."""
+    """An MLP's weights and biases in the precision of the products: values by `forward`, gradients by `backward`."""
 
     def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters):
         self.encoding, self.dtype = encoding, dtype
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
-    def ahead(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
+    def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
         """Encoding and activations of the hidden layers, only the last unless `keep`, and output of points (n, 3)."""
         activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
@@ -62,7 +63,7 @@ class Layers:
         dtype = torch.promote_types(self.dtype, torch.float32)
         return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
-    def back(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
+    def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
         """From the gradient of the output to that of the points; those of the parameters are added to `sums`."""
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):
@@ -71,7 +72,7 @@ class Layers:
             gradient = gradient @ self.weights[k]
             if k:
                 gradient = torch.ops.aten.leaky_relu_backward(gradient, activations[k], SLOPE, True)
-        return self.encoding.back(activations[0], gradient)
+        return self.encoding.backward(activations[0], gradient)
 
 
 class _Evaluate(torch.autograd.Function):
@@ -80,39 +81,44 @@ class _Evaluate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, encoding, dtype, keep, *parameters):
         ctx.layers = layers = Layers(encoding, dtype, parameters)
+        ctx.save_for_backward(*parameters)
 
-        def ahead(x):
-            activations, output = layers.ahead(x, keep)
+        def forward(x):
+            activations, output = layers.forward(x, keep)
             return output, activations if keep else None
 
-        return ahead_in_chunks(ctx, ahead, x)
+        return forward_in_chunks(ctx, forward, x)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
-        gradient, sums = back_in_chunks(ctx, ctx.layers.back, gradient)
+        gradient, sums = backward_in_chunks(ctx, ctx.layers.backward, gradient)
         return gradient, None, None, None, *sums
 
 
-def ahead_in_chunks(ctx, ahead, x: Tensor) -> Tensor:
-    """Values at points (n, 3) by `ahead`, which returns those of a chunk and what `back_in_chunks` needs of it.
+def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
+    """Values at points (n, 3) by `forward`, which returns those of a chunk and what the way back needs of it.
 
     Chunks are computed one per thread; a GPU computes all points at once.
     """
     size = min(CHUNK, -(-len(x) // torch.get_num_threads())) if x.device.type == "cpu" else len(x)
     parts = x.detach().split(max(1, size))
     ctx.sizes = [len(part) for part in parts]
-    values, ctx.kept = zip(*in_parallel(torch.no_grad()(ahead), parts))
+    values, ctx.kept = zip(*in_parallel(torch.no_grad()(forward), parts))
     return torch.cat(values)
 
 
-def back_in_chunks(ctx, back, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Gradients of the points and of the parameters of `ctx.layers`, by `back(gradient, kept, sums)` of each chunk."""
+def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Gradients of the points and of the parameters of `ctx.layers`, by `backward(gradient, kept, sums)` of each chunk.
+
+    Raises RuntimeError if the parameters were changed since, and the second time.
+    """
+    _ = ctx.saved_tensors  # torch's own checks: the layers may share the parameters' memory
 
     @torch.no_grad()
     def run(gradient, kept):
         sums = ctx.layers.zeros()
-        return back(gradient, kept, sums), sums
+        return backward(gradient, kept, sums), sums
 
     gradients, sums = zip(*in_parallel(run, gradient.split(ctx.sizes), ctx.kept))
     ctx.kept = None

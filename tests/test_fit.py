@@ -54,7 +54,30 @@ def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
     for entry in log:
         weights = config.weights_at((entry["iteration"] - 1) / 90)
         assert entry["loss"] == pytest.approx(sum(w * entry[term] for term, w in weights.items()), rel=1e-4)
+        assert entry["learning_rate"] == pytest.approx(3e-3 * 0.1 ** ((entry["iteration"] - 1) / 90))
     assert log[-1]["iteration"] == 90
+
+
+def test_muon_has_the_hidden_weights_and_adam_all_the_others():
+    ring = Ring([0, 0, 0], 1.0)
+    adam, muon = fit.optimizers(ring, Config("scene.xml"))
+    assert isinstance(adam, torch.optim.Adam) and isinstance(muon, torch.optim.Muon)
+    ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))
+    assert [tuple(p.shape) for p in ours] == 2 * [(256, 96), (256, 256), (256, 256)] + 2 * [(256, 256)]
+    assert sorted(map(id, ours + theirs)) == sorted(map(id, ring.parameters()))
+    (alone,) = fit.optimizers(ring, Config("scene.xml", optimizer="adam"))
+    assert len(alone.param_groups[0]["params"]) == len(list(ring.parameters()))
+
+
+def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
+    s, _ = Sphere().sample(3)
+
+    def value(precision):
+        running = fit.Fit(fit.capture.load(small_capture), fit.parse([str(small_capture), "--precision", precision]))
+        running.ring.shape_net.output.weight.data.mul_(30)
+        return running.regulariser(s).item()
+
+    assert value("bfloat16") == pytest.approx(value("float32"), rel=0.01)
 
 
 def test_steps_of_the_flow_are_part_of_the_result(finished):
@@ -467,7 +490,7 @@ def test_paper_preset_is_the_papers():
     assert config.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.01} and config.loss == "l2"
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
     assert config.levels == (5, 6) and [s.last - s.first for s in config.stages()] == [2000, 4000]
-    assert config.precision == "float32" and config.steps == 20
+    assert config.precision == "float32" and config.steps == 20 and not config.shadows and not config.indirect
     assert config.weights_at(0) == config.weights_at(1) == config.weights
 
 

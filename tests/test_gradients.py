@@ -3,6 +3,7 @@
 `benchmarks/gradients.py` holds the whole table; here every row and column of it occurs, at smaller cost.
 """
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -133,3 +134,9 @@ def test_stock_sensors_are_refused():
     with pytest.raises(Exception) as caught:
         dr.backward(dr.sum(image, axis=None))
     assert "gradients need an RGB variant and a photograph sensor" in str(caught.value) + str(caught.value.__cause__)
+
+
+def test_the_benchmark_of_endurance_runs():
+    script = Path(__file__).parents[1] / "benchmarks" / "endurance.py"
+    printed = subprocess.run([sys.executable, script, "--iterations", "1"], check=True, capture_output=True, text=True)
+    assert "\n| 1 | " in printed.stdout

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.linalg import expm
+from scipy.integrate import solve_ivp
 from torch.nn import functional as F
 
 from mi_ring import mlp
@@ -13,7 +13,7 @@ from mi_ring.brdfnet import BRDFNet, Parameter
 from mi_ring.domain import Sphere
 from mi_ring.encoding import PosEnc
 from mi_ring.ring import Ring
-from mi_ring.shapenet import ShapeNet, euler
+from mi_ring.shapenet import SPEED, ShapeNet
 
 
 def neurons(net):
@@ -44,15 +44,22 @@ def test_encoding_is_its_formula():
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
 
 
-def test_flow_of_a_linear_field_converges_to_the_matrix_exponential_at_eulers_rate():
-    a = torch.tensor([[0.2, -0.9, 0.1], [0.8, -0.3, 0.4], [0.0, 0.5, 0.6]], dtype=torch.float64)
+def test_flow_converges_to_the_solution_of_its_differential_equation_at_eulers_rate():
+    torch.manual_seed(3)
+    net = ShapeNet().double()
+    net.output.weight.data.mul_(400)
     x = torch.tensor([[1.0, 0.2, -0.5], [-0.3, 0.8, 0.9]], dtype=torch.float64)
-    exact = x @ torch.from_numpy(expm(a.numpy())).T
-    errors = [(euler(lambda p: p @ a.T, x, 1 / steps, steps) - exact).norm() for steps in (20, 40, 80, 160)]
-    ratios = [float(before / after) for before, after in zip(errors, errors[1:])]
-    # First order: half the step, half the error; the deviation from 2 is itself of first order in the step.
-    assert ratios == pytest.approx([2, 2, 2], abs=0.12)
-    assert abs(ratios[2] - 2) < abs(ratios[0] - 2)
+
+    def velocity(time, point):
+        return 2 * plain(net, torch.from_numpy(point)).tanh().detach().numpy()
+
+    ends = [solve_ivp(velocity, (0, 1), point, method="DOP853", rtol=1e-10, atol=1e-10).y[:, -1] for point in x.numpy()]
+    exact, errors = torch.from_numpy(np.array(ends)), []
+    for net.steps in (40, 80, 160, 320):
+        errors.append((net(x) - exact).norm().item())
+    assert (exact - x).norm(dim=1).min() > 0.2
+    ratios = [before / after for before, after in zip(errors, errors[1:])]
+    assert ratios == pytest.approx([2, 2, 2], abs=0.12)  # first order: half the step, half the error
 
 
 def test_shape_net_takes_its_euler_steps_through_its_velocity():
@@ -90,7 +97,9 @@ def test_gradient_of_the_flow_is_that_of_plain_euler_steps(threads):
     x, weight = torch.randn(2, 45, 3, dtype=torch.float64)
     x.requires_grad_()
     found = torch.autograd.grad((net(x) * weight).sum(), [x, *net.parameters()])
-    way = euler(lambda p: net.speed * torch.tanh(plain(net, p)), x, 1 / 7, 7)
+    way = x
+    for _ in range(7):
+        way = way + SPEED * torch.tanh(plain(net, way)) / 7
     expected = torch.autograd.grad((way * weight).sum(), [x, *net.parameters()])
     for a, b in zip(found, expected):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
@@ -135,8 +144,30 @@ def test_gradients_in_bfloat16_are_near_those_in_float32(network):
         return torch.autograd.grad(y.float().sum(), list(net.parameters()))
 
     for exact, rough in zip(gradients(False), gradients(True)):
-        # Summed in float32: in bfloat16 the 642 points of a bias would be off by more.
         assert rough.dtype == torch.float32 and (rough - exact).norm() < 0.03 * exact.norm()
+
+
+@pytest.mark.parametrize("network", [ShapeNet, BRDFNet])
+def test_gradients_in_bfloat16_are_summed_in_float32(network, threads):
+    net, (s, _) = network(), Sphere().sample(3)
+    with torch.autocast("cpu", torch.bfloat16):
+        y = net.evaluate(s)
+    (gradient,) = torch.autograd.grad(y.float().sum(), [net.output.bias])
+    assert (gradient == 642).all()  # one each; in bfloat16 one cannot count beyond 256
+
+
+@pytest.mark.parametrize("evaluate", [lambda net, x: net(x), lambda net, x: net.evaluate(x)], ids=["flow", "mlp"])
+def test_a_way_back_that_would_be_wrong_is_an_error(evaluate):
+    net, x = ShapeNet(steps=2), torch.randn(5, 3)
+    once = evaluate(net, x).sum()
+    once.backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        once.backward()
+    changed = evaluate(net, x).sum()
+    with torch.no_grad():
+        net.hidden[1].weight.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        changed.backward()
 
 
 @pytest.mark.parametrize("seed", range(5))

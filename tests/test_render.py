@@ -18,6 +18,7 @@ from mi_ring.errors import InputError
 from mi_ring.integrator import Photographs
 from mi_ring.photograph import Flash
 from mi_ring.ring import Ring
+from mi_ring.shapenet import SPEED
 
 CENTER, RADIUS, SHIFT = np.array([400.0, -150.0, 90.0]), 20.0, np.array([0.3, -0.5, 0.2])
 MIDDLE = CENTER + RADIUS * SHIFT  #: of the sphere, when the flow has carried it there
@@ -38,7 +39,7 @@ def sphere(shift=SHIFT, **material):
     """A matte sphere that the flow moves as a whole, by `shift` times its radius."""
     ring = Ring(CENTER, RADIUS, steps=8, subdivisions=4)
     ring.shape_net.output.weight.data.zero_()
-    ring.shape_net.output.bias.data.copy_(torch.atanh(torch.tensor(shift) / ring.shape_net.speed))
+    ring.shape_net.output.bias.data.copy_(torch.atanh(torch.tensor(shift) / SPEED))
     set_material(ring, **{"diffuse": ALBEDO / np.pi} | material)
     return ring
 
