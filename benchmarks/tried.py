@@ -9,7 +9,7 @@ import argparse
 import datetime
 import time
 
-from accuracy import alone, median_seconds, processor, table, there_and_back
+from accuracy import alone, median_seconds, peak_memory, processor, table, there_and_back
 
 from mi_ring import fit, losses, mlp, shapenet
 
@@ -38,6 +38,28 @@ def by_autograd(net):
         return net.output(h)
 
     return evaluate
+
+
+def euler_by_autograd(net):
+    """The flow by torch's own layers."""
+    direction = by_autograd(net)
+
+    def flow(x):
+        for _ in range(net.steps):
+            x = x + shapenet.SPEED / net.steps * torch.tanh(direction(x).to(x.dtype))
+        return x
+
+    return flow
+
+
+def flow_memory(by_hand: bool, level: int, steps: int) -> float:
+    """GiB that forward and backward pass of the flow take."""
+    fit.set_threads(fit.parse(["scene.xml"]))
+    net, (s, _) = shapenet.ShapeNet(steps), Sphere().sample(level)
+    there_and_back(net, s[:100], AUTOCAST)()  # what is needed for the first time only
+    before = peak_memory()
+    there_and_back(net if by_hand else euler_by_autograd(net), s, AUTOCAST)()
+    return peak_memory() - before
 
 
 def chunked(net, s, points):
@@ -84,23 +106,19 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
     returned = alone(with_returned_memory, arguments.level, arguments.steps)
+    memory = [alone(flow_memory, by_hand, arguments.level, arguments.steps) for by_hand in (True, False)]
     fit.set_threads(fit.parse(["scene.xml"]))
     fit.keep_memory()
     torch.manual_seed(0)
     s = Sphere().sample(arguments.level)[0]
     net = shapenet.ShapeNet(arguments.steps)
-    rows, direction = [], by_autograd(net)
-
-    def euler(x):
-        for _ in range(net.steps):
-            x = x + shapenet.SPEED / net.steps * torch.tanh(direction(x).to(x.dtype))
-        return x
+    rows = []
 
     def compare(idea, as_it_is, tried, note=""):
         rows.append([idea, *(f"{1000 * t:.3g}" for t in median_seconds(as_it_is, tried)), note])
 
     compare("flow: gradient by autograd instead of by hand", there_and_back(net, s, AUTOCAST),
-            there_and_back(euler, s, AUTOCAST))  # fmt: skip
+            there_and_back(euler_by_autograd(net), s, AUTOCAST))  # fmt: skip
     brdf_net = BRDFNet()
     compare("BRDF-Net: gradient by autograd instead of by hand", there_and_back(brdf_net.evaluate, s, AUTOCAST),
             there_and_back(by_autograd(brdf_net), s, AUTOCAST))  # fmt: skip
@@ -138,6 +156,7 @@ def main() -> None:
     print(f"{processor()}; {datetime.date.today()}; {len(s):,} vertices, {arguments.steps} steps, {DTYPE}, "
           f"{torch.get_num_threads()} threads\n")  # fmt: skip
     print(table(["tried", "as it is, ms", "tried, ms", ""], rows))
+    print("\nMemory of the flow, gradient by hand: {:.2f} GiB, by autograd: {:.2f} GiB".format(*memory))
 
 
 if __name__ == "__main__":
