@@ -45,8 +45,9 @@ def flow(level: int, steps: int) -> str:
         speeds = [f"{speed / 1e9:.0f}" for speed in (square, own, reached)]
         shares = [f"{reached / square:.0%}", f"{reached / own:.0%}"]
         rows.append([precision, *speeds, f"{t * 1000:.0f}", *shares])
-    heads = ["precision", "4096³, GFLOP/s", "V × 256 × 256, GFLOP/s", "flow, GFLOP/s", "flow, ms"]
-    return f"{len(s):,} vertices, {steps} steps:\n\n" + table([*heads, "of 4096³", "of V × 256 × 256"], rows)
+    heads = ["precision", "large products, GFLOP/s", "a hidden layer's product, GFLOP/s", "flow, GFLOP/s", "flow, ms",
+             "of large products", "of a hidden layer's"]  # fmt: skip
+    return f"{len(s):,} vertices, {steps} steps:\n\n" + table(heads, rows)
 
 
 def layer(level: int) -> str:
@@ -66,8 +67,8 @@ def layer(level: int) -> str:
     times = dict(zip(parts, median_seconds(*parts.values())))
     plain, *others = times.values()
     lines = [[name, f"{1000 * t:.2f}"] for name, t in times.items()]
-    lines.append(["all but the first", f"{1000 * sum(others):.2f}"])
-    lines.append(["three plain products, of that", f"{3 * plain / sum(others):.0%}"])
+    lines.append(["all but the first row", f"{1000 * sum(others):.2f}"])
+    lines.append(["share of that which three plain products take", f"{3 * plain / sum(others):.0%}"])
     return f"One hidden layer of {count:,} vertices in bfloat16:\n\n" + table(["part", "ms"], lines)
 
 
