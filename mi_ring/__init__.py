@@ -15,9 +15,11 @@ from mi_ring import llvm
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 llvm.prepare()
 
+import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 llvm.check()
+dr.set_thread_count(max(2, dr.thread_count()))  # on one thread Mitsuba waits forever when it reads or writes an EXR
 
 PLUGINS = ("mi_ring.photograph", "mi_ring.bsdf", "mi_ring.mesh", "mi_ring.integrator")
 

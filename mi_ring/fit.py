@@ -346,9 +346,9 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
     config = parse(arguments)
     config = dataclasses.replace(config, variant=set_variant(config.variant))
-    set_threads(config)
     keep_memory()
     scene = capture.load(config.scene, masks=config.masks)
+    set_threads(config)  # not before: on one thread Mitsuba waits forever when it reads an EXR
     if scene.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
     elif config.masks != "given" and all(mask is None for mask in scene.masks):

@@ -429,6 +429,29 @@ def test_a_users_mistake_is_one_line_and_status_2_before_any_work(broken_capture
     assert not (tmp_path / "out").exists()
 
 
+def test_a_fit_on_one_thread_reads_an_exr(broken_capture, tmp_path):
+    path, replace = broken_capture
+    image = path.parent / "images/000"
+    mi.Bitmap(f"{image}.png").convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False).write(f"{image}.exr")
+    replace("images/000.png", "images/000.exr")
+    status, complaint = call(path, "--out", tmp_path / "out", "--iterations", "1", "--threads", "1", *QUICK)
+    assert status == 0, complaint
+
+
+def test_on_one_core_an_exr_is_written_and_read(tmp_path):
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import mi_ring, numpy
+from mi_ring.results import write_image
+from pathlib import Path
+write_image(numpy.ones((5, 7, 3), numpy.float32), Path("one.exr"))
+import mitsuba as mi
+assert tuple(mi.Bitmap("one.exr").size()) == (7, 5)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, cwd=tmp_path)
+
+
 def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_path):
     status, complaint = call(tmp_path / "nothing", small_capture, tmp_path / "out", module="render")
     assert status == 2 and complaint.count("\n") == 1 and "nothing" in complaint
