@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -432,6 +433,7 @@ def test_a_users_mistake_is_one_line_and_status_2_before_any_work(broken_capture
 def test_a_fit_on_one_thread_reads_an_exr(broken_capture, tmp_path):
     path, replace = broken_capture
     image = path.parent / "images/000"
+    dr.set_thread_count(2)  # a fit before this in the same process may have left one
     mi.Bitmap(f"{image}.png").convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False).write(f"{image}.exr")
     replace("images/000.png", "images/000.exr")
     status, complaint = call(path, "--out", tmp_path / "out", "--iterations", "1", "--threads", "1", *QUICK)
