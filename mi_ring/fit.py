@@ -285,6 +285,18 @@ def set_threads(config: Config) -> None:
     dr.set_thread_count(threads)
 
 
+@contextlib.contextmanager
+def threads_of(config: Config):
+    """The fit's threads, from when its files are read until it ends: on one, Mitsuba waits forever for an EXR."""
+    before = torch.get_num_threads(), dr.thread_count()
+    set_threads(config)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        dr.set_thread_count(before[1])
+
+
 def keep_memory() -> None:
     """Have glibc keep freed memory, for the rest of the process.
 
@@ -348,11 +360,16 @@ def main(arguments: Sequence[str]) -> int:
     config = dataclasses.replace(config, variant=set_variant(config.variant))
     keep_memory()
     scene = capture.load(config.scene, masks=config.masks)
-    set_threads(config)  # not before: on one thread Mitsuba waits forever when it reads an EXR
     if scene.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
     elif config.masks != "given" and all(mask is None for mask in scene.masks):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
+    with threads_of(config):
+        return reconstruct(scene, config)
+
+
+def reconstruct(scene: capture.Capture, config: Config) -> int:
+    """Fit, and write the results. Returns the exit status of the command."""
     fit = Fit(scene, config)
     folder = config.folder
     if config.resume:
