@@ -76,7 +76,10 @@ def test_a_short_fit_of_the_teapot_is_already_near_and_our_numbers_are_the_judge
     numbers = json.loads(judged.stdout)
     assert numbers.keys() == {"normal_mean", "normal_median", "depth_mean", "depth_median", "iou", "flipped",
                               "psnr_input"}  # fmt: skip
-    assert {name: ours[name] for name in numbers} == pytest.approx(numbers, abs=1e-4)  # which has four digits
+    # It rounds to four digits. Mitsuba sums a vertex's normal in any order: an angle's cosine may miss by a last bit.
+    bit = np.degrees(2**-24 / np.sin(np.radians(numbers["normal_median"])))
+    for name, number in numbers.items():
+        assert ours[name] == pytest.approx(number, abs=0.51e-4 + (bit if name == "normal_median" else 0)), name
 
 
 def test_true_mesh_has_no_error(tmp_path, shared):
