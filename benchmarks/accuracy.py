@@ -160,7 +160,7 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
         ring.load_state_dict(state)
         with torch.no_grad():
             guess = evaluate.scene_of(ring.surface(s.to(running.device)).cpu().numpy(), faces)
-        curve.append((at, evaluate.compare_surfaces(running.capture, guess, true, diagonal)[0]["normal_mean"]))
+        curve.append((at, evaluate.compare_surfaces(running.capture, guess, true, diagonal)[0]))
     return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": memory, "speed": speed}
 
 
@@ -213,7 +213,7 @@ def main() -> None:
             row = measure(scene, out, [*options, "--seed", str(seed)], truth, POINTS)
             seconds, errors = zip(*row["curve"])
             print(table([f"{label}, fit time s", *(f"{s:.0f}" for s in seconds)],
-                        [["normals, mean error °", *(f"{e:.2f}" for e in errors)]]), flush=True)  # fmt: skip
+                        [["normals, mean error °", *(f"{e['normal_mean']:.2f}" for e in errors)]]), flush=True)  # fmt: skip
             print()
             costs = row["fit_seconds"], row["wall"], row["memory"], row["speed"] / 1e9
             rows.append([*(row[c] for c in COLUMNS), *costs])
