@@ -125,7 +125,10 @@ def product_speed(rows: int, width: int, dtype) -> float:
 
 
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
-    """Run `mi_ring.fit` in this process and look on: the curve, seconds by part, wall seconds, memory [GiB]."""
+    """Run `mi_ring.fit` in this process and look on.
+
+    Returns the curve of so many points, (seconds, `evaluate.errors`) each; seconds by part, wall seconds, memory [GiB].
+    """
     started = time.perf_counter()
     seconds, parts = watch(), collections.Counter()
     from mi_ring import evaluate, fit
@@ -211,9 +214,9 @@ def main() -> None:
             label = name if len(arguments.seeds) == 1 else f"{name}, seed {seed}"
             out = arguments.out / (name if seed == 0 else f"{name}_{seed}")
             row = measure(scene, out, [*options, "--seed", str(seed)], truth, POINTS)
-            seconds, errors = zip(*row["curve"])
-            print(table([f"{label}, fit time s", *(f"{s:.0f}" for s in seconds)],
-                        [["normals, mean error °", *(f"{e['normal_mean']:.2f}" for e in errors)]]), flush=True)  # fmt: skip
+            curve = [(f"{seconds:.0f}", f"{errors['normal_mean']:.2f}") for seconds, errors in row["curve"]]
+            seconds, errors = zip(*curve)
+            print(table([f"{label}, fit time s", *seconds], [["normals, mean error °", *errors]]), flush=True)
             print()
             costs = row["fit_seconds"], row["wall"], row["memory"], row["speed"] / 1e9
             rows.append([*(row[c] for c in COLUMNS), *costs])
