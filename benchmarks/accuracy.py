@@ -127,7 +127,8 @@ def product_speed(rows: int, width: int, dtype) -> float:
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """Run `mi_ring.fit` in this process and look on.
 
-    Returns the curve of so many points, (seconds, `evaluate.errors`) each; seconds by part, wall seconds, memory [GiB].
+    Returns the curve of so many points, (seconds, `evaluate.errors`) each; seconds by part, of the fit and of all; peak
+    memory [GiB]; FLOP/s of the machine.
     """
     started = time.perf_counter()
     seconds, parts = watch(), collections.Counter()
@@ -164,7 +165,8 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
         with torch.no_grad():
             guess = evaluate.scene_of(ring.surface(s.to(running.device)).cpu().numpy(), faces)
         curve.append((at, evaluate.compare_surfaces(running.capture, guess, true, diagonal)[0]))
-    return {"curve": curve, "parts": dict(parts), "wall": wall, "memory": memory, "speed": speed}
+    return {"curve": curve, "parts": dict(parts), "fit_seconds": running.seconds, "wall": wall, "memory": memory,
+            "speed": speed}  # fmt: skip
 
 
 def alone(function, *arguments):
@@ -180,8 +182,7 @@ def measure(scene: Path, out: Path, options: list[str], truth: Path, points: int
     if (novel := truth / "scene.xml").is_file():
         evaluate += ["--novel", str(novel)]
     numbers = json.loads(subprocess.run(evaluate, check=True, stdout=subprocess.PIPE, text=True).stdout)
-    log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return {"psnr_novel": math.nan} | numbers | watched | {"fit_seconds": log[-1]["seconds"]}
+    return {"psnr_novel": math.nan} | numbers | watched
 
 
 def table(heads, rows) -> str:

@@ -16,9 +16,10 @@ from accuracy import alone, processor, scene_file, table, truth_of, watched_fit
 from mi_ring.command import name_of
 
 CHOICES = [
-    "", "--seed 1", "--seed 2", "--weights.velocity 0.001", "--weights.mask 3", "--weights.mask 30", "--blur 0",
-    "--loss l2", "--loss log", "--batch 4", "--batch 16", "--spp 4", "--steps 3", "--steps 8", "--steps 20",
-    "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3", "--no-indirect", "--domain sphere",
+    "", "--seed 1", "--seed 2", "--velocity-decay 0.03", "--weights.velocity 0.001", "--weights.mask 3",
+    "--weights.mask 30", "--blur 0", "--loss l2", "--loss log", "--batch 4", "--batch 16", "--spp 4", "--steps 3",
+    "--steps 8", "--steps 20", "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3",
+    "--decay 0.03", "--precision bfloat16", "--no-indirect", "--domain sphere",
 ]  # fmt: skip
 
 
@@ -35,8 +36,8 @@ def main() -> None:
         for scene, truth in zip(arguments.scenes, truths):
             out = arguments.out / name_of(scene) / (choice.strip("-").replace(" ", "_") or "as_it_is")
             fitted = alone(watched_fit, [str(scene), "--out", str(out), *options, *choice.split()], truth, 1)
-            seconds, errors = fitted["curve"][-1]
-            row += [f"{errors['normal_mean']:.2f}°", f"{errors['depth_mean']:.2f}", f"{seconds:.0f}"]
+            _, errors = fitted["curve"][-1]
+            row += [f"{errors['normal_mean']:.2f}°", f"{errors['depth_mean']:.2f}", f"{fitted['fit_seconds']:.0f}"]
         rows.append(row)
         print("; ".join(row), file=sys.stderr)
     columns = ("normals, mean", "depth, mean %", "fit s")
