@@ -60,7 +60,7 @@ class Config:
     """Euler steps of the flow, the paper's T."""
     spp: int = 1
     """Samples per pixel."""
-    loss: Literal["l2", "l1", "log"] = "l1"
+    loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How predicted and observed radiance are compared."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance

@@ -6,18 +6,22 @@ import torch
 from torch import Tensor
 
 
-def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str = "l2") -> Tensor:
+def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str) -> Tensor:
     """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
 
     Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error.
     `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
-    that dim surfaces seen at a slant count as much as bright ones.
+    that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the mean of both.
     """
-    if kind == "log":
-        predicted, observed = ((x / exposure * 4).clamp(min=-0.5).log1p() for x in (predicted, observed))
-    else:
-        predicted, observed = predicted / exposure, observed / exposure
-    error = predicted - observed
+
+    def perceived(photographs: Tensor) -> Tensor:
+        linear = photographs / exposure
+        if kind in ("l2", "l1"):
+            return linear
+        log = (4 * linear).clamp(min=-0.5).log1p()
+        return log if kind == "log" else (linear + log) / 2  # both grow with the light: their errors have one sign
+
+    error = perceived(predicted) - perceived(observed)
     error = torch.where(clipped, error.clamp(max=0), error)
     return error.square().mean() if kind == "l2" else error.abs().mean()
 

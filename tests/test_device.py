@@ -38,7 +38,7 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
     x, material = net(s), brdf_net(s)
     terms = [
         losses.velocity_loss(net.velocity, x, 0.01),
-        losses.rgb_loss(images, torch.empty_like(images), torch.empty_like(images, dtype=torch.bool), 1.0, "l1"),
+        losses.rgb_loss(images, torch.empty_like(images), torch.empty_like(images, dtype=torch.bool), 1.0, "l1+log"),
         losses.mask_loss(masks, torch.empty_like(masks), 1.5),
     ]
     assert all(t.is_meta for t in (x, *material.values(), *terms))

@@ -22,11 +22,12 @@ def test_rgb_loss_by_hand():
     assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l2").item() == pytest.approx((0.04 + 0.16 + 1.44) / 4)
     assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1").item() == pytest.approx((0.2 + 0.4 + 1.2) / 4)
     log = [math.log1p(8 * p) - math.log1p(8 * o) for p, o in ((0.1, 0.2), (0.4, 0.2), (0, 0), (1.0, 0.4))]
-    expected = sum(map(abs, log)) / 4
-    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(expected, rel=1e-5)
+    log = sum(map(abs, log)) / 4
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(log, rel=1e-5)
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1+log").item() == pytest.approx((0.45 + log) / 2, rel=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["l2", "l1", "log"])
+@pytest.mark.parametrize("kind", ["l2", "l1", "log", "l1+log"])
 def test_a_clipped_pixel_says_at_least_this_bright(kind):
     clipped = torch.ones(1, 1, 2, 3, dtype=torch.bool)
     observed = pixels(1.0, 1.0)
