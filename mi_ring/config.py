@@ -69,7 +69,7 @@ class Config:
     """Is a point lit only if it sees the light, while fitting? Pictures of the result follow the scene's integrator."""
     indirect: bool = True
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
-    weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 10.0, "velocity": 0.01})
+    weights: dict[str, float] = field(default_factory=lambda: {"rgb": 1.0, "mask": 5.0, "velocity": 0.01})
     """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
     flow is, the paper's lambda."""
     velocity_decay: float = 0.03
