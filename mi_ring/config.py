@@ -45,7 +45,7 @@ class Config:
     room; none: as if it had none, which finds them in a dark room, too; --weights.mask 0 does without any."""
     seed: int = 0
     """Of every random choice."""
-    iterations: int = 400
+    iterations: int = 360
     """In all, shared out among the stages. From a hull or a mesh it is some fewer, see --shares."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
@@ -164,7 +164,7 @@ class Config:
 
 PRESETS = {
     "fast": {
-        "iterations": 130, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "iterations": 120, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},
