@@ -19,7 +19,7 @@ def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: flo
         if kind in ("l2", "l1"):
             return linear
         log = (4 * linear).clamp(min=-0.5).log1p()
-        return log if kind == "log" else (linear + log) / 2  # both grow with the light: their errors have one sign
+        return log if kind == "log" else (linear + log) / 2  # both rise, so this is the mean of two losses
 
     error = perceived(predicted) - perceived(observed)
     error = torch.where(clipped, error.clamp(max=0), error)
