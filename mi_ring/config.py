@@ -168,7 +168,7 @@ PRESETS = {
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},
-    "fine": {"iterations": 1200, "shares": (0.3, 0.4, 0.3)},
+    "fine": {"iterations": 1000, "shares": (0.3, 0.4, 0.3)},
     "paper": {
         "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
