@@ -127,8 +127,8 @@ def product_speed(rows: int, width: int, dtype) -> float:
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """Run `mi_ring.fit` in this process and look on.
 
-    Returns the curve of so many points, (seconds, `evaluate.errors`) each; seconds by part, of the fit and of all; peak
-    memory [GiB]; FLOP/s of the machine.
+    Returns the curve of so many points, (seconds, means of `evaluate.compare_surfaces`) each; seconds by part, of the
+    fit and of all; peak memory [GiB]; FLOP/s of the machine.
     """
     started = time.perf_counter()
     seconds, parts = watch(), collections.Counter()
@@ -154,7 +154,9 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
         fit.main(arguments)
     wall = time.perf_counter() - started
-    memory, speed = peak_memory(), product_speed(4096, 4096, torch.float32)
+    memory = peak_memory()
+    with fit.threads_of(running.config):
+        speed = product_speed(4096, 4096, torch.float32)
 
     (mesh, true), ring = evaluate.load_mesh(truth / "mesh.ply"), running.ring
     diagonal = np.linalg.norm(mesh.extents)

@@ -3,7 +3,7 @@
     python benchmarks/choices.py CAPTURE [MORE …] [--out out/choices] [OPTIONS OF mi_ring.fit]
 
 All fits have the same number of iterations, so that a setting which makes them cheaper shows in the seconds. Give
-`--preset fast` for an answer in an hour. The truth is found as in accuracy.py.
+`--preset fast` for an answer in an hour: the settings are chosen for it. The truth is found as in accuracy.py.
 """
 
 import argparse

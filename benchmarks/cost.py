@@ -4,7 +4,8 @@
 
 One setting at a time is varied about those of the first line: level of the sphere (four times the vertices each), width
 of the photographs, photographs per iteration, steps of the flow, samples per pixel, photographs of the scene (its own,
-again and again); the last lines are the last stage of the default preset, and the stages of `--preset paper` in size.
+again and again); the last lines are the last stage of the default preset, and the stages of `--preset paper`, all its
+settings with them.
 Each line is a process of its own; seconds of an iteration are the median of some. Photographs are as large as the scene
 has them, at most: that of the default has 256 pixels.
 """
@@ -46,20 +47,24 @@ def repeated(scene: Path, photographs: int, folder: Path) -> Path:
     return folder / scene.name
 
 
-def iterations(scene: Path, level: int, width: int, batch: int, steps: int, spp: int) -> dict:
+def iterations(scene: Path, preset: str, settings: dict) -> dict:
     """Median seconds of an iteration and of its parts, seconds until the first, peak memory [GiB]."""
     seconds = watch()
     from mi_ring import capture, fit
 
-    settings = {"levels": level, "widths": width, "shares": 1, "batch": batch, "steps": steps, "spp": spp}
-    config = fit.parse([str(scene), *(word for name, v in settings.items() for word in (f"--{name}", str(v)))])
-    fit.set_threads(config)
+    width = settings["width"]
+    words = {"preset": preset, "domain": "sphere", "levels": settings["level"], "widths": width, "shares": 1,
+             "batch": settings["batch"], "steps": settings["steps"], "spp": settings["spp"]}  # fmt: skip
+    config = fit.parse([str(scene), *(word for name, v in words.items() for word in (f"--{name}", str(v)))])
     fit.keep_memory()
     started = time.perf_counter()
-    running = fit.Fit(capture.load(scene), config)
+    photographs = capture.load(scene)
+    fit.set_threads(config)
+    running = fit.Fit(photographs, config)
     loading, times, parts = time.perf_counter() - started, [], []
     for k, sensor in enumerate(running.capture.sensors):  # as later in a fit, where what is decoded is remembered
-        running.capture.observe([k], -(-sensor.size[0] // width))
+        if width < sensor.size[0]:
+            running.capture.observe([k], -(-sensor.size[0] // width))
     for _ in range(WARM_UP + ITERATIONS):
         started, already = time.perf_counter(), dict(seconds)
         running.step()
@@ -75,17 +80,17 @@ def main() -> None:
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     scene = parser.parse_args().scene
     own = len(ElementTree.parse(scene).findall("sensor"))
-    base = {"level": 5, "width": 256, "batch": Config.batch, "steps": Config.steps, "spp": 1, "photographs": own}
-    settings = [base] + [base | {name: value} for name, values in VARIED.items() for value in values]
-    settings += [base | {"level": 6, "width": 512, "photographs": value} for value in (own, 2000)]
-    settings += [base | {"level": level, "width": 512, "steps": 20, "spp": 4} for level in (5, 6)]
+    base = {"level": 5, "width": 256, "batch": Config.batch, "steps": Config.steps, "spp": Config.spp,
+            "photographs": own}  # fmt: skip
+    lines = [("default", base | {name: value}) for name, values in VARIED.items() for value in values]
+    lines += [("default", base | {"level": 6, "width": 512, "photographs": value}) for value in (own, 2000)]
+    lines += [("paper", base | {"level": level, "width": 512, "steps": 20, "spp": 4}) for level in (5, 6)]
     rows = []
-    for setting in settings:
-        named = [f"**{v}**" if v != base[name] else str(v) for name, v in setting.items()]
-        named[0] += f" ({10 * 4 ** setting['level'] + 2:,})"
-        *options, photographs = setting.values()
+    for preset, settings in [("default", base), *lines]:
+        named = [f"**{v}**" if v != base[name] else str(v) for name, v in settings.items()]
+        named[0] += f" ({10 * 4 ** settings['level'] + 2:,})" + (", `paper`" if preset == "paper" else "")
         with tempfile.TemporaryDirectory() as folder:
-            measured = alone(iterations, repeated(scene, photographs, Path(folder)), *options)
+            measured = alone(iterations, repeated(scene, settings["photographs"], Path(folder)), preset, settings)
         parts, total = measured["parts"], measured["total"]
         spent = [f"{1000 * s:.0f}" for s in (*parts.values(), total - sum(parts.values()), total)]
         rows.append([*named, *spent, f"{measured['loading']:.1f}", f"{measured['peak']:.2f}"])

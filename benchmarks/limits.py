@@ -72,9 +72,8 @@ def layer(level: int) -> str:
     return f"One hidden layer of {count:,} vertices in bfloat16:\n\n" + table(["part", "ms"], lines)
 
 
-def rendering(scene: Path, level: int) -> str:
+def rendering(running: fit.Fit, level: int) -> str:
     """The table of the renderer, of the start surface."""
-    running = fit.Fit(capture.load(scene), fit.parse([str(scene)]))
     surface, size = running.surface, running.capture.sensors[0].size
     photographs = running.capture.photographs.select(running.capture.sizes[size][:8], size)
     s, faces = running.ring.domain.sample(level)
@@ -106,8 +105,8 @@ def rendering(scene: Path, level: int) -> str:
     }
     times = zip(parts, median_seconds(*parts.values()))
     rows = [[name, f"{1000 * t:.0f}", f"{pixels / t / 1e6:.1f}"] for name, t in times]
-    views = f"{len(photographs)} photographs of {size[0]} × {size[1]} of {scene.name}, {len(s):,} vertices"
-    return f"{views}:\n\n" + table(["part", "ms", "million pixels per second"], rows)
+    what = f"{len(photographs)} photographs of {size[0]} × {size[1]} of {running.capture.path.name}"
+    return f"{what}, {len(s):,} vertices:\n\n" + table(["part", "ms", "million pixels per second"], rows)
 
 
 def main() -> None:
@@ -117,12 +116,13 @@ def main() -> None:
     parser.add_argument("--level", type=int, default=5)
     parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
-    fit.set_threads(fit.parse([str(arguments.scene)]))
+    scene, config = capture.load(arguments.scene), fit.parse([str(arguments.scene)])
+    fit.set_threads(config)
     fit.keep_memory()
     print(f"{processor()}; {datetime.date.today()}; {torch.get_num_threads()} threads\n")
     print(flow(arguments.level, arguments.steps), end="\n\n")
     print(layer(arguments.level), end="\n\n")
-    print(rendering(arguments.scene, arguments.level))
+    print(rendering(fit.Fit(scene, config), arguments.level))
 
 
 if __name__ == "__main__":

@@ -315,6 +315,19 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     return scene, sensors
 
 
+def recompute_normals(scene: mi.Scene) -> None:
+    """Sum the vertex normals of meshes whose files have none anew: one thread does so in one order, several in any."""
+    for shape in scene.shapes():
+        if not shape.is_mesh() or not shape.has_vertex_normals():
+            continue
+        parameters = mi.traverse(shape)
+        before = np.array(parameters["vertex_normals"])
+        shape.recompute_vertex_normals()
+        if not np.allclose(before, np.array(parameters["vertex_normals"]), atol=1e-5):  # they were the file's own
+            parameters["vertex_normals"] = before
+            parameters.update()
+
+
 def reason(error: RuntimeError) -> str:
     """What Mitsuba's parser has to say, in one line."""
     text = str(error).split("] ", 1)[-1]

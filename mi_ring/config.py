@@ -61,7 +61,8 @@ class Config:
     spp: int = 1
     """Samples per pixel."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
-    """How predicted and observed radiance are compared."""
+    """How predicted and observed radiance are compared. l2: squared differences, the paper's; l1: absolute ones, which
+    few pixels that no surface explains do not rule; log: of logarithms, for what is dark; l1+log: the mean of both."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
     base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
@@ -94,7 +95,7 @@ class Config:
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
     threads: int = 0
-    """Processor threads; 0: all."""
+    """Processor threads of the fit; 0: all."""
     deterministic: bool = False
     """The same result bit for bit on the same machine, on one thread."""
 

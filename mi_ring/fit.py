@@ -38,6 +38,8 @@ class Fit:
 
     def __init__(self, scene: capture.Capture, config: Config):
         self.capture, self.config = scene, config
+        if config.deterministic:
+            capture.recompute_normals(scene.scene)
         self.random = torch.Generator().manual_seed(config.seed)
         torch.manual_seed(config.seed)
         domain, center, radius = start(scene, config.domain)
@@ -279,7 +281,10 @@ def set_variant(variant: str) -> str:
 
 
 def set_threads(config: Config) -> None:
-    """Parallel sums depend on the order in which threads finish: one thread is what determinism costs."""
+    """Set the number of threads of torch and Dr.Jit.
+
+    Parallel sums depend on the order in which threads finish: one thread is what determinism costs.
+    """
     threads = 1 if config.deterministic else config.threads or len(os.sched_getaffinity(0))
     torch.set_num_threads(threads)
     dr.set_thread_count(threads)
@@ -287,7 +292,7 @@ def set_threads(config: Config) -> None:
 
 @contextlib.contextmanager
 def threads_of(config: Config):
-    """The fit's threads, from when its files are read until it ends: on one, Mitsuba waits forever for an EXR."""
+    """The fit's threads, and those of before at the end. Not for reading: on one, Mitsuba waits forever for an EXR."""
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(config)
     try:

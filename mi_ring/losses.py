@@ -35,7 +35,7 @@ def mask_loss(coverage: Tensor, mask: Tensor, sigma: float) -> Tensor:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur by `sigma` [px] of (..., H, W) images, zero outside."""
+    """Gaussian blur by `sigma` > 0 [px] of (..., H, W) images, zero outside."""
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 

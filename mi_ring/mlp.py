@@ -99,10 +99,12 @@ class _Evaluate(torch.autograd.Function):
 def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
     """Values at points (n, 3) by `forward`, which returns those of a chunk and what the way back needs of it.
 
-    Chunks are computed one per thread; a GPU computes all points at once.
+    Chunks are computed one per thread, and are as many for each; a GPU computes all points at once.
     """
-    size = min(CHUNK, -(-len(x) // torch.get_num_threads())) if x.device.type == "cpu" else len(x)
-    parts = x.detach().split(max(1, size))
+    chunks, threads = 1, torch.get_num_threads()
+    if x.device.type == "cpu":
+        chunks = threads * -(-len(x) // (threads * CHUNK))
+    parts = x.detach().tensor_split(max(1, min(chunks, len(x))))
     ctx.sizes = [len(part) for part in parts]
     values, ctx.kept = zip(*in_parallel(torch.no_grad()(forward), parts))
     return torch.cat(values)
@@ -114,6 +116,8 @@ def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Te
     Raises RuntimeError if the parameters were changed since, and the second time.
     """
     _ = ctx.saved_tensors  # torch's own checks: the layers may share the parameters' memory
+    if ctx.kept is None:
+        raise RuntimeError("the backward pass of a network was taken a second time; retain_graph does not keep it")
 
     @torch.no_grad()
     def run(gradient, kept):

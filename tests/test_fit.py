@@ -172,6 +172,27 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
     assert logs[0] == logs[1]
 
 
+def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture):
+    path, edit = broken_capture
+    ball = trimesh.creation.icosphere(subdivisions=6)  # so many vertices that threads share the work
+    ball.vertices *= [1, 1.3, 0.7]
+    trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(path.parent / "none.ply", vertex_normal=False)
+    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], vertex_normals=[[0.6, 0, 0.8]] * 3)
+    triangle.export(path.parent / "own.ply", vertex_normal=True)
+    others = "".join(f'<shape type="ply"><string name="filename" value="{n}.ply"/></shape>' for n in ("none", "own"))
+    edit("</scene>", others + "</scene>")
+    config = fit.parse([str(path), "--deterministic"])
+    seen = set()
+    for _ in range(3):
+        scene = fit.capture.load(path)
+        with fit.threads_of(config):
+            shapes = fit.Fit(scene, config).capture.scene.shapes()
+        none, own = (np.array(s.vertex_normals_buffer()) for s in shapes if type(s) is mi.Mesh)
+        np.testing.assert_allclose(own, [0.6, 0, 0.8] * 3, rtol=1e-6)
+        seen.add(none.tobytes())
+    assert len(seen) == 1
+
+
 @pytest.mark.parametrize("moment", ["write_inputs", "write"])
 def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, monkeypatch, capsys):
     genuine = getattr(results, moment)

@@ -159,10 +159,11 @@ def test_gradients_in_bfloat16_are_summed_in_float32(network, threads):
 @pytest.mark.parametrize("evaluate", [lambda net, x: net(x), lambda net, x: net.evaluate(x)], ids=["flow", "mlp"])
 def test_a_way_back_that_would_be_wrong_is_an_error(evaluate):
     net, x = ShapeNet(steps=2), torch.randn(5, 3)
-    once = evaluate(net, x).sum()
-    once.backward()
-    with pytest.raises(RuntimeError, match="second time"):
-        once.backward()
+    for retain in (False, True):
+        once = evaluate(net, x).sum()
+        once.backward(retain_graph=retain)
+        with pytest.raises(RuntimeError, match="second time"):
+            once.backward()
     changed = evaluate(net, x).sum()
     with torch.no_grad():
         net.hidden[1].weight.add_(1)
