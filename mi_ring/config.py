@@ -36,7 +36,7 @@ class Config:
     resume: bool = False
     """Go on from the folder's checkpoint.pt. Give the same settings as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Settings that go together; each can be overridden. paper: the paper's own, days on a CPU."""
+    """Settings that go together; each can be overridden. paper: the paper's own, half a day on two cores."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
     the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
