@@ -101,8 +101,9 @@ def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
 
     Chunks are computed one per thread, and are as many for each; a GPU computes all points at once.
     """
-    chunks, threads = 1, torch.get_num_threads()
+    chunks = 1
     if x.device.type == "cpu":
+        threads = torch.get_num_threads()
         chunks = threads * -(-len(x) // (threads * CHUNK))
     parts = x.detach().tensor_split(max(1, min(chunks, len(x))))
     ctx.sizes = [len(part) for part in parts]
