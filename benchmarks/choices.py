@@ -16,10 +16,9 @@ from accuracy import alone, processor, scene_file, table, truth_of, watched_fit
 from mi_ring.command import name_of
 
 CHOICES = [
-    "", "--seed 1", "--seed 2", "--velocity-decay 0.03", "--weights.velocity 0.001", "--weights.mask 2",
-    "--weights.mask 10", "--blur 0", "--loss l2", "--loss l1", "--loss log", "--batch 4", "--batch 16", "--spp 4",
-    "--steps 3", "--steps 8", "--steps 20", "--optimizer adam", "--muon-rate 0.015", "--muon-rate 0.06", "--decay 0.3",
-    "--decay 0.03", "--precision bfloat16", "--no-indirect", "--domain sphere",
+    "", "--seed 1", "--seed 2", "--domain sphere", "--velocity-decay 0.03", "--weights.mask 2", "--weights.mask 10",
+    "--blur 0", "--loss l2", "--loss l1", "--loss log", "--batch 4", "--batch 16", "--steps 3", "--steps 8",
+    "--steps 20", "--optimizer adam", "--decay 0.3", "--decay 0.03", "--precision bfloat16",
 ]  # fmt: skip
 
 
