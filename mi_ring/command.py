@@ -60,7 +60,14 @@ def complaint_in(box: str) -> str:
     complaint = " ".join(parts[0]) or " ".join(box.split())
     union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
     if union:  # of kinds of values; why each is not meant is of no interest
-        complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), union[2])
+        kinds = re.sub("[{}]", "", union[2]).replace(",", "|")
+        complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), kinds)
+    for kind, error in (
+        ("whole number", r"invalid literal for int\(\) .*"),
+        ("number", "could not convert string to float"),
+    ):
+        complaint = re.sub(rf"^Error parsing (\S+): {error}: '(.*)'", rf"\1: is \2; must be a {kind}", complaint)
+    complaint = re.sub(r"^Error parsing \w+: (?=--)", "", complaint)  # by the dataclass itself
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
 
 

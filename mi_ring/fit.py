@@ -163,21 +163,8 @@ class Fit:
             "seconds": self.seconds,
         }
 
-    def restore(self, path: Path):
-        """Go on from a checkpoint. Raises InputError if there is none or if it was made with other settings."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            before = state["settings"]
-        except FileNotFoundError:
-            raise InputError(f"{path}: --resume: no such file; run without --resume to start anew") from None
-        except Exception as error:
-            raise InputError(f"{path}: --resume: not a checkpoint ({str(error).splitlines()[0]})") from error
-        for name, value in self.config.settings().items():
-            if before.get(name) != value:
-                raise InputError(f"{path}: --{name.replace('_', '-')}: was {before.get(name)} before, is {value} now; "
-                                 "give the same settings to resume, or start anew without --resume")  # fmt: skip
-        if state["scene"] != digest(self.config.scene):
-            raise InputError(f"{path}: --resume: was made from another scene file than {self.config.scene}")
+    def restore(self, state: dict):
+        """Go on from this state, which `read_checkpoint` has read."""
         self.ring.load_state_dict(state["ring"]["networks"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
@@ -226,6 +213,25 @@ def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radi
                 f'{scene.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, of '
                 f"radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
             )
+
+
+def read_checkpoint(config: Config) -> dict:
+    """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
+    path = config.folder / "checkpoint.pt"
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        before = state["settings"]
+    except FileNotFoundError:
+        raise InputError(f"{path}: --resume: no such file; run without --resume to start anew") from None
+    except Exception as error:
+        raise InputError(f"{path}: --resume: not a checkpoint ({str(error).splitlines()[0]})") from error
+    for name, value in config.settings().items():
+        if before.get(name) != value:
+            raise InputError(f"{path}: --{name.replace('_', '-')}: was {before.get(name)} before, is {value} now; "
+                             "give the same settings to resume, or start anew without --resume")  # fmt: skip
+    if state["scene"] != digest(config.scene):
+        raise InputError(f"{path}: --resume: was made from another scene file than {config.scene}")
+    return state
 
 
 def digest(file: Path) -> str:
@@ -363,6 +369,7 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
     config = parse(arguments)
     config = dataclasses.replace(config, variant=set_variant(config.variant))
+    state = read_checkpoint(config) if config.resume else None
     keep_memory()
     scene = capture.load(config.scene, masks=config.masks)
     if scene.threshold is not None:
@@ -370,15 +377,15 @@ def main(arguments: Sequence[str]) -> int:
     elif config.masks != "given" and all(mask is None for mask in scene.masks):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config):
-        return reconstruct(scene, config)
+        return reconstruct(scene, config, state)
 
 
-def reconstruct(scene: capture.Capture, config: Config) -> int:
-    """Fit, and write the results. Returns the exit status of the command."""
+def reconstruct(scene: capture.Capture, config: Config, state: dict | None) -> int:
+    """Fit, from that state on if it is given, and write the results. Returns the exit status of the command."""
     fit = Fit(scene, config)
     folder = config.folder
-    if config.resume:
-        fit.restore(folder / "checkpoint.pt")
+    if state:
+        fit.restore(state)
     fitted_scene = results.scene_xml(config.scene, folder, config.subdivisions, fit.ring.bsdf)
     results.prepare(folder, config)
     with interruptible() as interrupted:
@@ -386,7 +393,7 @@ def reconstruct(scene: capture.Capture, config: Config) -> int:
         if config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
                   f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
-        if not config.resume:
+        if not state:
             results.write_inputs(folder / "inputs.png", fit)
         try:
             train(fit, folder, interrupted)

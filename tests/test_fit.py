@@ -307,10 +307,10 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
 
 
 def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
-    options = ["--domain", "hull", "--iterations", "6", *QUICK]
+    config = fit.parse([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
 
     def fresh():
-        return fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), *options]))
+        return fit.Fit(capture.load(small_capture), config)
 
     before = fresh()
     assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
@@ -318,7 +318,7 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
         before.step()
     results.save(before.state(), tmp_path / "checkpoint.pt")
     after = fresh()
-    after.restore(tmp_path / "checkpoint.pt")
+    after.restore(fit.read_checkpoint(config))
     for level in (2, 3):
         (s, faces), (again, same) = before.ring.domain.sample(level), after.ring.domain.sample(level)
         assert torch.equal(s, again) and np.array_equal(faces, same)
@@ -490,17 +490,18 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
         (["--preset"], ["preset"]),
         (["--weights.mask", "-5"], ["--weights", "0 or more"]),
         (["--seed", str(2**70)], ["--seed", "below 2^63"]),
-        (["--iterations", "many"], ["iterations", "many"]),
+        (["--iterations", "many"], ["--iterations: is many; must be a whole number"]),
         (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
-        (["--steps", "0"], ["--steps", "0", "at least 1"]),
+        (["--steps", "0"], ["--steps: is 0, must be at least 1"]),
         (["--velocity-decay", "0"], ["--velocity-decay", "0", "above 0"]),
         (["--iteration", "5"], ["iteration"]),
         (["--levels", "4", "9"], ["--levels", "0 to 8"]),
         (["--levels", "4"], ["--widths", "as many"]),
         (["--loss", "l3"], ["loss", "l3"]),
-        (["--domain", "cube"], ["--domain: is cube; must be {auto,sphere,hull}|{{mesh} PATH}"]),
+        (["--domain", "cube"], ["--domain: is cube; must be auto|sphere|hull|mesh PATH"]),
         (["--domain", "mesh"], ["--domain: is mesh; must be"]),
         (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
+        (["--learning-rate", "fast"], ["--learning-rate: is fast; must be a number"]),
     ],
 )
 def test_an_unusable_option_is_one_line_that_names_it(options, words):

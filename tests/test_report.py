@@ -268,7 +268,7 @@ def rows(n=9, **changes):
 
 def test_of_a_good_fit_there_is_nothing_to_say():
     assert report.findings(rows(), 400, 400) == []
-    assert report.findings(rows(psnr=29.0, iou=0.91, saturated=0.049, shift=(0.9, 0.1)), 400, 400) == []
+    assert report.findings(rows(psnr=29.0, iou=0.91, saturated=0.249, shift=(0.9, 0.1)), 400, 400) == []
     nothing = [report.Row("a.png", 30.0, None, 0.0, None, {}), report.Row("b.png", 12.0, None, 0.0, None, {})]
     assert report.findings(nothing, 400, 400) == []  # which of two is wrong cannot be told
 
@@ -276,7 +276,7 @@ def test_of_a_good_fit_there_is_nothing_to_say():
 @pytest.mark.parametrize("changes, words", [
     ({"psnr": 26.0}, ["4.jpg (26.0 dB)", "31.6 dB", "leave"]),
     ({"iou": 0.62}, ["4.jpg (IoU 0.62)", "mask"]),
-    ({"saturated": 0.064}, ["4.jpg (6.4%)", "Expose less"]),
+    ({"saturated": 0.264}, ["4.jpg (26.4%)", "Expose less"]),
     ({"shift": (-1.4, 2.05)}, ["4.jpg (1.4 px to the left and 2.0 px below)", "pose"]),
 ])  # fmt: skip
 def test_one_photograph_that_stands_out_is_named(changes, words):
@@ -300,9 +300,9 @@ def test_an_early_end_is_told():
 def test_of_many_the_worst_are_named():
     many = rows(20)
     for k, row in enumerate(many):
-        row.saturated = 0.06 + 0.01 * k
+        row.saturated = 0.26 + 0.01 * k
     (found,) = report.findings(many, 400, 400)
-    assert found.startswith("19.jpg (25.0%), 18.jpg (24.0%), 17.jpg") and "and 15 more" in found
+    assert found.startswith("19.jpg (45.0%), 18.jpg (44.0%), 17.jpg") and "and 15 more" in found
 
 
 def test_shifts_are_measured_to_a_fraction_of_a_pixel():
