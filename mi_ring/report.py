@@ -83,8 +83,8 @@ def findings(rows: list[Row], iteration: int, iterations: int) -> list[str]:
     typical, scatter = middle([row.psnr for row in rows])
     limit = typical - max(MISFIT, 3 * scatter)
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
-        found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there, then mend pose, "
-                     "light or mask, or leave the photograph out.")  # fmt: skip
+        found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
+                     "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
     masked = [row for row in rows if row.iou is not None]
     if few := worst((row.iou, row.name, f"IoU {row.iou:.2f}") for row in masked if row.iou < COVERED):
         found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
@@ -203,7 +203,7 @@ def loss_curve(log: list[dict], fit) -> str:
     axes.set_xlabel("iteration (dotted: next stage)")
     axes.grid(alpha=0.3)
     if log:
-        axes.legend(loc="upper right")
+        figure.legend(loc="outside right upper")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg")
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
