@@ -60,7 +60,7 @@ def complaint_in(box: str) -> str:
     complaint = " ".join(parts[0]) or " ".join(box.split())
     union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
     if union:  # of kinds of values; why each is not meant is of no interest
-        kinds = re.sub("[{}]", "", union[2]).replace(",", "|")
+        kinds = re.sub("[{}]", "", union[2].replace("{None}|", "")).replace(",", "|")
         complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), kinds)
     for kind, error in (
         ("whole number", r"invalid literal for int\(\) .*"),

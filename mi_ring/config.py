@@ -36,7 +36,7 @@ class Config:
     resume: bool = False
     """Go on from the folder's checkpoint.pt. Give the same settings as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Settings that go together; each can be overridden. paper: the paper's own, half a day on two cores."""
+    """Settings that go together; each can be overridden. paper: the paper's own, seven hours on two cores."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
     the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
@@ -46,7 +46,7 @@ class Config:
     seed: int = 0
     """Of every random choice."""
     iterations: int = 360
-    """In all, shared out among the stages. From a hull or a mesh it is some fewer, see --shares."""
+    """In all, shared out among the stages. From a hull or a mesh it is fewer, see --shares."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
     widths: tuple[int, ...] = (128, 256, 512)

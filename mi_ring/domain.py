@@ -28,7 +28,8 @@ def closed(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> t
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
     if not path.is_file():
-        raise InputError(f"{path}: {field}: no such file")
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: {field}: {what}; give the file of a mesh")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:
@@ -37,11 +38,11 @@ def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     return mesh
 
 
-def load(path: Path) -> trimesh.Trimesh:
-    """A closed mesh from a file. Raises InputError if it is none."""
-    mesh = read_mesh(path, "--domain")
+def load(path: Path, field: str) -> trimesh.Trimesh:
+    """A closed mesh from a file. Raises InputError, which names the `field`, if it is none."""
+    mesh = read_mesh(path, field)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
-        raise InputError(f"{path}: --domain: is not a closed surface")
+        raise InputError(f"{path}: {field}: is not a closed surface")
     return mesh
 
 

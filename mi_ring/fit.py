@@ -176,7 +176,7 @@ def start(scene: capture.Capture, choice) -> tuple[Domain, np.ndarray, float]:
     """The domain of a fit and the sphere that normalises it: what `--domain` asks for, else what the scene says."""
     shape = scene.shape
     if isinstance(choice, tuple):
-        return closed(load(choice[1]), shape.center, shape.radius)
+        return closed(load(choice[1], "--domain"), shape.center, shape.radius)
     if choice == "auto" and shape.domain:
         return shape.domain
     try:
@@ -217,6 +217,7 @@ def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radi
 
 def read_checkpoint(config: Config) -> dict:
     """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
+    capture.require_file(config.scene)
     path = config.folder / "checkpoint.pt"
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

@@ -107,7 +107,7 @@ class ShapeNetMesh(mi.Mesh):
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain = None
         if "domain" in given:
-            self.domain = closed(load(beside_scene(given["domain"])), self.center, self.radius)
+            self.domain = closed(load(beside_scene(given["domain"]), "domain"), self.center, self.radius)
         sphere = Sphere(), np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         domain, center, radius = self.domain or sphere
         self.ring = Ring.load(beside_scene(given["weights"])) if "weights" in given else None

@@ -84,10 +84,10 @@ def test_a_mesh_with_a_hole_is_no_domain(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2)
     ball.update_faces(np.arange(len(ball.faces)) > 5)
     ball.export(tmp_path / "open.ply")
-    with pytest.raises(InputError, match=r"open.ply: --domain: is not a closed surface"):
-        load(tmp_path / "open.ply")
-    with pytest.raises(InputError, match=r"gone.ply: --domain: no such file"):
-        load(tmp_path / "gone.ply")
+    with pytest.raises(InputError, match=r"open.ply: domain: is not a closed surface"):
+        load(tmp_path / "open.ply", "domain")
+    with pytest.raises(InputError, match=r"gone.ply: domain: no such file"):
+        load(tmp_path / "gone.ply", "domain")
 
 
 def test_what_a_domain_contains():
