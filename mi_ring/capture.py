@@ -18,7 +18,7 @@ from tqdm import tqdm
 from mi_ring import mesh, photograph
 from mi_ring.bsdf import check_attributes
 from mi_ring.edges import Edges
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_file
 from mi_ring.hull import Hull, NoParallax, Silhouette, evenly, nearest_point
 from mi_ring.integrator import Photographs
 
@@ -297,16 +297,9 @@ def brightness(capture: Capture, k: int) -> np.ndarray:
     return decode(capture.images[k], capture.linear[k], 1.0)[0].max(-1)
 
 
-def require_file(path: Path) -> None:
-    """Raises InputError if a scene is not a file."""
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{path}: {what}; give the XML file of a scene")
-
-
 def open_scene(path: Path) -> tuple[mi.Scene, list]:
     """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
-    require_file(path)
+    require_file(path, "the XML file of a scene")
     try:
         path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)

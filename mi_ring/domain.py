@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_file
 
 FINEST = 6  #: level up to which domains are remeshed; beyond it triangles are cut in four
 PLACES = 16  #: for each vertex to be at
@@ -27,9 +27,7 @@ def closed(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> t
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{path}: {field}: {what}; give the file of a mesh")
+    require_file(path, "the file of a mesh", field)
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:

@@ -1,4 +1,6 @@
-"""The one error that a user can cause."""
+"""The one error that a user can cause, and the commonest cause of it."""
+
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -7,3 +9,10 @@ class InputError(ValueError):
     The message is one line: the file, the field, what was found, and what to do. Commands print it and exit with
     status 2.
     """
+
+
+def require_file(path: Path, wanted: str, field: str = "") -> None:
+    """Raise InputError, which says what is `wanted` and in which `field`, if the path is not that of a file."""
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{path}: {field}{': ' if field else ''}{what}; give {wanted}")

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from mi_ring import bridge, capture, command, losses, reflectance, results
 from mi_ring.config import PRESETS, Config
 from mi_ring.domain import Domain, Sphere, closed, load
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_file
 from mi_ring.hull import genus
 from mi_ring.ring import Ring
 
@@ -217,7 +217,7 @@ def check_place(scene: capture.Capture, domain: Domain, center: np.ndarray, radi
 
 def read_checkpoint(config: Config) -> dict:
     """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
-    capture.require_file(config.scene)
+    require_file(config.scene, "the XML file of a scene")
     path = config.folder / "checkpoint.pt"
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

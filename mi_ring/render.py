@@ -18,7 +18,7 @@ from tyro.conf import Positional, arg
 from mi_ring import bridge, capture, command
 from mi_ring.atlas import flowed
 from mi_ring.capture import Capture, camera_of, linear_to_srgb, to_bytes
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_file
 from mi_ring.integrator import Photographs, light_of
 from mi_ring.material import MaterialOptions, dress
 from mi_ring.photograph import Flash, Photograph
@@ -294,8 +294,7 @@ def under(envmap: Path, up: np.ndarray, scene: Capture, ring: Ring) -> bridge.Su
         of_shape = isinstance(emitter, Flash) or mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         if not (of_shape or emitter.is_environment()):
             parts.append(emitter)
-    if not envmap.is_file():
-        raise InputError(f"{envmap}: --envmap: no such file; give an EXR or HDR file of latitude and longitude")
+    require_file(envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
     try:
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world)})
     except RuntimeError as error:
