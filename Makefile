@@ -8,7 +8,7 @@ SCENE  ?= scenes/pot2.xml
 ARGS   ?=
 
 RUN = $(VENV)/bin/python -m
-NPM_CI = cd mi_ring/viewer && npm ci --ignore-scripts --no-audit --no-fund
+NPM_CI = cd mi_ring/output/viewer && npm ci --ignore-scripts --no-audit --no-fund
 
 .PHONY: help setup fit test tools viewer lint docs clean
 
@@ -25,8 +25,8 @@ help:
 setup: $(VENV)/.setup-done
 
 # editable_mode=compat: a checkout called mi_ring would otherwise hide the package from scripts in the folder above it.
-$(VENV)/.setup-done: pyproject.toml Makefile mi_ring/llvm.py | $(VENV)/bin/pip
-	$(VENV)/bin/python -I mi_ring/llvm.py
+$(VENV)/.setup-done: pyproject.toml Makefile mi_ring/system/llvm.py | $(VENV)/bin/pip
+	$(VENV)/bin/python -I mi_ring/system/llvm.py
 	$(RUN) pip install $(TORCH)
 	$(RUN) pip install --config-settings editable_mode=compat -e '.[test]'
 	@touch $@
@@ -39,7 +39,7 @@ $(VENV)/bin/pip:
 	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv $(VENV); else set -e; \
 	  $(PYTHON) -m venv --without-pip $(VENV); \
 	  deb=$(VENV)/pip-deb; wheels=/usr/share/python-wheels; certificates=/etc/ssl/certs/ca-certificates.crt; \
-	  ls $$wheels/pip-*.whl >/dev/null 2>&1 || { $(PYTHON) -I mi_ring/llvm.py $$deb python3-pip-whl; wheels=$$deb$$wheels; }; \
+	  ls $$wheels/pip-*.whl >/dev/null 2>&1 || { $(PYTHON) -I mi_ring/system/llvm.py $$deb python3-pip-whl; wheels=$$deb$$wheels; }; \
 	  test -e $$certificates || { certificates=$$deb/certificates; cat $$deb/usr/share/ca-certificates/*/*.crt >$$certificates; }; \
 	  wheel=$$(ls $$wheels/pip-*.whl); \
 	  PIP_CERT=$${PIP_CERT:-$$certificates} $(VENV)/bin/python $$wheel/pip install --upgrade pip; \
@@ -60,7 +60,7 @@ tools:
 	@if ! command -v npm; then echo 'make tools: found no npm; Node.js brings it' >&2; \
 	elif ! ($(NPM_CI)); then echo 'make tools: npm could not fetch the validator of glTF' >&2; fi
 
-# three.js and mi_ring/viewer/viewer.js in one file, which is part of the repository.
+# three.js and mi_ring/output/viewer/viewer.js in one file, which is part of the repository.
 viewer:
 	$(NPM_CI) && npm run build
 
@@ -72,5 +72,5 @@ docs: setup
 	@echo build/docs/index.html
 
 clean:
-	rm -rf .pytest_cache .ruff_cache build *.egg-info mi_ring/viewer/node_modules
+	rm -rf .pytest_cache .ruff_cache build *.egg-info mi_ring/output/viewer/node_modules
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +

@@ -62,7 +62,6 @@ def processor() -> str:
 
 def watch() -> dict[str, float]:
     """Seconds by part of all fits of this process, from now on."""
-    from mi_ring import bridge, shapenet  # here, not in the parent: a process begins with its parent's peak memory
 
     # isort: split
     import torch
@@ -132,7 +131,6 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """
     started = time.perf_counter()
     seconds, parts = watch(), collections.Counter()
-    from mi_ring import evaluate, fit
 
     # isort: split
     import numpy as np
@@ -155,18 +153,18 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
         fit.main(arguments)
     wall = time.perf_counter() - started
     memory = peak_memory()
-    with fit.threads_of(running.config):
+    with machine.threads_of(running.config):
         speed = product_speed(4096, 4096, torch.float32)
 
-    (mesh, true), ring = evaluate.load_mesh(truth / "mesh.ply"), running.ring
+    (mesh, true), ring = surfaces.load_true_mesh(truth / "mesh.ply"), running.ring
     diagonal = np.linalg.norm(mesh.extents)
     s, faces = ring.domain.sample(running.config.subdivisions)
     curve = []
     for at, state in course:
         ring.load_state_dict(state)
         with torch.no_grad():
-            guess = evaluate.scene_of(ring.surface(s.to(running.device)).cpu().numpy(), faces)
-        curve.append((at, evaluate.compare_surfaces(running.capture, guess, true, diagonal)[0]))
+            guess = plain_mesh.scene_of(ring.surface(s.to(running.device)).cpu().numpy(), faces)
+        curve.append((at, surfaces.compare_surfaces(running.capture, guess, true, diagonal)[0]))
     return {"curve": curve, "parts": dict(parts), "fit_seconds": running.seconds, "wall": wall, "memory": memory,
             "speed": speed}  # fmt: skip
 

@@ -21,10 +21,13 @@ import numpy as np
 from accuracy import processor
 from playwright.sync_api import sync_playwright
 
-from mi_ring import bridge, capture
-from mi_ring.capture import camera_of, linear_to_srgb, to_bytes
-from mi_ring.integrator import light_of
-from mi_ring.ring import Ring
+from mi_ring.capture import loading
+from mi_ring.capture.capture import camera_of
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.rendering import bridge
+from mi_ring.rendering.lights import light_of
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import load_fit
 
 
 def photograph(sensor) -> dict:
@@ -64,7 +67,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="results folder of a fit")
     parser.add_argument("--picture", type=Path, help="file for a picture of three photographs")
     arguments = parser.parse_args()
-    scene, ring = capture.load(arguments.run / "scene.xml", images=False), Ring.load(arguments.run)
+    scene, ring = loading.load_capture(arguments.run / "scene.xml", images=False), load_fit(arguments.run)
     theirs = drawn(arguments.run / "report.html", scene.sensors)
     surface = bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))

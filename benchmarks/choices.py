@@ -13,7 +13,7 @@ from pathlib import Path
 
 from accuracy import alone, processor, scene_file, table, truth_of, watched_fit
 
-from mi_ring.command import name_of
+from mi_ring.system.command import scene_name
 
 CHOICES = [
     "", "--seed 1", "--seed 2", "--domain sphere", "--velocity-decay 0.03", "--weights.mask 2", "--weights.mask 10",
@@ -33,14 +33,14 @@ def main() -> None:
     for choice in CHOICES:
         row = [f"`{choice}`" if choice else "as it is"]
         for scene, truth in zip(arguments.scenes, truths):
-            out = arguments.out / name_of(scene) / (choice.strip("-").replace(" ", "_") or "as_it_is")
+            out = arguments.out / scene_name(scene) / (choice.strip("-").replace(" ", "_") or "as_it_is")
             fitted = alone(watched_fit, [str(scene), "--out", str(out), *options, *choice.split()], truth, 1)
             _, errors = fitted["curve"][-1]
             row += [f"{errors['normal_mean']:.2f}°", f"{errors['depth_mean']:.2f}", f"{fitted['fit_seconds']:.0f}"]
         rows.append(row)
         print("; ".join(row), file=sys.stderr)
     columns = ("normals, mean", "depth, mean %", "fit s")
-    heads = ["changed", *(f"{name_of(scene)}: {column}" for scene in arguments.scenes for column in columns)]
+    heads = ["changed", *(f"{scene_name(scene)}: {column}" for scene in arguments.scenes for column in columns)]
     print(f"\n{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n\n{table(heads, rows)}")
 
 

@@ -11,7 +11,8 @@ import datetime
 import os
 from pathlib import Path
 
-from mi_ring import bridge  # before Mitsuba, for it chooses LLVM
+from mi_ring.geometry.domain import Sphere
+from mi_ring.rendering import bridge
 
 # isort: split
 import drjit as dr
@@ -19,8 +20,6 @@ import mitsuba as mi
 import torch
 from accuracy import processor
 from render import METHODS, Scene
-
-from mi_ring.domain import Sphere
 
 
 def resident() -> float:

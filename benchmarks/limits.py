@@ -13,24 +13,28 @@ from pathlib import Path
 
 from accuracy import median_seconds, processor, product_speed, table, there_and_back
 
-from mi_ring import bridge, capture, fit, integrator
+from mi_ring import fit
+from mi_ring.capture import loading
+from mi_ring.fitting import fit
+from mi_ring.fitting.config import Config
+from mi_ring.geometry.domain import Sphere
+from mi_ring.nets.mlp import SLOPE
+from mi_ring.nets.shapenet import ShapeNet
+from mi_ring.rendering import bridge
+from mi_ring.rendering.photographs import pixel_rays
+from mi_ring.system import machine
 
 # isort: split
 import drjit as dr
 import torch
 from torch.nn import functional as F
 
-from mi_ring.config import Config
-from mi_ring.domain import Sphere
-from mi_ring.mlp import SLOPE
-from mi_ring.shapenet import ShapeNet
-
 
 def flow_speed(s, steps: int, precision: str) -> tuple[float, float]:
     """FLOP/s, and seconds, of forward and backward."""
     net = ShapeNet(steps)
     weights = sum(layer.weight.numel() for layer in [*net.hidden, net.output])
-    t = median_seconds(there_and_back(net, s, fit.autocast(precision, s.device)))[0]
+    t = median_seconds(there_and_back(net, s, machine.autocast(precision, s.device)))[0]
     return 3 * 2 * weights * steps * len(s) / t, t
 
 
@@ -84,7 +88,7 @@ def rendering(running: fit.Fit, level: int) -> str:
     material = {name: value.requires_grad_() for name, value in material.items()}
 
     def trace():
-        ray, _ = integrator.pixel_rays(photographs, 1, 0)
+        ray, _ = pixel_rays(photographs, 1, 0)
         dr.eval(surface.scene.ray_intersect_preliminary(ray, coherent=True))
         dr.sync_thread()
 
@@ -116,9 +120,9 @@ def main() -> None:
     parser.add_argument("--level", type=int, default=5)
     parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
-    scene, config = capture.load(arguments.scene), fit.parse([str(arguments.scene)])
-    fit.set_threads(config)
-    fit.keep_memory()
+    scene, config = loading.load_capture(arguments.scene), fit.parse([str(arguments.scene)])
+    machine.set_threads(config)
+    machine.keep_memory()
     print(f"{processor()}; {datetime.date.today()}; {torch.get_num_threads()} threads\n")
     print(flow(arguments.level, arguments.steps), end="\n\n")
     print(layer(arguments.level), end="\n\n")

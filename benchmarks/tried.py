@@ -11,19 +11,21 @@ import time
 
 from accuracy import alone, median_seconds, peak_memory, processor, table, there_and_back
 
-from mi_ring import fit, losses, mlp, shapenet
+from mi_ring import fit
+from mi_ring.fitting.config import Config
+from mi_ring.geometry.domain import Sphere
+from mi_ring.images import blur
+from mi_ring.nets import chunks, mlp, shapenet
+from mi_ring.nets.brdfnet import BRDFNet
+from mi_ring.nets.encoding import PosEnc
+from mi_ring.system import machine
 
 # isort: split
 import torch
 from torch.nn import functional as F
 
-from mi_ring.brdfnet import BRDFNet
-from mi_ring.config import Config
-from mi_ring.domain import Sphere
-from mi_ring.encoding import PosEnc
-
 SLOPE = mlp.SLOPE
-AUTOCAST = fit.autocast("auto", torch.device("cpu"))  # as in a fit
+AUTOCAST = machine.autocast("auto", torch.device("cpu"))  # as in a fit
 with AUTOCAST():
     DTYPE = torch.mm(torch.ones(1, 1), torch.ones(1, 1)).dtype
 
@@ -54,7 +56,7 @@ def euler_by_autograd(net):
 
 def flow_memory(by_hand: bool, level: int, steps: int) -> float:
     """GiB that forward and backward pass of the flow take."""
-    fit.set_threads(fit.parse(["scene.xml"]))
+    machine.set_threads(fit.parse(["scene.xml"]))
     net, (s, _) = shapenet.ShapeNet(steps), Sphere().sample(level)
     there_and_back(net, s[:100], AUTOCAST)()  # what is needed for the first time only
     before = peak_memory()
@@ -66,16 +68,16 @@ def chunked(net, s, points):
     """The flow in chunks of another size."""
 
     def run():
-        before, mlp.CHUNK = mlp.CHUNK, points
+        before, chunks.CHUNK = chunks.CHUNK, points
         there_and_back(net, s, AUTOCAST)()
-        mlp.CHUNK = before
+        chunks.CHUNK = before
 
     return run
 
 
 def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
-    fit.set_threads(fit.parse(["scene.xml"]))
+    machine.set_threads(fit.parse(["scene.xml"]))
     torch.manual_seed(0)
     return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0], AUTOCAST))[0]
 
@@ -107,8 +109,8 @@ def main() -> None:
     arguments = parser.parse_args()
     returned = alone(with_returned_memory, arguments.level, arguments.steps)
     memory = [alone(flow_memory, by_hand, arguments.level, arguments.steps) for by_hand in (True, False)]
-    fit.set_threads(fit.parse(["scene.xml"]))
-    fit.keep_memory()
+    machine.set_threads(fit.parse(["scene.xml"]))
+    machine.keep_memory()
     torch.manual_seed(0)
     s = Sphere().sample(arguments.level)[0]
     net = shapenet.ShapeNet(arguments.steps)
@@ -151,7 +153,7 @@ def main() -> None:
                 "not for users of torch")  # fmt: skip
         compare("encoding by doubling instead of cosines and sines", lambda: encode(s), lambda: doubled(s))
         images = torch.randn(8, 128, 128)
-        compare("blur of the masks, 8 of 128², σ = 8 px, by convolutions", lambda: losses.blur(images, 8.0),
+        compare("blur of the masks, 8 of 128², σ = 8 px, by convolutions", lambda: blur(images, 8.0),
                 lambda: convolved(images, 8.0))  # fmt: skip
     print(f"{processor()}; {datetime.date.today()}; {len(s):,} vertices, {arguments.steps} steps, {DTYPE}, "
           f"{torch.get_num_threads()} threads\n")  # fmt: skip

@@ -3,38 +3,83 @@
 `import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current
 variant of Mitsuba and for every one switched to later, and the emitter `flash` through which other integrators see a
 photograph's light. It selects `llvm_ad_rgb` if no variant is selected yet.
+
+What it offers beyond that is read when first asked for:
+
+    capture = mi_ring.load_capture("pot2.xml")
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast"))
+    for it in fit: ...
+    fit.save("out/pot2"); ring = mi_ring.load_fit("out/pot2")
 """
 
 import importlib
 import os
-import sys
+import warnings
+from typing import TYPE_CHECKING
 
-from mi_ring import llvm
+from mi_ring.system import llvm
+from mi_ring.version import __version__
 
-# Torch's workers would spin after each operation and steal the cores from Dr.Jit. Read when torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-llvm.prepare()
+if TYPE_CHECKING:
+    from mi_ring.capture.capture import Capture
+    from mi_ring.capture.loading import load_capture
+    from mi_ring.errors import InputError
+    from mi_ring.fitting.config import Config
+    from mi_ring.fitting.fit import Fit, Iteration
+    from mi_ring.fitting.terms import Term, default_terms
+    from mi_ring.nets.registry import register_network
+    from mi_ring.ring.ring import Ring
+    from mi_ring.ring.saved import load_fit
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
+#: The Python API: names and the modules that they are read from.
+_API = {
+    "Capture": "capture.capture", "load_capture": "capture.loading", "InputError": "errors", "Config": "fitting.config",
+    "Fit": "fitting.fit", "Iteration": "fitting.fit", "Term": "fitting.terms", "default_terms": "fitting.terms",
+    "register_network": "nets.registry", "Ring": "ring.ring", "load_fit": "ring.saved",
+}  # fmt: skip
 
-llvm.check()
-dr.set_thread_count(max(2, dr.thread_count()))  # on one thread Mitsuba waits forever when it reads or writes an EXR
-
-PLUGINS = ("mi_ring.photograph", "mi_ring.bsdf", "mi_ring.mesh", "mi_ring.integrator")
-
-
-def _register(old: str | None, new: str) -> None:
-    """Plugin classes belong to one variant: define them anew in each."""
-    for name in PLUGINS:
-        if name in sys.modules:
-            importlib.reload(sys.modules[name])
-        else:
-            importlib.import_module(name)
+__all__ = [
+    "Capture", "Config", "Fit", "InputError", "Iteration", "Ring", "Term", "__version__", "default_terms",
+    "load_capture", "load_fit", "register_network",
+]  # fmt: skip
 
 
-mi.detail.add_variant_callback(_register)
-if mi.variant() is None:
-    mi.set_variant("llvm_ad_rgb")
-else:
-    _register(None, mi.variant())
+def __getattr__(name: str):
+    if name not in _API:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_API[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _prepare_mitsuba() -> None:
+    """Choose LLVM, register the plugins, select a variant."""
+    # Torch's workers would spin after each operation and steal the cores from Dr.Jit. Read when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    llvm.prepare()
+    problem = llvm.missing()
+    if llvm.has_atomic():  # else Mitsuba cannot be imported
+        import drjit as dr
+        import mitsuba as mi
+
+        from mi_ring import plugins
+
+        def register(old: str | None, new: str) -> None:
+            if problem and new.startswith("llvm"):
+                raise ImportError(problem)
+            plugins.register()
+
+        # On one thread Mitsuba waits forever when it reads or writes an EXR.
+        dr.set_thread_count(max(2, dr.thread_count()))
+        mi.detail.add_variant_callback(register)
+        if mi.variant() is not None:
+            register(None, mi.variant())
+        elif not problem:
+            mi.set_variant("llvm_ad_rgb")
+    if problem:  # other variants do without: whoever needs it is told again
+        warnings.warn(problem, stacklevel=3)
+
+
+_prepare_mitsuba()

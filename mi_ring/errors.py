@@ -1,5 +1,6 @@
 """The one error that a user can cause, and the commonest cause of it."""
 
+
 from pathlib import Path
 
 
@@ -9,6 +10,10 @@ class InputError(ValueError):
     The message is one line: the file, the field, what was found, and what to do. Commands print it and exit with
     status 2.
     """
+
+
+class SceneError(ValueError):
+    """What a scene asks for cannot be rendered. The message says which object and what is wrong with it."""
 
 
 def require_file(path: Path, wanted: str, field: str = "") -> None:

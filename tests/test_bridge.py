@@ -10,8 +10,8 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring import bridge
-from mi_ring.integrator import Photographs
+from mi_ring.rendering import bridge
+from mi_ring.rendering.photographs import Photographs
 
 WIDTH, HEIGHT, COUNT = 35, 25, 2  # [px], photographs
 CENTER = np.array([0.3, -0.2, 0.15])

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_ring import command, fit, results
+from mi_ring import fit
 from mi_ring.errors import InputError
+from mi_ring.output import results
+from mi_ring.system import command, files, machine
 
 
 def xml(pattern, new, count=1):
@@ -229,8 +231,8 @@ def test_a_log_that_cannot_be_continued(tmp_path):
 
 def test_after_a_full_disk_the_fit_goes_on(small_capture, tmp_path, monkeypatch, capsys):
     out, quick = tmp_path / "out", ["--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2]
-    monkeypatch.setattr(fit, "CHECKPOINT_SECONDS", 0)
-    save, saved = results.save, []
+    monkeypatch.setattr(machine, "CHECKPOINT_SECONDS", 0)
+    save, saved = files.write_state, []
 
     def sometimes(state, path):
         if len(saved) == 3:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from mi_ring.bsdf import CookTorrance, check_attributes
+from mi_ring.plugins.cooktorrance import CookTorrance
+from mi_ring.rendering.attributes import require_attributes
 
 CONTEXT = mi.BSDFContext()
 DISTRIBUTIONS = ["ggx", "beckmann"]
@@ -491,5 +492,5 @@ def test_photometric_refuses_a_shape_that_is_no_mesh():
 def test_attributes_of_a_stock_mesh_are_accepted(tetrahedron):
     bsdf = reading(diffuse="vertex_diffuse", specular="face_shine", roughness="vertex_roughness")
     scene = scene_of({"type": "ply", "filename": tetrahedron, "bsdf": bsdf})
-    check_attributes(scene.shapes()[0])
+    require_attributes(scene.shapes()[0])
     mi.render(scene, spp=1)

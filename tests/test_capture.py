@@ -9,13 +9,15 @@ import tifffile
 import torch
 from conftest import AXES, CENTER
 
-from mi_ring import bridge, capture
+from mi_ring import images
+from mi_ring.capture import decoding, loading
 from mi_ring.errors import InputError
+from mi_ring.rendering import bridge
 
 
 def test_srgb_decoding_is_the_standards():
     image = np.array([[[0, 10, 11], [127, 200, 255]]], np.uint8)
-    linear, clipped = capture.decode(image, linear=False, saturation=1.0)
+    linear, clipped = decoding.decode(image, linear=False, saturation=1.0)
     # IEC 61966-2-1, by hand: 10/255 is on the straight part, 11/255 on the power
     expected = [0, 10 / 255 / 12.92, ((11 / 255 + 0.055) / 1.055) ** 2.4]
     assert linear[0, 0] == pytest.approx(expected, abs=1e-7)
@@ -25,21 +27,21 @@ def test_srgb_decoding_is_the_standards():
 
 def test_sixteen_bits_are_linear_and_all_of_them_count():
     image = np.array([[[0, 1, 257], [32768, 65534, 65535]]], np.uint16)
-    linear, clipped = capture.decode(image, linear=True, saturation=0.5)
+    linear, clipped = decoding.decode(image, linear=True, saturation=0.5)
     np.testing.assert_allclose(linear, image / 65535.0, rtol=1e-6)
     assert clipped.tolist() == [[[False, False, False], [True, True, True]]]
 
 
 def test_srgb_encoding_inverts_decoding():
     v = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(capture.srgb_to_linear(capture.linear_to_srgb(v)), v, atol=1e-5)
+    np.testing.assert_allclose(images.srgb_to_linear(images.linear_to_srgb(v)), v, atol=1e-5)
 
 
 def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
     path, _ = broken_capture
     pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
     mi.Bitmap(pixels).write(str(path.parent / "images/002.png"))
-    scene = capture.load(path)
+    scene = loading.load_capture(path)
     rgb = scene.observe([2])[0]
     np.testing.assert_allclose(rgb[0].numpy(), pixels / 65535.0, rtol=1e-6)
 
@@ -49,7 +51,7 @@ def test_tiff_files_are_read_with_all_bits(broken_capture):
     edit("images/002.png", "images/002.tiff")
     pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
     tifffile.imwrite(path.parent / "images/002.tiff", pixels)
-    np.testing.assert_allclose(capture.load(path).observe([2])[0][0].numpy(), pixels / 65535.0, rtol=1e-6)
+    np.testing.assert_allclose(loading.load_capture(path).observe([2])[0][0].numpy(), pixels / 65535.0, rtol=1e-6)
 
 
 def test_grey_pictures_and_those_with_alpha_are_read(broken_capture):
@@ -60,11 +62,11 @@ def test_grey_pictures_and_those_with_alpha_are_read(broken_capture):
     rgb, alpha = np.concatenate([grey, grey // 2, grey // 3], 2), np.zeros_like(grey)
     alpha[10:20], alpha[20:30] = 255, 51
     mi.Bitmap(np.concatenate([rgb, alpha], 2)).write(str(path.parent / "images/001.png"))
-    scene = capture.load(path)
+    scene = loading.load_capture(path)
     assert np.array_equal(scene.images[0], np.repeat(grey, 3, 2))
     assert np.array_equal(scene.images[1][10:20], rgb[10:20])
     assert not scene.images[1][:10].any() and not scene.images[1][30:].any()  # transparent: black
-    linear = capture.decode(rgb, linear=False, saturation=1.0)[0]
+    linear = decoding.decode(rgb, linear=False, saturation=1.0)[0]
     np.testing.assert_allclose(scene.observe([1])[0][0, 20:30], 0.2 * linear[20:30], rtol=0.1, atol=2e-4)
     assert np.array_equal(scene.masks[1], alpha[..., 0])  # the photograph is its own mask
 
@@ -75,7 +77,7 @@ def test_a_photograph_without_alpha_is_no_mask(broken_capture):
     with pytest.raises(
         InputError, match=r'001.png: photograph "001", mask: is the photograph itself, which has no alp'
     ):
-        capture.load(path)
+        loading.load_capture(path)
 
 
 def test_sixteen_bit_masks_are_read(broken_capture):
@@ -83,7 +85,7 @@ def test_sixteen_bit_masks_are_read(broken_capture):
     mask = np.zeros((40, 56, 1), np.uint16)
     mask[10:20, 5:30] = 65535
     mi.Bitmap(mask).write(str(path.parent / "masks/003.png"))
-    assert np.array_equal(capture.load(path).masks[3], (mask[:, :, 0] // 257).astype(np.uint8))
+    assert np.array_equal(loading.load_capture(path).masks[3], (mask[:, :, 0] // 257).astype(np.uint8))
 
 
 def test_files_are_those_beside_the_scene_not_those_of_the_working_directory(broken_capture, monkeypatch):
@@ -93,13 +95,13 @@ def test_files_are_those_beside_the_scene_not_those_of_the_working_directory(bro
     (path.parent / "images/003.png").unlink()
     monkeypatch.chdir(elsewhere)
     with pytest.raises(InputError, match="images/003.png"):
-        capture.load(path)
+        loading.load_capture(path)
 
 
 def test_a_shape_needs_no_id(broken_capture):
     path, edit = broken_capture
     edit(' id="object"', "")
-    scene = capture.load(path)
+    scene = loading.load_capture(path)
     bridge.Surface(scene.scene, scene.shape)
 
 
@@ -110,13 +112,13 @@ def test_declared_encoding_beats_the_default(broken_capture):
     pixels = np.arange(56 * 40 * 3, dtype=np.uint16).reshape(40, 56, 3) * 9 + 3
     for k in (1, 2):
         mi.Bitmap(pixels).write(str(path.parent / f"images/{k:03}.png"))
-    scene = capture.load(path)
-    for k, convert in ((1, capture.srgb_to_linear), (2, np.float32)):
+    scene = loading.load_capture(path)
+    for k, convert in ((1, images.srgb_to_linear), (2, np.float32)):
         np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(pixels / 65535.0), atol=1e-6)
 
 
 def test_shrinking_averages_blocks(small_capture):
-    scene = capture.load(small_capture)
+    scene = loading.load_capture(small_capture)
     full, _, mask, masked = scene.observe([3, 7])
     small, _, coverage, _ = scene.observe([3, 7], 4)
     assert masked.tolist() == [True, True]
@@ -128,14 +130,14 @@ def test_shrinking_averages_blocks(small_capture):
 @pytest.fixture
 def decodes(monkeypatch):
     """How many photographs have been decoded."""
-    calls, decode = [], capture.decode
-    monkeypatch.setattr(capture, "decode", lambda *args: calls.append(None) or decode(*args))
+    calls, decode = [], decoding.decode
+    monkeypatch.setattr(images, "decode", lambda *args: calls.append(None) or decode(*args))
     return lambda: len(calls)
 
 
 def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypatch, decodes):
-    monkeypatch.setattr(capture, "REMEMBERED_PIXELS", 3 * 28 * 20 + 7)
-    scene = capture.load(small_capture)
+    monkeypatch.setattr(images, "REMEMBERED_PIXELS", 3 * 28 * 20 + 7)
+    scene = loading.load_capture(small_capture)
     first = scene.observe([5, 2, 9, 4], 2)
     again = scene.observe([4, 9, 5], 2)
     assert all(torch.equal(a[[3, 2, 0]], b) for a, b in zip(first, again))
@@ -146,26 +148,26 @@ def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypa
 
 
 def test_each_photograph_is_remembered_at_its_own_scale(small_capture, decodes):
-    scene = capture.load(small_capture)
+    scene = loading.load_capture(small_capture)
     for _ in range(3):
         half, quarter = scene.observe([5], 2), scene.observe([9], 4)
     assert decodes() == 2
-    torch.testing.assert_close(scene.observe([5], 4)[0][0], capture.shrink(half[0][0], 2))
+    torch.testing.assert_close(scene.observe([5], 4)[0][0], images.box_filter(half[0][0], 2))
     assert quarter[0].shape == (1, 10, 14, 3) and decodes() == 3
 
 
 def test_photographs_to_look_at_are_evenly_spread(small_capture):
-    scene = capture.load(small_capture)
+    scene = loading.load_capture(small_capture)
     assert scene.spread() == list(range(12)) and scene.spread(5) == [0, 2, 4, 7, 9]
 
 
 def test_masks_are_found_in_a_dark_room(small_capture):
-    given, found = capture.load(small_capture), capture.load(small_capture, masks="none")
+    given, found = loading.load_capture(small_capture), loading.load_capture(small_capture, masks="none")
     assert given.threshold is None and 0 < found.threshold < 0.02
     for mask, guess in zip(given.masks, found.masks):
         both, either = ((mask > 127) & (guess > 127)).sum(), ((mask > 127) | (guess > 127)).sum()
         assert both > 0.9 * either  # the lights are beside the cameras: a thin crescent is dark
-    assert capture.load(small_capture, masks="auto").masks[3].tolist() == given.masks[3].tolist()
+    assert loading.load_capture(small_capture, masks="auto").masks[3].tolist() == given.masks[3].tolist()
 
 
 def test_no_masks_are_found_in_a_bright_room(broken_capture):
@@ -173,7 +175,7 @@ def test_no_masks_are_found_in_a_bright_room(broken_capture):
     for file in path.parent.glob("images/*.png"):
         image = np.array(mi.Bitmap(str(file)))
         mi.Bitmap(np.maximum(image, 90)).write(str(file))
-    scene = capture.load(path, masks="none")
+    scene = loading.load_capture(path, masks="none")
     assert scene.threshold is None and scene.masks == [None] * 12
 
 
@@ -182,11 +184,11 @@ def test_a_photograph_that_the_light_missed_gets_no_mask(broken_capture):
     missed = np.zeros((40, 56, 3), np.uint8)
     missed[30, 50] = 255  # a hot pixel
     mi.Bitmap(missed).write(str(path.parent / "images/004.png"))
-    scene = capture.load(path, masks="none")
+    scene = loading.load_capture(path, masks="none")
     assert scene.masks[4] is None and sum(mask is not None for mask in scene.masks) == 11
     for file in path.parent.glob("images/*.png"):
         mi.Bitmap(np.zeros((40, 56, 3), np.uint8)).write(str(file))
-    assert capture.load(path, masks="none").threshold is None
+    assert loading.load_capture(path, masks="none").threshold is None
 
 
 def test_specks_are_no_object(broken_capture):
@@ -195,11 +197,11 @@ def test_specks_are_no_object(broken_capture):
     assert not image[2, 3].any()
     image[2, 3] = 200  # a hot pixel
     mi.Bitmap(image).write(str(path.parent / "images/004.png"))
-    assert capture.load(path, masks="none").masks[4][2, 3] == 0
+    assert loading.load_capture(path, masks="none").masks[4][2, 3] == 0
 
 
 def test_sphere_of_masks_finds_the_object(small_capture):
-    center, radius = capture.load(small_capture).sphere()
+    center, radius = loading.load_capture(small_capture).sphere()
     volume = np.prod(AXES) ** (1 / 3)
     # Twelve views: the hull is a little larger than the object, and masks are uncertain by half a pixel, 5 % of it.
     assert np.linalg.norm(center - CENTER) < 0.1 * volume
@@ -212,7 +214,7 @@ def test_sphere_of_cameras_is_near_the_object(broken_capture):
     for k in range(12):
         text = text.replace(f'<string name="mask" value="masks/{k:03}.png"/>', "")
     path.write_text(text)
-    scene = capture.load(path)
+    scene = loading.load_capture(path)
     assert scene.observe([0])[3].tolist() == [False]
     center, radius = scene.sphere()
     assert np.linalg.norm(center - CENTER) < 8  # principal point and targets are off the centre
@@ -225,12 +227,12 @@ def test_sphere_of_the_xml_wins(broken_capture):
         '<bsdf type="cooktorrance"/>',
         '<bsdf type="cooktorrance"/><float name="radius" value="4.5"/><point name="center" x="1" y="2" z="3"/>',
     )
-    center, radius = capture.load(path).sphere()
+    center, radius = loading.load_capture(path).sphere()
     assert center.tolist() == [1, 2, 3] and radius == 4.5
 
 
 def test_exposure_and_reflectance_follow_the_lamp(small_capture):
-    scene = capture.load(small_capture)
+    scene = loading.load_capture(small_capture)
     exposure = scene.exposure()
     values = [scene.observe([k], 4) for k in range(12)]
     inside = torch.cat([rgb[mask > 0.5] for rgb, _, mask, _ in values])

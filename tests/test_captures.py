@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_ring import capture, evaluate, fit, render
-from mi_ring.command import run
+from mi_ring import evaluate, fit, render
+from mi_ring.capture import capture, loading
+from mi_ring.metrics import evaluation, surfaces
+from mi_ring.system.command import run
 
 ROOT = Path(__file__).parents[1]
 POT = ROOT / "scenes" / "pot2.xml"
@@ -26,7 +28,7 @@ def test_pot_is_a_small_closed_surface_of_genus_one():
 
 @pytest.mark.parametrize(("file", "count"), [("pot2.xml", 32), ("pot2/truth/scene.xml", 8)])
 def test_pot_has_its_photographs(file, count):
-    scene = capture.load(ROOT / "scenes" / file)
+    scene = loading.load_capture(ROOT / "scenes" / file)
     assert len(scene) == count
     assert all(sensor.size == (256, 256) for sensor in scene.sensors)
     assert scene.photographs.colocated  # a flash at the camera
@@ -35,10 +37,10 @@ def test_pot_has_its_photographs(file, count):
 
 
 def test_cameras_of_the_pot_put_the_true_mesh_into_the_masks():
-    scene = capture.load(POT)
+    scene = loading.load_capture(POT)
     mesh = trimesh.load(ROOT / "scenes/pot2/truth/mesh.ply", process=False)
     for k in (0, 5, 17, 31):
-        matrix, focal, centre = capture.camera_of(scene.sensors[k])
+        matrix, focal, centre, _ = scene.sensors[k].camera
         local = (mesh.vertices - matrix[:3, 3]) @ matrix[:3, :3]
         column, row = (centre - focal * local[:, :2] / local[:, 2:]).T
         rows, columns = np.nonzero(scene.masks[k] > 127)
@@ -48,7 +50,7 @@ def test_cameras_of_the_pot_put_the_true_mesh_into_the_masks():
 
 
 def test_normalising_sphere_of_the_pot_comes_from_its_masks():
-    center, radius = capture.load(POT).sphere()
+    center, radius = loading.load_capture(POT).sphere()
     mesh = trimesh.load(ROOT / "scenes/pot2/truth/mesh.ply", process=False)
     assert np.linalg.norm(center - mesh.center_mass) < 0.1 * radius
     assert 0.95 < radius / (1.3 * (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)) < 1.2
@@ -57,7 +59,7 @@ def test_normalising_sphere_of_the_pot_comes_from_its_masks():
 @pytest.mark.parametrize("name", ["bunny", "pig", "teapot"])
 def test_normalising_sphere_whatever_the_units(shared, name):
     folder = shared / "data/captures" / name
-    center, radius = capture.load(folder / "scene.xml").sphere()
+    center, radius = loading.load_capture(folder / "scene.xml").sphere()
     mesh = trimesh.load(folder / "truth/mesh.ply", process=False)
     assert np.linalg.norm(center - mesh.bounds.mean(0)) < 0.5 * radius
     assert 0.3 < radius / (np.linalg.norm(mesh.extents) / 2) < 1.0
@@ -67,7 +69,7 @@ def test_a_short_fit_of_the_teapot_is_already_near_and_our_numbers_are_the_judge
     folder, out = shared / "data/captures/teapot", tmp_path / "teapot"
     fit.main([str(folder / "scene.xml"), "--out", str(out), "--iterations", "60", "--levels", "3", "4",
               "--widths", "64", "128", "--shares", "0.5", "0.5", "--subdivisions", "5"])  # fmt: skip
-    ours = evaluate.evaluate(out, folder / "truth/mesh.ply", spp=1)
+    ours = evaluation.evaluate_fit(out, folder / "truth/mesh.ply", spp=1)
     # The start sphere is off by about 50 degrees; a minute of one core gets this far with any seed tried.
     assert ours["normal_mean"] < 15 and ours["iou"] > 0.9
     render.main([str(out), str(folder / "scene.xml"), str(tmp_path / "pictures"), "--spp", "1"])
@@ -84,9 +86,9 @@ def test_a_short_fit_of_the_teapot_is_already_near_and_our_numbers_are_the_judge
 
 def test_true_mesh_has_no_error(tmp_path, shared):
     folder = shared / "data/captures/pig"
-    scene = capture.load(folder / "scene.xml")
-    mesh, truth = evaluate.load_mesh(folder / "truth/mesh.ply")
-    numbers, views = evaluate.compare_surfaces(scene, truth, truth, float(np.linalg.norm(mesh.extents)))
+    scene = loading.load_capture(folder / "scene.xml")
+    mesh, truth = surfaces.load_true_mesh(folder / "truth/mesh.ply")
+    numbers, views = surfaces.compare_surfaces(scene, truth, truth, float(np.linalg.norm(mesh.extents)))
     assert numbers["iou"] == 1 and numbers["depth_mean"] == 0 and len(views) == len(scene)
     assert numbers["normal_mean"] < 0.02  # arccos near 1 in float32
 

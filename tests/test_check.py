@@ -8,7 +8,10 @@ import pytest
 from PIL import Image
 from test_hull import ball, silhouettes
 
-from mi_ring import check, command, hull
+from mi_ring import check
+from mi_ring.geometry import hull
+from mi_ring.metrics import mask_agreement
+from mi_ring.system import command
 
 
 def run(path, tmp_path, capsys, *options):
@@ -82,7 +85,7 @@ def test_principal_points_off_by_half_a_pixel(broken_capture, tmp_path, capsys):
 @pytest.mark.parametrize(("shift", "words"), [(-0.5, "add 0.5 to"), (0.5, "subtract 0.5 from"), (0.0, None)])
 def test_half_a_pixel_either_way(shift, words, scale):
     views = [s._replace(centre=s.centre + shift) for s in silhouettes(ball(4.0), 12, scale)]
-    found = check.half_pixel(hull.Hull(views, "scene.xml"))
+    found = mask_agreement.half_pixel(hull.Hull(views, "scene.xml"))
     assert words in found if words else found is None
 
 

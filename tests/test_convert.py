@@ -12,8 +12,11 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from scipy.spatial.transform import Rotation
 
-from mi_ring import capture, command, convert, photograph
+from mi_ring import convert, images
+from mi_ring.capture import loading
 from mi_ring.errors import InputError
+from mi_ring.rendering import pinhole
+from mi_ring.system import command
 
 SIZE = W, H = 62, 52
 K = np.array([[70.0, 0, 28.5], [0, 76.0, 27.25], [0, 0, 1]])  # fx, fy and the principal point are all different
@@ -35,7 +38,7 @@ def by_hand(R, t, calibration=K):
 
 def in_scene(sensor):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    x, depth = photograph.project(
+    x, depth = pinhole.project(
         sensor.to_world.matrix, sensor.focal, sensor.centre, mi.Point3f(POINTS.T.astype("f4"))
     )
     assert np.array(depth).min() > 0
@@ -45,7 +48,7 @@ def in_scene(sensor):
 def converted(*arguments):
     """The scene that a conversion writes."""
     assert convert.main([str(a) for a in arguments]) is None
-    return capture.load(arguments[2])
+    return loading.load_capture(arguments[2])
 
 
 def write(path, pixels):
@@ -160,7 +163,7 @@ def test_transforms_of_nerf(tmp_path):
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
     assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
-    expected = capture.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
+    expected = images.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
     np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
 
 
@@ -545,7 +548,7 @@ def test_truncated_files(diligent, colmap, tmp_path):
 def test_both_formats_of_a_capture_agree(shared, tmp_path, name):
     """The captures come as scene.xml and as transforms.json."""
     folder = shared / "data/captures" / name
-    ours, theirs = converted("transforms", folder, tmp_path / "a.xml"), capture.load(folder / "scene.xml", images=False)
+    ours, theirs = converted("transforms", folder, tmp_path / "a.xml"), loading.load_capture(folder / "scene.xml", images=False)
     for a, b in zip(ours.sensors, theirs.sensors):
         np.testing.assert_allclose(np.array(a.to_world.matrix), np.array(b.to_world.matrix), rtol=1e-4, atol=1e-5)
         assert a.filename.resolve() == b.filename.resolve()

@@ -9,11 +9,14 @@ import torch
 from test_fit import QUICK, distance
 from torch.nn import functional as F
 
-from mi_ring import bridge, fit, losses
-from mi_ring.brdfnet import BRDFNet
-from mi_ring.config import Config
+from mi_ring import fit
 from mi_ring.errors import InputError
-from mi_ring.shapenet import ShapeNet
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.terms import mask_loss, rgb_loss, velocity_loss
+from mi_ring.nets.brdfnet import BRDFNet
+from mi_ring.nets.shapenet import ShapeNet
+from mi_ring.rendering import bridge
+from mi_ring.system import machine
 
 TINY = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2"]
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU and a torch built with CUDA")
@@ -37,9 +40,9 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
         images, masks = (torch.empty(2, 5, 7, *more, requires_grad=True) for more in ((3,), ()))
     x, material = net(s), brdf_net(s)
     terms = [
-        losses.velocity_loss(net.velocity, x, 0.01),
-        losses.rgb_loss(images, torch.empty_like(images), torch.empty_like(images, dtype=torch.bool), 1.0, "l1+log"),
-        losses.mask_loss(masks, torch.empty_like(masks), 1.5),
+        velocity_loss(net.velocity, x, 0.01),
+        rgb_loss(images, torch.empty_like(images), torch.empty_like(images, dtype=torch.bool), 1.0, "l1+log"),
+        mask_loss(masks, torch.empty_like(masks), 1.5),
     ]
     assert all(t.is_meta for t in (x, *material.values(), *terms))
     (x.sum() + sum(m.sum() for m in material.values()) + sum(terms)).backward()
@@ -50,7 +53,7 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
 def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
     for precision, expected in (("auto", amx), ("bfloat16", True), ("float32", False)):
-        with fit.autocast(precision, torch.device("cpu"))():
+        with machine.autocast(precision, torch.device("cpu"))():
             assert torch.is_autocast_enabled("cpu") == expected
 
 
@@ -65,7 +68,7 @@ def test_without_a_gpu_the_fit_says_so_and_goes_on(small_capture, tmp_path, caps
 def test_without_a_working_gpu_driver_the_fit_goes_on(monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(dr, "has_backend", lambda backend: False)
-    assert fit.set_variant("cuda_ad_rgb") == "llvm_ad_rgb"
+    assert machine.set_variant("cuda_ad_rgb") == "llvm_ad_rgb"
     assert "(Dr.Jit finds none, or its driver is too old)" in capsys.readouterr().out
 
 

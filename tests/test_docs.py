@@ -20,10 +20,11 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring import bsdf, command, integrator, mesh, photograph
-from mi_ring.config import Config
-from mi_ring.formats import FORMATS
-from mi_ring.ring import Ring
+from mi_ring import __main__
+from mi_ring.fitting.config import Config
+from mi_ring.importers.formats import FORMATS
+from mi_ring.plugins import cooktorrance, flash, photograph, photometric, shapenet
+from mi_ring.ring.ring import Ring
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,8 +32,8 @@ ROOT = Path(__file__).parents[1]
 def plugins():
     """By name; the modules are loaded anew with each variant, so that they must be asked each time."""
     return {
-        "photograph": photograph.Photograph, "flash": photograph.Flash, "shapenet": mesh.ShapeNetMesh,
-        "cooktorrance": bsdf.CookTorrance, "photometric": integrator.Photometric,
+        "photograph": photograph.Photograph, "flash": flash.Flash, "shapenet": shapenet.ShapeNetMesh,
+        "cooktorrance": cooktorrance.CookTorrance, "photometric": photometric.Photometric,
     }  # fmt: skip
 
 
@@ -74,8 +75,8 @@ def test_every_plugin_has_its_page(built, name):
 
 def test_every_command_has_its_help_on_the_page(built):
     text = text_of(built / "commands.html")
-    for name in command.COMMANDS:
-        usage, sentence = command.summary(name)
+    for name in __main__.COMMANDS:
+        usage, sentence = __main__.summary(name)
         assert squeezed(usage) in text and squeezed(sentence.replace("`", "")) in text
         assert f"usage:mi_ring.{name}[-h]" in text
     assert all(f"usage:mi_ring.convert{name}[-h]" in text for name in FORMATS)
@@ -244,7 +245,7 @@ def config_of(name: str) -> type:
     return found
 
 
-PAGES = [(name,) for name in command.COMMANDS if name != "convert"] + [("convert", name) for name in FORMATS]
+PAGES = [(name,) for name in __main__.COMMANDS if name != "convert"] + [("convert", name) for name in FORMATS]
 
 
 def descriptions(config: type) -> dict[str, str]:
@@ -281,10 +282,10 @@ def test_convert_lists_its_formats():
 def test_the_program_says_what_each_command_does(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["mi-ring", "--help"])
     with pytest.raises(SystemExit) as stop:
-        command.main()
+        __main__.main()
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for name in command.COMMANDS:
+    for name in __main__.COMMANDS:
         assert re.search(rf"^  mi-ring {name} [A-Z]\S+.*\n      \S+ \S+", text, re.M), name
 
 
@@ -292,7 +293,7 @@ def test_the_program_says_what_each_command_does(capsys, monkeypatch):
 def test_a_command_that_there_is_not_is_one_line(arguments, wrong, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["mi-ring", *arguments])
     with pytest.raises(SystemExit) as stop:
-        command.main()
+        __main__.main()
     assert stop.value.code == 2
     printed = capsys.readouterr()
     assert wrong in printed.err and printed.err.count("\n") == 1 and not printed.out

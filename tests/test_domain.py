@@ -6,8 +6,9 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_ring.domain import PLACES, Domain, Sphere, closed, load
 from mi_ring.errors import InputError
+from mi_ring.geometry.domain import PLACES, Domain, Sphere, closed_domain
+from mi_ring.geometry.meshes import load_closed_mesh
 
 MAJOR, MINOR = 1.0, 0.35
 
@@ -16,7 +17,7 @@ MAJOR, MINOR = 1.0, 0.35
 def torus():
     """A torus of very uneven triangles."""
     mesh = trimesh.creation.torus(MAJOR, MINOR, major_sections=150, minor_sections=24)
-    return closed(mesh, center=[0, 0, 0], radius=1.0)[0]
+    return closed_domain(mesh, center=[0, 0, 0], radius=1.0)[0]
 
 
 def off_torus(points):
@@ -64,7 +65,7 @@ def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
 
 def test_a_level_too_coarse_for_the_handles_keeps_them():
     """A ring as thin as wire: twenty triangles cannot have its shape."""
-    wire = closed(trimesh.creation.torus(1.0, 0.02, major_sections=90, minor_sections=8))[0]
+    wire = closed_domain(trimesh.creation.torus(1.0, 0.02, major_sections=90, minor_sections=8))[0]
     points, faces = wire.sample(0)
     mesh = trimesh.Trimesh(points.numpy(), faces)
     assert mesh.is_watertight and mesh.euler_number == 0
@@ -74,7 +75,7 @@ def test_normalisation_and_orientation():
     mesh = trimesh.creation.torus(3.0, 1.0)
     mesh.apply_translation([10, 20, 30])
     mesh.invert()
-    domain, center, radius = closed(mesh)
+    domain, center, radius = closed_domain(mesh)
     np.testing.assert_allclose(center, [10, 20, 30], atol=1e-6)
     assert np.linalg.norm(domain.points, axis=1).mean() == pytest.approx(1)
     assert trimesh.Trimesh(domain.points, domain.faces).volume > 0 and 2.9 < radius < 3.2
@@ -85,9 +86,9 @@ def test_a_mesh_with_a_hole_is_no_domain(tmp_path):
     ball.update_faces(np.arange(len(ball.faces)) > 5)
     ball.export(tmp_path / "open.ply")
     with pytest.raises(InputError, match=r"open.ply: domain: is not a closed surface"):
-        load(tmp_path / "open.ply", "domain")
+        load_closed_mesh(tmp_path / "open.ply", "domain")
     with pytest.raises(InputError, match=r"gone.ply: domain: no such file"):
-        load(tmp_path / "gone.ply", "domain")
+        load_closed_mesh(tmp_path / "gone.ply", "domain")
 
 
 def test_what_a_domain_contains():

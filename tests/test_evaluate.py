@@ -10,10 +10,14 @@ import trimesh
 from conftest import AXES, CENTER
 from trimesh.creation import box, icosphere, torus
 
-from mi_ring import capture, evaluate, render, results
-from mi_ring.command import run
-from mi_ring.hull import genus
-from mi_ring.ring import Ring
+from mi_ring import evaluate, render
+from mi_ring.capture import loading, scenefile
+from mi_ring.geometry.meshes import genus
+from mi_ring.metrics import predictions, surfaces
+from mi_ring.output import ply
+from mi_ring.rendering import plain_mesh
+from mi_ring.ring.ring import Ring
+from mi_ring.system.command import run
 
 
 def rectangle(width, height, z=0.0):
@@ -32,13 +36,13 @@ def moved(mesh, scale=1.0, to=(400.0, -1500.0, 90.0)):
 
 def test_parallel_planes_are_as_far_apart_as_they_are():
     # The diagonal is 5: 0.015 of it is 0.3 %, to both sides.
-    numbers = evaluate.compare_shapes(moved(rectangle(3, 4, 0.015)), moved(rectangle(3, 4)))
+    numbers = surfaces.compare_shapes(moved(rectangle(3, 4, 0.015)), moved(rectangle(3, 4)))
     assert numbers["chamfer"] == pytest.approx(0.3, abs=1e-9)
     assert numbers["f_score_0.1"] == 0 and numbers["f_score_0.5"] == 1
 
 
 def test_equal_surfaces_of_other_triangles_have_no_distance():
-    numbers = evaluate.compare_shapes(moved(box((3, 4, 5)).subdivide()), moved(box((3, 4, 5))))
+    numbers = surfaces.compare_shapes(moved(box((3, 4, 5)).subdivide()), moved(box((3, 4, 5))))
     assert numbers["chamfer"] < 1e-9
     assert numbers["f_score_0.1"] == numbers["f_score_0.5"] == 1
 
@@ -46,7 +50,7 @@ def test_equal_surfaces_of_other_triangles_have_no_distance():
 @pytest.mark.parametrize("swapped", [False, True])
 def test_what_is_missing_or_too_much_counts_half(swapped):
     half, whole = moved(rectangle(1, 1), 7), moved(rectangle(2, 1), 7)
-    numbers = evaluate.compare_shapes(*(whole, half) if swapped else (half, whole))
+    numbers = surfaces.compare_shapes(*(whole, half) if swapped else (half, whole))
     diagonal = np.sqrt(2 if swapped else 5)
     # A point of the other half is between 0 and 1 away from the first, 1/2 in the mean. Tolerances: 100,000 points.
     assert numbers["chamfer"] == pytest.approx(100 / diagonal * (0 + 1 / 4) / 2, rel=0.02)
@@ -56,9 +60,9 @@ def test_what_is_missing_or_too_much_counts_half(swapped):
 
 
 def test_spheres_of_two_radii():
-    numbers = evaluate.compare_shapes(moved(icosphere(5, 1.004), 30), moved(icosphere(5), 30))
+    numbers = surfaces.compare_shapes(moved(icosphere(5, 1.004), 30), moved(icosphere(5), 30))
     assert numbers["chamfer"] == pytest.approx(100 * 0.004 / (2 * np.sqrt(3)), rel=0.01)
-    numbers = evaluate.compare_shapes(icosphere(5, 1.004), icosphere(5))
+    numbers = surfaces.compare_shapes(icosphere(5, 1.004), icosphere(5))
     assert numbers["f_score_0.1"] == 0 and numbers["f_score_0.5"] == 1  # 0.115 %
 
 
@@ -94,7 +98,7 @@ def test_two_spheres_that_interpenetrate(seed):
     expected = crossing_triangles(both)
     assert expected > 30
     for mesh in (both, moved(both, 30), moved(both, 0.01)):  # at the last, float32 would see nothing
-        assert evaluate.self_intersections(mesh) == expected
+        assert surfaces.self_intersections(mesh) == expected
 
 
 def test_a_crumpled_sphere_where_an_edge_pierces_many():
@@ -103,14 +107,14 @@ def test_a_crumpled_sphere_where_an_edge_pierces_many():
                                  mesh.faces, process=False), 20)  # fmt: skip
     expected = crossing_triangles(mesh)
     assert expected > 0.5 * len(mesh.faces)
-    assert evaluate.self_intersections(mesh) == expected
+    assert surfaces.self_intersections(mesh) == expected
 
 
 def test_one_needle_through_three_sheets():
     sheets = [rectangle(4, 3, z) for z in (0.0, 0.5, 1.0)]
     needle = trimesh.Trimesh([[2.5, 1, -1], [2.5, 1, 2], [9, 1.2, 0.1]], [[0, 1, 2]], process=False)
     mesh = trimesh.util.concatenate([*sheets, needle])
-    assert evaluate.self_intersections(mesh) == crossing_triangles(mesh) >= 4
+    assert surfaces.self_intersections(mesh) == crossing_triangles(mesh) >= 4
 
 
 @pytest.mark.parametrize(
@@ -119,7 +123,7 @@ def test_one_needle_through_three_sheets():
 )  # fmt: skip
 def test_what_does_not_cross_itself(mesh):
     for surface in (mesh, moved(mesh, 3)):
-        assert evaluate.self_intersections(surface) == 0
+        assert surfaces.self_intersections(surface) == 0
 
 
 def test_genus_of_all_pieces():
@@ -132,15 +136,15 @@ def test_genus_of_all_pieces():
 
 
 def test_a_surface_that_is_inside_out_is_flipped(small_capture):
-    scene = capture.load(small_capture)
+    scene = loading.load_capture(small_capture)
     ball = moved(icosphere(4), 20, CENTER)
     inverted = trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False)
-    outside, inside = (evaluate.scene_of(mesh.vertices, mesh.faces) for mesh in (ball, inverted))
-    numbers, views = evaluate.compare_surfaces(scene, outside, outside, 10.0)
+    outside, inside = (plain_mesh.scene_of(mesh.vertices, mesh.faces) for mesh in (ball, inverted))
+    numbers, views = surfaces.compare_surfaces(scene, outside, outside, 10.0)
     assert numbers["flipped"] == 0 and numbers["normal_mean"] < 0.1
-    numbers, _ = evaluate.compare_surfaces(scene, inside, outside, 10.0)
+    numbers, _ = surfaces.compare_surfaces(scene, inside, outside, 10.0)
     assert numbers["flipped"] == 1 and numbers["normal_mean"] > 179.9
-    numbers, _ = evaluate.compare_surfaces(scene, outside, inside, 10.0)
+    numbers, _ = surfaces.compare_surfaces(scene, outside, inside, 10.0)
     assert numbers["flipped"] == 0  # that of the fit, not of the truth
     assert [view["name"] for view in views] == [f"{k:03}.png" for k in range(12)]
 
@@ -158,9 +162,9 @@ def test_ssim_is_that_of_the_paper():
             mx, my = (weights * x).sum(), (weights * y).sum()
             vx, vy, vxy = ((weights * p).sum() for p in ((x - mx) ** 2, (y - my) ** 2, (x - mx) * (y - my)))
             values.append((2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
-    assert evaluate.ssim(a, b)["ssim"] == pytest.approx(np.mean(values), abs=1e-9)
-    assert evaluate.ssim(a, a)["ssim"] == pytest.approx(1)
-    assert evaluate.ssim(a[:10], b[:10]) == {}  # it does not fit in
+    assert predictions.ssim(a, b)["ssim"] == pytest.approx(np.mean(values), abs=1e-9)
+    assert predictions.ssim(a, a)["ssim"] == pytest.approx(1)
+    assert predictions.ssim(a[:10], b[:10]) == {}  # it does not fit in
 
 
 # The command.
@@ -172,8 +176,8 @@ def sphere_run(small_capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     ring = Ring(CENTER, 25.0, scale=0.5)
     torch.save(ring.state(), folder / "ring.pt")
-    results.write_mesh(ring, 3, folder / "mesh.ply")
-    scene = results.scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
+    ply.write_mesh(ring, 3, folder / "mesh.ply")
+    scene = scenefile.fitted_scene(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
     (folder / "scene.xml").write_bytes(scene)
     ellipsoid = trimesh.Trimesh(CENTER + icosphere(4).vertices * AXES, icosphere(4).faces)
     ellipsoid.export(folder / "truth.ply")

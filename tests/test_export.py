@@ -17,13 +17,14 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_bsdf import directions, twin
 
-from mi_ring import atlas, export, gltf, results
-from mi_ring.brdfnet import Parameter
-from mi_ring.capture import camera_of
-from mi_ring.domain import Domain
+from mi_ring import export
+from mi_ring.capture.capture import camera_of
 from mi_ring.errors import InputError
-from mi_ring.integrator import light_of
-from mi_ring.ring import Ring
+from mi_ring.geometry.domain import Domain
+from mi_ring.nets.brdfnet import Parameter
+from mi_ring.output import atlas, gltf, mitsuba_scene, results
+from mi_ring.rendering.lights import light_of
+from mi_ring.ring.ring import Ring
 
 CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
 RESOLUTION = 256
@@ -377,7 +378,7 @@ assert "mi_ring" not in sys.modules
 np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
-    sensor = export.first_photograph(run)
+    sensor = mitsuba_scene.first_photograph(run)
     matrix, (fx, fy), (cx, cy) = camera_of(sensor)
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
     x, y, z, _, *strength = np.ravel(light_of(sensor))[:7].tolist()
@@ -400,7 +401,7 @@ def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
     torch.save(bright.state({"subdivisions": 4}), tmp_path / "ring.pt")
     (tmp_path / "scene.xml").write_text(small_capture.read_text())
     export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
-    intensity = np.ravel(light_of(export.first_photograph(tmp_path)))[4:7]
+    intensity = np.ravel(light_of(mitsuba_scene.first_photograph(tmp_path)))[4:7]
     stock = mi.load_file(str(tmp_path / "stock.xml"))
     boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
     assert boost.min() > 20

@@ -17,11 +17,16 @@ import trimesh
 from conftest import AXES, CENTER
 from PIL import Image
 
-from mi_ring import capture, command, fit, render, results
-from mi_ring.config import PRESETS, Config
-from mi_ring.domain import Domain, Sphere
+from mi_ring import __main__, fit, render
+from mi_ring.capture import capture, loading
 from mi_ring.errors import InputError
-from mi_ring.ring import Ring
+from mi_ring.fitting import checkpoint, fit, optimizers, session, start
+from mi_ring.fitting.config import PRESETS, Config
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.output import results
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import load_fit
+from mi_ring.system import files, machine
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
 FILES = ["scene.xml", "ring.pt", "mesh.ply", "config.json", "log.jsonl", "inputs.png", "report.html", "checkpoint.pt"]
@@ -60,12 +65,12 @@ def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
 
 def test_muon_has_the_hidden_weights_and_adam_all_the_others():
     ring = Ring([0, 0, 0], 1.0)
-    adam, muon = fit.optimizers(ring, Config("scene.xml"))
+    adam, muon = optimizers.optimizers_of(ring, Config("scene.xml"))
     assert isinstance(adam, torch.optim.Adam) and isinstance(muon, torch.optim.Muon)
     ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))
     assert [tuple(p.shape) for p in ours] == 2 * [(256, 96), (256, 256), (256, 256)] + 2 * [(256, 256)]
     assert sorted(map(id, ours + theirs)) == sorted(map(id, ring.parameters()))
-    (alone,) = fit.optimizers(ring, Config("scene.xml", optimizer="adam"))
+    (alone,) = optimizers.optimizers_of(ring, Config("scene.xml", optimizer="adam"))
     assert len(alone.param_groups[0]["params"]) == len(list(ring.parameters()))
 
 
@@ -73,7 +78,7 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
     s, _ = Sphere().sample(3)
 
     def value(precision):
-        running = fit.Fit(fit.capture.load(small_capture), fit.parse([str(small_capture), "--precision", precision]))
+        running = fit.Fit(machine.capture.load(small_capture), fit.parse([str(small_capture), "--precision", precision]))
         running.ring.shape_net.output.weight.data.mul_(30)
         return running.regulariser(s).item()
 
@@ -81,7 +86,7 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
 
 
 def test_steps_of_the_flow_are_part_of_the_result(finished):
-    assert Ring.load(finished).shape_net.steps == Config("scene.xml").steps != 20
+    assert load_fit(finished).shape_net.steps == Config("scene.xml").steps != 20
 
 
 def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
@@ -157,10 +162,10 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
         assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
 
     interrupted = fit.parse([*arguments, "--out", str(tmp_path / "c")])
-    with fit.threads_of(interrupted):
-        first = fit.Fit(fit.capture.load(small_capture), interrupted)
+    with machine.threads_of(interrupted):
+        first = fit.Fit(machine.capture.load(small_capture), interrupted)
         results.prepare(tmp_path / "c", interrupted)
-        fit.train(first, tmp_path / "c", lambda: first.iteration == 9)  # in the second stage
+        session.train(first, tmp_path / "c", lambda: first.iteration == 9)  # in the second stage
     assert fit.main([*arguments, "--out", str(tmp_path / "c"), "--resume"]) == 0
 
     rings = [torch.load(tmp_path / name / "ring.pt")["networks"] for name in ("a", "b", "c")]
@@ -184,8 +189,8 @@ def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture)
     config = fit.parse([str(path), "--deterministic"])
     seen = set()
     for _ in range(3):
-        scene = fit.capture.load(path)
-        with fit.threads_of(config):
+        scene = machine.capture.load(path)
+        with machine.threads_of(config):
             shapes = fit.Fit(scene, config).capture.scene.shapes()
         none, own = (np.array(s.vertex_normals_buffer()) for s in shapes if type(s) is mi.Mesh)
         np.testing.assert_allclose(own, [0.6, 0, 0.8] * 3, rtol=1e-6)
@@ -209,8 +214,8 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
 
 
 def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_path, monkeypatch):
-    genuine = fit.losses.rgb_loss
-    monkeypatch.setattr(fit.losses, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
+    genuine = machine.losses.rgb_loss
+    monkeypatch.setattr(machine.losses, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
     with pytest.raises(InputError, match="diverged at iteration 9"):
         fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "20", *QUICK])
     ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
@@ -221,9 +226,9 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
     def glare(surface, photographs, coverage, seed):
         return 1000 * coverage[..., None].expand(*coverage.shape, 3)
 
-    monkeypatch.setattr(fit.bridge, "interreflection", glare)
+    monkeypatch.setattr(machine.bridge, "interreflection", glare)
     for options, bright in (([], True), (["--no-indirect"], False)):
-        first = fit.Fit(fit.capture.load(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
+        first = fit.Fit(machine.capture.load(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
         assert (first.step()["rgb"] > 100) == bright
 
 
@@ -237,11 +242,11 @@ def test_interreflection_is_left_out_where_intensities_cannot_be_true(broken_cap
 
 def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatch):
     path, edit = broken_capture
-    genuine, used = fit.bridge.render, []
-    monkeypatch.setattr(fit.bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
+    genuine, used = machine.bridge.render, []
+    monkeypatch.setattr(machine.bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
-        fit.Fit(fit.capture.load(path), fit.parse([str(path), *QUICK, *options])).step()
+        fit.Fit(machine.capture.load(path), fit.parse([str(path), *QUICK, *options])).step()
 
     step()
     step("--no-shadows")
@@ -299,7 +304,7 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
     assert distance(run / "mesh.ply") < 0.04  # hardly a fit: it is the start that is near
     mesh = trimesh.load(run / "mesh.ply", process=False)
     assert mesh.is_watertight and mesh.euler_number == 2
-    domain = Ring.load(run).domain
+    domain = load_fit(run).domain
     assert type(domain) is Domain and np.linalg.norm(domain.points, axis=1).mean() == pytest.approx(1, abs=0.01)
     again = mi.load_dict({"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 3})
     vertices = np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)
@@ -310,15 +315,15 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
     config = fit.parse([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
 
     def fresh():
-        return fit.Fit(capture.load(small_capture), config)
+        return fit.Fit(loading.load_capture(small_capture), config)
 
     before = fresh()
     assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
     for _ in range(3):
         before.step()
-    results.save(before.state(), tmp_path / "checkpoint.pt")
+    files.write_state(before.state(), tmp_path / "checkpoint.pt")
     after = fresh()
-    after.restore(fit.read_checkpoint(config))
+    after.restore(checkpoint.read_checkpoint(config))
     for level in (2, 3):
         (s, faces), (again, same) = before.ring.domain.sample(level), after.ring.domain.sample(level)
         assert torch.equal(s, again) and np.array_equal(faces, same)
@@ -336,36 +341,36 @@ def test_start_from_a_mesh(small_capture, tmp_path):
 
 
 def test_auto_takes_the_hull_only_where_it_has_handles(small_capture, monkeypatch):
-    scene = capture.load(small_capture)
-    assert type(fit.start(scene, "auto")[0]) is Sphere
-    monkeypatch.setattr(fit, "genus", lambda mesh: 1)
-    domain, center, radius = fit.start(scene, "auto")
+    scene = loading.load_capture(small_capture)
+    assert type(start.starting_surface(scene, "auto")[0]) is Sphere
+    monkeypatch.setattr(machine, "genus", lambda mesh: 1)
+    domain, center, radius = start.starting_surface(scene, "auto")
     assert type(domain) is Domain
     np.testing.assert_allclose(center, CENTER, atol=2)
     assert radius == pytest.approx(AXES.mean(), rel=0.1)
-    assert type(fit.start(scene, "sphere")[0]) is Sphere
+    assert type(start.starting_surface(scene, "sphere")[0]) is Sphere
 
 
 def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(broken_capture):
     path, _ = broken_capture
     mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/004.png"))
     with pytest.raises(InputError, match="nothing in it"):
-        fit.start(capture.load(path), "auto")
+        start.starting_surface(loading.load_capture(path), "auto")
     bsdf = '<bsdf type="cooktorrance"/>'
     place = '<point name="center" x="400" y="-150" z="90"/><float name="radius" value="30"/>'
     path.write_text(path.read_text().replace(bsdf, bsdf + place))
-    domain, center, radius = fit.start(capture.load(path), "auto")
+    domain, center, radius = start.starting_surface(loading.load_capture(path), "auto")
     assert type(domain) is Sphere and center.tolist() == CENTER.tolist() and radius == 30
     with pytest.raises(InputError, match="nothing in it"):
-        fit.start(capture.load(path), "hull")
+        start.starting_surface(loading.load_capture(path), "hull")
 
 
 def test_a_domain_of_the_scene_does_not_normalise_another(broken_capture):
     path, _ = broken_capture
     torus_domain(path)
-    scene = capture.load(path)
-    assert fit.start(scene, "auto")[0] is scene.shape.domain[0]
-    domain, _, radius = fit.start(scene, "sphere")
+    scene = loading.load_capture(path)
+    assert start.starting_surface(scene, "auto")[0] is scene.shape.domain[0]
+    domain, _, radius = start.starting_surface(scene, "sphere")
     assert type(domain) is Sphere and radius == pytest.approx(scene.sphere()[1]) != scene.shape.domain[2]
 
 
@@ -568,13 +573,13 @@ def test_program_lists_its_commands():
     done = subprocess.run([sys.executable, "-c", "import sys; sys.argv[1:] = ['--help']; "
                            "from mi_ring import command; command.main()"], capture_output=True, text=True)  # fmt: skip
     assert done.returncode == 0
-    assert all(name in done.stdout for name in command.COMMANDS)
+    assert all(name in done.stdout for name in __main__.COMMANDS)
 
 
 def test_writes_are_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.pt"
-    results.save({"iteration": 1}, path)
+    files.write_state({"iteration": 1}, path)
     monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        results.save({"iteration": 2}, path)
+        files.write_state({"iteration": 2}, path)
     assert torch.load(path) == {"iteration": 1}

@@ -6,7 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.hull import Hull, Silhouette, directions, genus, signed_distance
+from mi_ring.geometry.camera import directions
+from mi_ring.geometry.hull import Hull, Silhouette, signed_distance
+from mi_ring.geometry.meshes import genus
 
 CENTER = np.array([12.0, -40.0, 7.0])
 W, H, FOCAL, CENTRE = 120, 90, np.array([130.0, 140.0]), np.array([57.0, 48.0])

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mi_ring import bridge, indirect
-from mi_ring.integrator import Photographs, render_photographs
+from mi_ring.rendering import bridge, indirect
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.pictures import render_photographs
 
 WIDTH, HEIGHT = 70, 49  # [px]
 CENTER, RADIUS, SHARE = np.array([0.3, -0.2, 0.4]), 0.9, 0.35  # of the cup; which share of the sphere it is

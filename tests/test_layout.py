@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import mi_ring
-from mi_ring.command import COMMANDS
+from mi_ring.__main__ import COMMANDS
 
 PACKAGE = Path(mi_ring.__file__).parent
 NETWORKS = {"encoding", "mlp", "shapenet", "brdfnet"}

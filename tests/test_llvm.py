@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from mi_ring import llvm
+from mi_ring.system import llvm
 
 # The names that LLVM's own builds, Debian, Ubuntu and Fedora use, and two libraries that are not LLVM.
 NAMES = {
@@ -129,7 +129,7 @@ def test_preload_finds_an_order(tmp_path, monkeypatch):
 @pytest.mark.parametrize("version", [(17, 0, 0), (19, 1, 7), (22, 1, 0)])
 def test_accepts(drjit_loaded, version):
     drjit_loaded(*version)
-    llvm.check()
+    llvm.require_usable()
 
 
 @pytest.mark.parametrize(("version", "found"), [
@@ -142,7 +142,7 @@ def test_refuses(world, drjit_loaded, version, found):
     put(world / "system", 15)
     drjit_loaded(*version)
     with pytest.raises(ImportError) as error:
-        llvm.check()
+        llvm.require_usable()
     for part in (found, "libLLVM-15.so", "LLVM 17 or newer", "abort", "make setup", "apt install lib", llvm.VARIABLE):
         assert part in str(error.value)
 
@@ -152,7 +152,7 @@ def test_refusal_asks_for_the_right_order(world, drjit_loaded, monkeypatch):
     drjit_loaded(15, 0, 6)
     monkeypatch.setattr(llvm, "_too_late", True)
     with pytest.raises(ImportError, match="import mi_ring before mitsuba"):
-        llvm.check()
+        llvm.require_usable()
 
 
 def test_refusal_of_the_users_choice(world, drjit_loaded, monkeypatch):
@@ -160,7 +160,7 @@ def test_refusal_of_the_users_choice(world, drjit_loaded, monkeypatch):
     drjit_loaded(15, 0, 6)
     monkeypatch.setenv(llvm.VARIABLE, put(world / "mine", 15) + "/libLLVM-15.so")
     with pytest.raises(ImportError, match=f"Unset {llvm.VARIABLE}") as error:
-        llvm.check()
+        llvm.require_usable()
     assert "does not exist" not in str(error.value)
 
 

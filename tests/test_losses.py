@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from mi_ring import losses
+from mi_ring import images
+from mi_ring.fitting import terms
 
 
 def pixels(*values):
@@ -19,12 +20,12 @@ NONE = torch.zeros(1, 1, 4, 3, dtype=torch.bool)
 def test_rgb_loss_by_hand():
     predicted, observed = pixels(0.1, 0.4, 0.0, 1.0), pixels(0.2, 0.2, 0.0, 0.4)
     # in units of the exposure 0.5: differences -0.2, 0.4, 0, 1.2
-    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l2").item() == pytest.approx((0.04 + 0.16 + 1.44) / 4)
-    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1").item() == pytest.approx((0.2 + 0.4 + 1.2) / 4)
+    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l2").item() == pytest.approx((0.04 + 0.16 + 1.44) / 4)
+    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l1").item() == pytest.approx((0.2 + 0.4 + 1.2) / 4)
     log = [math.log1p(8 * p) - math.log1p(8 * o) for p, o in ((0.1, 0.2), (0.4, 0.2), (0, 0), (1.0, 0.4))]
     log = sum(map(abs, log)) / 4
-    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(log, rel=1e-5)
-    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1+log").item() == pytest.approx((0.45 + log) / 2, rel=1e-5)
+    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(log, rel=1e-5)
+    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l1+log").item() == pytest.approx((0.45 + log) / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["l2", "l1", "log", "l1+log"])
@@ -32,22 +33,22 @@ def test_a_clipped_pixel_says_at_least_this_bright(kind):
     clipped = torch.ones(1, 1, 2, 3, dtype=torch.bool)
     observed = pixels(1.0, 1.0)
     brighter = pixels(1.5, 3.0).clone().requires_grad_()
-    loss = losses.rgb_loss(brighter, observed, clipped, 0.3, kind)
+    loss = terms.rgb_loss(brighter, observed, clipped, 0.3, kind)
     loss.backward()
     assert loss == 0 and (brighter.grad == 0).all()
-    assert losses.rgb_loss(pixels(0.9, 1.0), observed, clipped, 0.3, kind) > 0
+    assert terms.rgb_loss(pixels(0.9, 1.0), observed, clipped, 0.3, kind) > 0
 
 
 def test_mask_loss_without_blur_is_the_mean_square():
     coverage = torch.tensor([[[1.0, 0.5], [0.0, 0.0]]])
     mask = torch.tensor([[[1.0, 1.0], [0.0, 1.0]]])
-    assert losses.mask_loss(coverage, mask, 0.1).item() == pytest.approx((0.25 + 1) / 4)
+    assert terms.mask_loss(coverage, mask, 0.1).item() == pytest.approx((0.25 + 1) / 4)
 
 
 def test_blur_is_a_gaussian_and_keeps_the_sum():
     image = torch.zeros(1, 31, 41)
     image[0, 14, 22] = 1.0
-    found = losses.blur(image, 2.0)[0]
+    found = images.blur(image, 2.0)[0]
     y, x = torch.meshgrid(torch.arange(31.0) - 14, torch.arange(41.0) - 22, indexing="ij")
     expected = torch.exp(-(x**2 + y**2) / 8) / (2 * math.pi * 4)
     assert found.sum().item() == pytest.approx(1, abs=1e-5)
@@ -58,7 +59,7 @@ def test_blur_is_a_gaussian_and_keeps_the_sum():
 def test_blur_takes_zero_for_what_is_outside():
     image = torch.rand(2, 5, 7)
     padded = torch.nn.functional.pad(image, (9, 9, 9, 9))
-    torch.testing.assert_close(losses.blur(image, 2.5), losses.blur(padded, 2.5)[:, 9:-9, 9:-9])
+    torch.testing.assert_close(images.blur(image, 2.5), images.blur(padded, 2.5)[:, 9:-9, 9:-9])
 
 
 def test_mask_loss_feels_a_mask_it_does_not_touch():
@@ -67,7 +68,7 @@ def test_mask_loss_feels_a_mask_it_does_not_touch():
     coverage.requires_grad_()
     mask = torch.zeros(1, 20, 20)
     mask[0, 10, 11] = 1.0
-    losses.mask_loss(coverage, mask, 3.0).backward()
+    terms.mask_loss(coverage, mask, 3.0).backward()
     gradient = coverage.grad[0, 10]
     assert gradient[8] < gradient[2]  # growing toward the mask pays, away from it does not
 
@@ -83,13 +84,13 @@ def test_velocity_loss_of_a_plane_wave_is_its_closed_form():
 
     # −Δ sin(k·x) = |k|² sin(k·x), so (I − αΔ)V = (1 + α|k|²) V
     expected = ((1 + alpha * 49) ** 2 * wave(x).square().sum(-1)).mean()
-    found = losses.velocity_loss(wave, x, alpha)
+    found = terms.velocity_loss(wave, x, alpha)
     # The stencil's relative error in Δ is about (k h)²/12 = 0.2 %, of which a third counts here.
     assert found.item() == pytest.approx(expected.item(), rel=2e-3)
 
 
 def test_velocity_loss_without_laplacian_is_the_mean_square():
     x = torch.randn(9, 3)
-    assert losses.velocity_loss(lambda p: 2 * p, x, 0.0).item() == pytest.approx(
+    assert terms.velocity_loss(lambda p: 2 * p, x, 0.0).item() == pytest.approx(
         (4 * x.square().sum(-1)).mean().item(), rel=1e-6
     )

@@ -9,12 +9,12 @@ import torch
 import trimesh
 
 from mi_ring import export, render
-from mi_ring.brdfnet import Parameter
-from mi_ring.domain import Domain, Sphere
 from mi_ring.errors import InputError
-from mi_ring.material import MaterialOptions, dress
-from mi_ring.ring import Ring
-from mi_ring.shapenet import ShapeNet
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets.brdfnet import Parameter
+from mi_ring.nets.shapenet import ShapeNet
+from mi_ring.ring.material import MaterialOptions, dress
+from mi_ring.ring.ring import Ring
 
 PRINCIPLED = """<bsdf type="principled">
   <texture name="base_color" type="mesh_attribute"><string name="name" value="vertex_base_color"/></texture>

@@ -8,9 +8,9 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring.bsdf import ATTRIBUTES
-from mi_ring.domain import Domain
-from mi_ring.ring import Ring
+from mi_ring.geometry.domain import Domain
+from mi_ring.plugins.cooktorrance import ATTRIBUTES
+from mi_ring.ring.ring import Ring
 
 CENTER, RADIUS = [40.0, -15.0, 9.0], 12.5
 

@@ -8,12 +8,13 @@ import torch
 from scipy.integrate import solve_ivp
 from torch.nn import functional as F
 
-from mi_ring import mlp
-from mi_ring.brdfnet import BRDFNet, Parameter
-from mi_ring.domain import Sphere
-from mi_ring.encoding import PosEnc
-from mi_ring.ring import Ring
-from mi_ring.shapenet import SPEED, ShapeNet
+from mi_ring.geometry.domain import Sphere
+from mi_ring.nets import mlp
+from mi_ring.nets.brdfnet import BRDFNet, Parameter
+from mi_ring.nets.encoding import PosEnc
+from mi_ring.nets.shapenet import SPEED, ShapeNet
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import load_fit
 
 
 def neurons(net):
@@ -241,7 +242,7 @@ def test_state_survives_the_file(tmp_path):
     ring = Ring(center=[1.0, 2.0, 3.0], radius=4.0, scale=5.0, steps=7)
     torch.nn.init.normal_(ring.shape_net.output.weight)  # else no step would lead anywhere
     torch.save(ring.state({"seed": 3}), tmp_path / "ring.pt")
-    again = Ring.load(tmp_path / "ring.pt")
+    again = load_fit(tmp_path / "ring.pt")
     s = torch.randn(6, 3)
     assert torch.equal(again.surface(s), ring.surface(s))
     assert all(torch.equal(value, ring.brdf_net(s)[name]) for name, value in again.brdf_net(s).items())

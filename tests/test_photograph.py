@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_ring.photograph import camera_ray, project
+from mi_ring.rendering.pinhole import camera_ray, project
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 7, 5, 9.5, 7.25, 3.1, 2.8  # [px]; nothing in the middle, nothing square
 POSE = np.array(mi.ScalarTransform4f().look_at([1.3, -0.7, 2.9], [0.2, 0.1, -0.3], [0.2, 1, 0.1]).matrix)

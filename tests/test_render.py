@@ -13,12 +13,17 @@ import torch
 from conftest import SCENE, SENSOR
 from scipy.spatial.transform import Rotation
 
-from mi_ring import bridge, capture, command, render
+from mi_ring import render
+from mi_ring.capture import capture, loading
 from mi_ring.errors import InputError
-from mi_ring.integrator import Photographs
-from mi_ring.photograph import Flash
-from mi_ring.ring import Ring
-from mi_ring.shapenet import SPEED
+from mi_ring.nets.shapenet import SPEED
+from mi_ring.output import views
+from mi_ring.output.film import write_film
+from mi_ring.plugins.flash import Flash
+from mi_ring.rendering import bridge
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.ring.ring import Ring
+from mi_ring.system import command
 
 CENTER, RADIUS, SHIFT = np.array([400.0, -150.0, 90.0]), 20.0, np.array([0.3, -0.5, 0.2])
 MIDDLE = CENTER + RADIUS * SHIFT  #: of the sphere, when the flow has carried it there
@@ -60,14 +65,14 @@ def look_at(eye, target, up):
 
 def project(sensor, points):
     """Pixels (N, 2) where a photograph shows points (N, 3)."""
-    matrix, focal, centre = capture.camera_of(sensor)
+    matrix, focal, centre, _ = sensor.camera
     x, y, z = ((np.atleast_2d(points) - matrix[:3, 3]) @ matrix[:3, :3].astype(float)).T
     return np.stack([centre[0] - focal[0] * x / z, centre[1] - focal[1] * y / z], 1)
 
 
 def normal_in(sensor, x, y, center, radius):
     """Of a sphere, where the middle of pixel (x, y) sees it."""
-    matrix, focal, centre = capture.camera_of(sensor)
+    matrix, focal, centre, _ = sensor.camera
     d = matrix[:3, :3].astype(float) @ [(centre[0] - x - 0.5) / focal[0], (centre[1] - y - 0.5) / focal[1], 1]
     d, away = d / np.linalg.norm(d), matrix[:3, 3] - center
     b = d @ away
@@ -113,11 +118,11 @@ def arguments(*options):
 
 
 def frames_of(path, ring, *options):
-    return render.frames_of(capture.load(path, images=False), ring, arguments(*options))
+    return views.views_of(loading.load_capture(path, images=False), ring, arguments(*options))
 
 
 def eye_of(frame):
-    return capture.camera_of(frame.sensor)[0][:3, 3].astype(float)
+    return frame.sensor.camera.to_world[:3, 3].astype(float)
 
 
 def light_of(frame):
@@ -162,7 +167,7 @@ def test_a_turntable_goes_once_around_the_axis_with_its_light(tmp_path, up):
     assert np.ptp(np.linalg.norm(vertices - middle, axis=1)) > 0.1 * RADIUS  # not just a sphere
     path = write_scene(tmp_path)
     frames = frames_of(path, ring, "--turntable", 8, *([] if up is None else ["--up", *up]))
-    axis = capture.load(path, images=False).up if up is None else up / np.linalg.norm(up)
+    axis = loading.load_capture(path, images=False).up if up is None else up / np.linalg.norm(up)
     if up is None:
         assert axis @ UP > 0.9
     assert [frame.name for frame in frames] == [f"{k:03}.png" for k in range(8)]
@@ -174,7 +179,7 @@ def test_a_turntable_goes_once_around_the_axis_with_its_light(tmp_path, up):
         np.testing.assert_allclose(eyes[k] + eyes[(k + 4) % 8], 2 * (eyes[k] @ axis) * axis, atol=0.2)
     own = []
     for frame in frames:
-        matrix, focal, centre = capture.camera_of(frame.sensor)
+        matrix, focal, centre, _ = frame.sensor.camera
         assert frame.sensor.size == (7, 5) and centre.tolist() == [3.5, 2.5] and focal[0] == focal[1]
         assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1, abs=1e-5)
         np.testing.assert_allclose(project(frame.sensor, middle), [[3.5, 2.5]], atol=0.05)
@@ -214,8 +219,8 @@ def test_the_turntable_of_a_camera_on_its_axis_turns_the_picture(tmp_path):
     """There is no up in what it sees but the photograph's own."""
     path, axis = write_scene(tmp_path), EYES[0] - MIDDLE
     frames = frames_of(path, sphere(), "--turntable", 4, "--up", *axis)
-    before = capture.camera_of(capture.load(path, images=False).sensors[0])[0]
-    matrices = [capture.camera_of(frame.sensor)[0] for frame in frames]
+    before = loading.load_capture(path, images=False).sensors[0].camera.to_world
+    matrices = [frame.sensor.camera.to_world for frame in frames]
     assert matrices[0][:3, 1] @ before[:3, 1] > 0.99
     for a, b in zip(matrices, matrices[1:]):
         np.testing.assert_allclose(b[:3, 3], EYES[0], atol=1e-3)
@@ -245,7 +250,7 @@ def test_a_light_orbit_moves_the_light_alone(tmp_path, parallel):
         assert np.linalg.norm(toward) == pytest.approx(1 if parallel else np.linalg.norm(LIGHTS[2] - MIDDLE), rel=1e-5)
         assert toward @ line / np.linalg.norm(toward) == pytest.approx(np.sqrt(0.5), abs=1e-5)
         aside.append(toward - toward @ line * line)
-        np.testing.assert_array_equal(*(capture.camera_of(f.sensor)[0] for f in (frame, frames[0])))
+        np.testing.assert_array_equal(*(f.sensor.camera.to_world for f in (frame, frames[0])))
         np.testing.assert_allclose(eye_of(frame), EYES[2], atol=1e-3)
         strength = mi.traverse(frame.sensor.light)["irradiance.value" if parallel else "intensity.value"]
         np.testing.assert_allclose(np.array(strength).ravel(), STRENGTH, rtol=1e-6)
@@ -298,7 +303,7 @@ def test_time_takes_the_photographs_in_the_midst_of_the_flow(tmp_path, run):
     path = write_scene(tmp_path, (64, 48), (60, 55), aim=(0, 0, 0))
     render.main([str(run), str(path), str(tmp_path / "out"), "--time", "0.3", "--spp", "16", "--envmap",
                  str(environment(tmp_path, lambda up: 0 * up + 0.25)), "--integrator", "direct"])  # fmt: skip
-    sensors = capture.load(path, images=False).sensors
+    sensors = loading.load_capture(path, images=False).sensors
     for sensor in sensors:
         picture = read(tmp_path / "out" / sensor.filename.name)
         centre, _ = disc(np.where(abs(picture[..., 2:] - encoded(0.25)) > 10, 1, 0))
@@ -323,7 +328,7 @@ def test_a_matte_sphere_in_an_even_light_has_its_albedo_everywhere(tmp_path, run
     sky = environment(tmp_path, lambda up: 0 * up + 1, name)
     options = ["--envmap", str(sky), "--format", "exr", "--spp", "64", *integrator]
     render.main([str(run), str(path), str(tmp_path / "out"), *options])
-    for sensor in capture.load(path, images=False).sensors:
+    for sensor in loading.load_capture(path, images=False).sensors:
         picture = read(tmp_path / "out" / f"{sensor.filename.stem}.exr")
         y, x = np.mgrid[:40, :56] + 0.5
         off = np.linalg.norm(np.stack([x, y], -1) - project(sensor, MIDDLE)[0], axis=-1)
@@ -341,9 +346,9 @@ def test_the_upper_half_of_an_environment_is_where_up_is(tmp_path, run, up):
     sky = environment(tmp_path, lambda up: (up > 0) * 1.0)
     options = ["--envmap", str(sky), "--format", "exr", "--spp", "128", "--up", *map(str, up)]
     render.main([str(run), str(path), str(tmp_path / "out"), *options])
-    for sensor in capture.load(path, images=False).sensors:
+    for sensor in loading.load_capture(path, images=False).sensors:
         picture = read(tmp_path / "out" / f"{sensor.filename.stem}.exr")
-        eye = capture.camera_of(sensor)[0][:3, 3].astype(float)
+        eye = sensor.camera.to_world[:3, 3].astype(float)
         toward = (eye - MIDDLE) / np.linalg.norm(eye - MIDDLE)
         sideways = np.cross(toward, [0.3, 0.5, 0.6])
         for normal in (toward, toward + 0.6 * sideways, toward - 0.6 * sideways):
@@ -374,7 +379,7 @@ def test_what_else_is_in_the_scene_stays_with_an_environment(tmp_path, run):
     path = write_scene(tmp_path, (56, 40), (25, 28), extra=extra, edit=rename, aim=(0, 0, 0))
     sky = environment(tmp_path, lambda up: 0 * up + 0.1)
     render.main([str(run), str(path), str(tmp_path / "out"), "--envmap", str(sky), "--format", "exr", "--spp", "512"])
-    sensor = capture.load(path, images=False).sensors[0]
+    sensor = loading.load_capture(path, images=False).sensors[0]
     picture = read(tmp_path / "out" / "000.exr")
 
     def pixel(point):
@@ -398,7 +403,7 @@ def test_path_sees_the_photographs_own_lights(tmp_path, run, shadows):
     for name in ("path", "photometric"):
         options = ["--integrator", name, "--format", "exr", "--spp", "256"]
         render.main([str(run), str(path), str(tmp_path / name), *options])
-    for k, sensor in enumerate(capture.load(path, images=False).sensors):
+    for k, sensor in enumerate(loading.load_capture(path, images=False).sensors):
         pictures = [read(tmp_path / name / f"{k:03}.exr") for name in ("path", "photometric")]
         x, y = np.floor(project(sensor, MIDDLE)[0]).astype(int)
         normal = normal_in(sensor, x, y, MIDDLE, RADIUS)
@@ -495,7 +500,7 @@ def test_an_interrupted_film_leaves_the_old_one(tmp_path, run):
 
     for error in (KeyboardInterrupt(), MemoryError()):
         with pytest.raises(type(error)):
-            render.write_film(pictures(error), film, (56, 40), 24)
+            write_film(pictures(error), film, (56, 40), 24)
         assert film.read_bytes() == b"before" and {p.name for p in tmp_path.iterdir()} == {"film.mp4", "ring.pt"}
 
 
@@ -517,12 +522,12 @@ def test_a_film_that_does_not_fit_on_the_disk_is_one_line(tmp_path, count):
     film.write_bytes(b"before")
     random = np.random.default_rng(1)
     with small_files(4000), pytest.raises(InputError) as error:
-        render.write_film((random.random((40, 56, 3)) for _ in range(count)), film, (56, 40), 24)
+        write_film((random.random((40, 56, 3)) for _ in range(count)), film, (56, 40), 24)
     message = str(error.value)
     assert "film.mp4: cannot be written" in message and "\n" not in message and len(message) < 400
     assert film.read_bytes() == b"before" and [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
     with pytest.raises(InputError, match="cannot be written"):
-        render.write_film(iter([]), tmp_path / "gone" / "film.mp4", (56, 40), 24)
+        write_film(iter([]), tmp_path / "gone" / "film.mp4", (56, 40), 24)
 
 
 def second(old, new):

@@ -15,7 +15,10 @@ from conftest import AXES, CENTER
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from mi_ring import capture, fit, report
+from mi_ring import fit, images
+from mi_ring.capture import loading
+from mi_ring.fitting import fit
+from mi_ring.output import report
 
 VIEWER = Path(report.__file__).parent / "viewer"
 QUICK = ["--levels", "2", "--widths", "56", "--shares", "1", "--batch", "4", "--subdivisions", "3", "--no-indirect"]
@@ -59,7 +62,7 @@ def glb(positions, normals, uv, faces, image, scale=1.0):
 @pytest.fixture(scope="module")
 def fitted(small_capture):
     """A quick fit and its log."""
-    fitted = fit.Fit(capture.load(small_capture), fit.parse([str(small_capture), "--iterations", "50", *QUICK]))
+    fitted = fit.Fit(loading.load_capture(small_capture), fit.parse([str(small_capture), "--iterations", "50", *QUICK]))
     log = [{"iteration": i + 1, **fitted.step()} for i in range(50)]
     fitted.surface.show(fitted.ring, *fitted.ring.domain.sample(3))
     return fitted, log
@@ -73,7 +76,7 @@ def page_file(fitted, tmp_path_factory):
     file = tmp_path_factory.mktemp("report") / "report.html"
     faces = np.arange(len(corners)).reshape(-1, 3)
     box = glb(corners, normals, 0 * corners[:, :2], faces, np.tile(COLOUR.astype(np.uint8), (5, 7, 1)))
-    file.write_text(report.html(*fitted, box), "utf-8")
+    file.write_text(report.report_html(*fitted, box), "utf-8")
     return file
 
 
@@ -122,7 +125,7 @@ def test_it_is_one_self_contained_file(page_file, fitted):
     assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
     assert page.count("<script") == page.count("</script>") == 4 and "<link" not in page
     assert all(f"{k:03}.png" in body for k in range(12))
-    without = report.html(*fitted)
+    without = report.report_html(*fitted)
     assert without.count("<script") == 1 and "<canvas" not in without
 
 
@@ -221,7 +224,7 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     corners = corner + np.array([0 * u, u, u + v, v])
     file = tmp_path / "parallelogram.html"
     uv, faces = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
-    file.write_text(report.html(*fitted, glb(corners, [normal] * 4, uv, faces, image, 0.8)), "utf-8")
+    file.write_text(report.report_html(*fitted, glb(corners, [normal] * 4, uv, faces, image, 0.8)), "utf-8")
 
     origin, light = corner + np.array([[4.0, 0.5, 16.0], [-3.0, 5.0, 11.0]])
     forward = corner + 0.4 * u + 0.6 * v - origin
@@ -237,11 +240,11 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     a, b = np.moveaxis((points - corner) @ np.linalg.pinv(np.stack([u, v], 1)).T, -1, 0)
     to_light = light - points
     distance = np.linalg.norm(to_light, axis=-1)
-    colour = capture.srgb_to_linear(quarters / 255)[(b > 0.5).astype(int), (a > 0.5).astype(int)]
+    colour = images.srgb_to_linear(quarters / 255)[(b > 0.5).astype(int), (a > 0.5).astype(int)]
     radiance = colour / 0.8 / np.pi * intensity * (to_light @ normal / distance**3)[..., None]
     edge = np.minimum(np.minimum(a, 1 - a) * 5, np.minimum(b, 1 - b) * 4)  # about how far inside
     clear = (edge > 0.4) & (abs(a - 0.5) > 0.1) & (abs(b - 0.5) > 0.1)  # not where colours blend
-    truth = capture.linear_to_srgb(radiance)
+    truth = images.linear_to_srgb(radiance)
     assert 0.2 < truth[edge > 0].max() < 0.95 and 200 < clear.sum() < 2500
 
     to_world = np.eye(4)
@@ -263,14 +266,14 @@ def rows(n=9, **changes):
         for k in range(n)
     ]
     good[4] |= changes
-    return [report.Row(**row, pictures={}) for row in good]
+    return [report.PhotographPanel(**row, pictures={}) for row in good]
 
 
 def test_of_a_good_fit_there_is_nothing_to_say():
-    assert report.findings(rows(), 400, 400) == []
-    assert report.findings(rows(psnr=29.0, iou=0.91, saturated=0.249, shift=(0.9, 0.1)), 400, 400) == []
-    nothing = [report.Row("a.png", 30.0, None, 0.0, None, {}), report.Row("b.png", 12.0, None, 0.0, None, {})]
-    assert report.findings(nothing, 400, 400) == []  # which of two is wrong cannot be told
+    assert report.fit_findings(rows(), 400, 400) == []
+    assert report.fit_findings(rows(psnr=29.0, iou=0.91, saturated=0.249, shift=(0.9, 0.1)), 400, 400) == []
+    nothing = [report.PhotographPanel("a.png", 30.0, None, 0.0, None, {}), report.PhotographPanel("b.png", 12.0, None, 0.0, None, {})]
+    assert report.fit_findings(nothing, 400, 400) == []  # which of two is wrong cannot be told
 
 
 @pytest.mark.parametrize("changes, words", [
@@ -280,7 +283,7 @@ def test_of_a_good_fit_there_is_nothing_to_say():
     ({"shift": (-1.4, 2.05)}, ["4.jpg (1.4 px to the left and 2.0 px below)", "pose"]),
 ])  # fmt: skip
 def test_one_photograph_that_stands_out_is_named(changes, words):
-    (found,) = report.findings(rows(**changes), 400, 400)
+    (found,) = report.fit_findings(rows(**changes), 400, 400)
     assert all(word in found for word in words) and found.endswith(".")
 
 
@@ -288,12 +291,12 @@ def test_a_shift_of_all_photographs_is_one_of_the_camera():
     moved = rows()
     for row in moved:
         row.shift = (row.shift[0] + 0.6, row.shift[1] - 1.2)
-    (found,) = report.findings(moved, 400, 400)
+    (found,) = report.fit_findings(moved, 400, 400)
     assert "0.6 px to the right and 1.1 px above" in found and "cx and cy" in found
 
 
 def test_an_early_end_is_told():
-    (found,) = report.findings(rows(), 130, 400)
+    (found,) = report.fit_findings(rows(), 130, 400)
     assert "130 of 400" in found and "--resume" in found
 
 
@@ -301,7 +304,7 @@ def test_of_many_the_worst_are_named():
     many = rows(20)
     for k, row in enumerate(many):
         row.saturated = 0.26 + 0.01 * k
-    (found,) = report.findings(many, 400, 400)
+    (found,) = report.fit_findings(many, 400, 400)
     assert found.startswith("19.jpg (45.0%), 18.jpg (44.0%), 17.jpg") and "and 15 more" in found
 
 
@@ -320,13 +323,13 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
 def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capture, broken_capture, monkeypatch):
     fitted, _ = fitted
     names = fitted.capture.names
-    good = [report.compare(fitted, k, names[k])[0] for k in range(12)]
-    assert not report.findings(good, 50, 50)
+    good = [report.panel_of(fitted, k, names[k])[0] for k in range(12)]
+    assert not report.fit_findings(good, 50, 50)
     path, edit = broken_capture
     edit('name="cx" value="30.5"', 'name="cx" value="32.5"', count=-1)
-    monkeypatch.setattr(fitted, "capture", capture.load(path))
-    moved = [report.compare(fitted, k, names[k])[0] for k in range(12)]
-    found = [found for found in report.findings(moved, 50, 50) if "cx and cy" in found]
+    monkeypatch.setattr(fitted, "capture", loading.load_capture(path))
+    moved = [report.panel_of(fitted, k, names[k])[0] for k in range(12)]
+    found = [found for found in report.fit_findings(moved, 50, 50) if "cx and cy" in found]
     assert len(found) == 1 and re.search(r"(1\.[5-9]|2\.[0-5]) px to the left and 0\.[0-2] px", found[0])
 
 
@@ -339,8 +342,8 @@ def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monk
     image[tuple(inside[: len(inside) // 4].T)] = 255
     Image.fromarray(image).save(path.parent / "images" / "003.png")
     fitted, _ = fitted
-    monkeypatch.setattr(fitted, "capture", capture.load(path))
-    assert report.compare(fitted, 3, "003.png")[0].saturated == pytest.approx(0.25, abs=0.01)
+    monkeypatch.setattr(fitted, "capture", loading.load_capture(path))
+    assert report.panel_of(fitted, 3, "003.png")[0].saturated == pytest.approx(0.25, abs=0.01)
 
 
 def test_the_bundle_is_whole_small_as_stated_and_can_be_embedded():

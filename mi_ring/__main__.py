@@ -1,0 +1,39 @@
+"""The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+from mi_ring.system.command import run
+
+#: Modules of the package; the first line of each says what the command does and ends in how it is called.
+COMMANDS = ("convert", "check", "fit", "render", "export", "evaluate", "validate")
+
+
+def summary(name: str) -> tuple[str, str]:
+    """How a command is called, and what it does, by the first line of its module, which is not imported."""
+    source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
+    sentence, _, call = ast.get_docstring(ast.parse(source)).split("\n")[0].partition("`python -m mi_ring.")
+    return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")
+
+
+def overview() -> str:
+    """The help of `mi-ring`: every command in two lines."""
+    lines = ["usage: mi-ring COMMAND …", ""]
+    for usage, sentence in map(summary, COMMANDS):
+        lines += [f"  {usage}", f"      {sentence}"]
+    return "\n".join([*lines, "", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same."])
+
+
+def main() -> None:
+    """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in ("-h", "--help"):
+        print(overview())
+        sys.exit(0)
+    if name not in COMMANDS:
+        what = f"is {name}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
+        print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
+        sys.exit(2)
+    run(f"mi-ring {name}", importlib.import_module(f"mi_ring.{name}").main, sys.argv[2:])

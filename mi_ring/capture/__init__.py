@@ -1,0 +1,4 @@
+"""A scene file and its photographs: read, decoded, as tensors; and the one writer of scene files.
+
+May import: mitsuba, numpy, scipy, skimage, torch, tqdm; images, plugins, rendering, ring, nets, geometry, system.
+"""

@@ -1,0 +1,193 @@
+"""A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.capture.decoding import decode
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import NoParallax, nearest_point
+from mi_ring.geometry.hull import Hull, Silhouette, evenly
+from mi_ring.images import box_filter
+from mi_ring.rendering.photographs import Photographs
+
+#: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
+REMEMBERED_PIXELS = 2**23
+
+
+class Observation(NamedTuple):
+    """Photographs as a fit sees them, n of one size."""
+
+    rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
+    clipped: Tensor  #: (n, H, W, 3) bool: the scene is at least this bright
+    mask: Tensor  #: (n, H, W) the object's coverage in [0, 1]; 0 where there is no mask
+    masked: Tensor  #: (n,) bool: which have a mask
+    valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None if all do. Others are black and clipped
+
+
+@dataclass
+class Capture:
+    """What a scene file gives to a fit. `images` hold the files' encoded pixels, decoded on demand by `observe`.
+
+    Nothing that renders or fits a capture changes it.
+    """
+
+    path: Path
+    scene: mi.Scene
+    shape: mi.Mesh  #: the `shapenet`
+    sensors: list  #: the photographs
+    photographs: Photographs  #: their cameras and lights
+    shadows: bool
+    images: list[np.ndarray] = field(default_factory=list)  #: (H, W, 3) uint8, uint16 or float32 each
+    linear: list[bool] = field(default_factory=list)  #: are the encoded pixels linear radiance, or sRGB?
+    masks: list[np.ndarray | None] = field(default_factory=list)  #: (H, W) uint8, 0 background, 255 object
+    valid: list[np.ndarray | None] = field(default_factory=list)  #: (H, W) uint8, 0 where the photograph shows nothing
+    threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were not
+
+    def __post_init__(self):
+        sizes = [sensor.size for sensor in self.sensors]
+        self._decoded, self._remembered = {}, 0  # (scale, result of `decoded`) by photograph, and their pixels
+        #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
+        self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
+
+    def __len__(self) -> int:
+        return len(self.sensors)
+
+    @functools.cached_property
+    def names(self) -> list[str]:
+        """File names of the photographs, with folders where they would not tell one from another without."""
+        files = [Path(os.path.abspath(sensor.filename)) for sensor in self.sensors]
+        names = [file.name for file in files]
+        if len(set(names)) == len(names):
+            return names
+        common = os.path.commonpath([file.parent for file in files])
+        return [file.relative_to(common).as_posix() for file in files]
+
+    def spread(self, most: int = 200) -> list[int]:
+        """Indices of at most so many photographs, evenly spread: enough to look at."""
+        return evenly(len(self), most)
+
+    def photograph(self, k: int, scale: int = 1) -> Photographs:
+        """Photograph `k` alone, to be rendered `scale` times smaller."""
+        return self.photographs.select([k], self.sensors[k].size, scale)
+
+    def observe(self, index: Sequence[int], scale: int = 1) -> Observation:
+        """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
+        rgb, clipped, mask, valid = zip(*(self.decoded(k, scale) for k in index))
+        masked = torch.tensor([self.masks[k] is not None for k in index])
+        if all(v is None for v in valid):
+            return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, None)
+        valid = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
+        return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, torch.stack(valid))
+
+    def decoded(self, k: int, scale: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """One photograph of `observe`. If smaller than the file and if it fits, it is remembered, at its last scale."""
+        if k in self._decoded:
+            before, result = self._decoded[k]
+            if before == scale:
+                return result
+            self._remembered -= self._decoded.pop(k)[1][2].numel()
+        linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
+        mask = np.zeros(linear.shape[:2], np.uint8) if self.masks[k] is None else self.masks[k]
+        valid = None
+        if self.valid[k] is not None:
+            shown = self.valid[k] > 127
+            linear = np.where(shown[..., None], linear, 0)
+            saturated = saturated | ~shown[..., None]  # nothing is known: the scene is at least this black
+            valid = box_filter(torch.from_numpy(shown).float()[..., None], scale)[..., 0] == 1
+        result = (
+            box_filter(torch.from_numpy(linear), scale),
+            box_filter(torch.from_numpy(saturated).float(), scale) > 0,
+            box_filter(torch.from_numpy(mask).float()[..., None] / 255, scale)[..., 0],
+            valid,
+        )
+        pixels = result[2].numel()
+        if scale > 1 and self._remembered + pixels <= REMEMBERED_PIXELS:
+            self._decoded[k] = scale, result
+            self._remembered += pixels
+        return result
+
+    def exposure(self) -> float:
+        """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks).
+
+        Of thousands of photographs a few hundred tell.
+        """
+        total, count = 0.0, 0
+        for k in self.spread():
+            rgb, _, mask, masked, _ = self.observe([k], 4 if min(self.sensors[k].size) >= 16 else 1)
+            inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
+            total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
+        if not total > 0:
+            raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
+        return total / count
+
+    def reflectance(self, center: np.ndarray, exposure: float) -> float:
+        """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights."""
+        return float(exposure / np.median(self.photographs.lights.irradiance(center).mean(1)))
+
+    @property
+    def up(self) -> np.ndarray:
+        """The mean direction (3,) that is up in the photographs; in the first if they were held in every way."""
+        ups = np.stack([sensor.camera.up for sensor in self.sensors])
+        up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
+        return up / np.linalg.norm(up)
+
+    def silhouettes(self) -> list[Silhouette]:
+        """The masks with their cameras, one for all photographs that share both."""
+        once = {}
+        for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
+            if mask is not None:
+                once.setdefault((id(mask), sensor.camera.to_world.tobytes()), k)
+        return [Silhouette(self.masks[k], self.sensors[k].camera, self.outline(k), self.valid[k]) for k in once.values()]
+
+    @functools.cached_property
+    def hull(self) -> Hull | None:
+        """The visual hull of the masks, if there are any and they are seen from more than one side."""
+        silhouettes = self.silhouettes()
+        try:
+            return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
+        except NoParallax:
+            return None
+
+    @property
+    def whole(self) -> bool:
+        """Do masks show the whole object? Those that were found do not show what is in shadow."""
+        return self.threshold is None or self.photographs.colocated
+
+    def outline(self, k: int) -> str:
+        """The file that photograph `k` has its mask from."""
+        return str(self.sensors[k].mask or self.sensors[k].filename)
+
+    def sphere(self) -> tuple[np.ndarray, float]:
+        """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
+        center, radius = self.shape.center, self.shape.radius
+        if center is None or radius is None:
+            middle, ball = sphere_of_masks(self.hull) if self.hull else sphere_of_cameras(self)
+            center, radius = middle if center is None else center, ball if radius is None else radius
+        return center, radius
+
+
+def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:
+    """Centre of the masks' visual hull and 1.3 times the radius of the ball of the same volume [scene units].
+
+    A start surface that is a little too large shrinks onto the object, which goes faster than growing limbs.
+    """
+    center, radius = hull.ball()
+    return center, 1.3 * radius
+
+
+def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
+    """The point that all cameras look at, and half the radius of the ball there that every photograph holds."""
+    cameras = [sensor.camera for sensor in capture.sensors]
+    origins = np.stack([camera.position for camera in cameras])
+    center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))
+    half_angle = min(np.arctan(min(camera.size) / 2 / camera.focal.max()) for camera in cameras)
+    return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())

@@ -1,0 +1,78 @@
+"""Photographs and masks from files: encoded pixels, and the linear radiance that they mean."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.images import linear_to_srgb, read_image, srgb_to_linear
+
+
+def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape."""
+    if image.dtype == np.float32:
+        value = image
+    else:
+        full = np.iinfo(image.dtype).max
+        value = np.arange(full + 1, dtype=np.float32) / full
+    lookup = value if linear else srgb_to_linear(value)
+    saturated = value >= saturation
+    return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
+
+
+def read_pixels(path: Path, field: str, sensor, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32, all the bits that the file has.
+
+    Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
+    """
+    field = f'photograph "{sensor.id()}", {field}'
+    if not path.is_file():
+        raise InputError(f"{scene}: {field}: no such file: {path}")
+    try:
+        pixels = read_image(path)
+    except Exception as error:
+        raise InputError(f"{path}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
+    expected, found = sensor.size, pixels.shape[1::-1]
+    if found != expected:
+        found, expected = ("{} x {}".format(*size) for size in (found, expected))
+        raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
+    if not np.isfinite(pixels).all():
+        raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
+    return pixels
+
+
+def read_photograph(sensor, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, 3) of a photograph; one without colours is grey, and what is transparent is black."""
+    pixels = read_pixels(sensor.filename, "filename", sensor, scene)
+    if sensor.encoding == "linear" and pixels.dtype == np.uint8:
+        raise InputError(f'{scene}: photograph "{sensor.id()}", encoding: is linear, but {sensor.filename.name} has 8 '
+                         "bits, as sRGB has; leave it out, or give 16 bits or EXR if it is linear indeed")  # fmt: skip
+    channels = pixels.shape[2]
+    rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
+    if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files have the product already
+        return rgb
+    full = np.iinfo(pixels.dtype).max
+    linear = is_linear(sensor, pixels)
+    radiance = decode(rgb, linear, 1.0)[0] * (pixels[:, :, -1:] / np.float32(full))
+    return ((radiance if linear else linear_to_srgb(radiance)) * full + 0.5).astype(pixels.dtype)
+
+
+def is_linear(sensor, pixels: np.ndarray) -> bool:
+    """Is this image linear radiance? As its photograph says, else 8-bit files are not and others are."""
+    return sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
+
+
+def read_mask(sensor, file: Path | None, field: str, scene: Path) -> np.ndarray | None:
+    """Mask (H, W) uint8 from a file that a photograph names in a `field`, None if it names none.
+
+    Of a photograph that is its own mask it is the alpha channel.
+    """
+    if file is None:
+        return None
+    pixels = read_pixels(file, field, sensor, scene)
+    if file == sensor.filename and pixels.shape[2] not in (2, 4):
+        raise InputError(f'{file}: photograph "{sensor.id()}", {field}: is the photograph itself, which has no '
+                         "alpha channel")  # fmt: skip
+    channel = pixels[:, :, -1 if file == sensor.filename else 0]
+    full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
+    return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)

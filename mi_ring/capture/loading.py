@@ -1,0 +1,96 @@
+"""Opens scene files: what a fit would stumble over later is said at once."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import is_linear, read_mask, read_photograph
+from mi_ring.capture.masks import find_masks
+from mi_ring.errors import InputError, SceneError, require_file
+from mi_ring.plugins import photograph, shapenet
+from mi_ring.rendering.attributes import require_attributes
+from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.photographs import Photographs
+
+
+def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
+    """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later.
+
+    Without `images` only cameras and lights are read: enough to render. `masks`: those "given" by the scene; if there
+    are none, "auto" finds them by brightness where the room was dark; "none" does so even if there are.
+    """
+    path = Path(path)
+    scene, sensors = open_scene(path)
+    shapes = [s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh)]
+    if len(shapes) != 1:
+        raise InputError(f'{path}: shape: found {len(shapes)} <shape type="shapenet">; a fit needs exactly one')
+    try:
+        for shape in scene.shapes():
+            require_attributes(shape)
+        if images:
+            Edges(scene)  # refuses shapes without gradients
+        photographs = Photographs.of(sensors)
+    except SceneError as error:
+        raise InputError(f"{path}: {error}") from error
+    shadows = getattr(scene.integrator(), "shadows", True)
+    if not images:
+        return Capture(path, scene, shapes[0], sensors, photographs, shadows)
+    reading = tqdm(sensors, desc="reading", unit="photograph", leave=False, disable=None)
+    pixels = [read_photograph(s, path) for s in reading]
+    linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
+    given = read_once([(s, s.mask) for s in sensors], "mask", path) if masks != "none" else [None] * len(sensors)
+    valid = read_once([(s, s.valid) for s in sensors], "valid", path)
+    capture = Capture(path, scene, shapes[0], sensors, photographs, shadows, pixels, linear, given, valid)
+    if masks != "given" and all(mask is None for mask in given):
+        find_masks(capture)
+    return capture
+
+
+def read_once(files: list, field: str, scene: Path) -> list:
+    """The masks (H, W) that photographs name in a field, by (sensor, file). Those that share one share its pixels."""
+    read = {}
+    for sensor, file in files:
+        key = file, sensor.size, file == sensor.filename
+        if key not in read:
+            read[key] = read_mask(sensor, file, field, scene)
+    return [read[file, sensor.size, file == sensor.filename] for sensor, file in files]
+
+
+def open_scene(path: Path) -> tuple[mi.Scene, list]:
+    """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
+    require_file(path, "the XML file of a scene")
+    try:
+        path.read_text("utf-8")
+        scene = mi.load_file(str(path), optimize=False, parallel=False)
+    except UnicodeError as error:
+        raise InputError(f"{path}: is not UTF-8 at byte {error.start} ({error.reason}); convert it") from error
+    except RuntimeError as error:
+        raise InputError(f"{path}: {reason(error)}") from error
+    sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
+    if not sensors:
+        raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
+    return scene, sensors
+
+
+def recompute_normals(scene: mi.Scene) -> None:
+    """Sum the vertex normals of meshes whose files have none anew: one thread does so in one order, several in any."""
+    for shape in scene.shapes():
+        if not shape.is_mesh() or not shape.has_vertex_normals():
+            continue
+        parameters = mi.traverse(shape)
+        before = np.array(parameters["vertex_normals"])
+        shape.recompute_vertex_normals()
+        if not np.allclose(before, np.array(parameters["vertex_normals"]), atol=1e-5):  # they were the file's own
+            parameters["vertex_normals"] = before
+            parameters.update()
+
+
+def reason(error: RuntimeError) -> str:
+    """What Mitsuba's parser has to say, in one line."""
+    text = str(error).split("] ", 1)[-1]
+    if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
+        text = text.split("Error: ", 1)[-1]
+    return " ".join(text.split())

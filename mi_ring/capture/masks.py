@@ -1,0 +1,53 @@
+"""Masks by brightness, where a scene has none and the room was dark."""
+
+import numpy as np
+import scipy.ndimage
+import torch
+from skimage.filters import threshold_otsu
+
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import decode
+from mi_ring.images import box_filter
+
+
+def find_masks(capture: Capture) -> None:
+    """Give the photographs masks of what is brighter than a dark room, if it was dark when they were taken.
+
+    Such a mask shows what the light reaches of the object; the rest of the object may be as dark as the room.
+    """
+    some = [small_brightness(capture, k) for k in capture.spread(50)]
+    values = np.concatenate([image.ravel() for image in some])
+    if values.max() <= 0:
+        return
+    floor = values[values > 0].min()
+    split = float(np.exp(threshold_otsu(np.log(np.maximum(values, floor)))))
+    dark, bright = values[values <= split], values[values > split]
+    border = np.concatenate([np.concatenate([i[0], i[-1], i[:, 0], i[:, -1]]) for i in some])
+    # Above the noise of the dark: of what is not near to anything bright.
+    apart = [image[scipy.ndimage.maximum_filter(image, 7) <= split] for image in some]
+    if not sum(map(len, apart)) or np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
+        return
+    noise = float(np.quantile(np.concatenate(apart), 0.999))
+    capture.threshold = max(4 * noise, 1e-3 * float(np.median(bright)))
+    largest = []
+    for k in range(len(capture)):
+        seen = brightness(capture, k) > capture.threshold
+        pieces, _ = scipy.ndimage.label(seen)
+        sizes = np.bincount(pieces.ravel())
+        sizes[0] = 0
+        capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+        largest.append(sizes.max() / seen.size)
+    for k, share in enumerate(largest):
+        if share <= 0.02 * np.median(largest):  # a few hot pixels: the light did not reach the object
+            capture.masks[k] = None
+
+
+def small_brightness(capture: Capture, k: int) -> np.ndarray:
+    """`brightness` of about 256 × 256 pixels, the means of blocks."""
+    image = torch.from_numpy(brightness(capture, k))[..., None]
+    return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
+
+
+def brightness(capture: Capture, k: int) -> np.ndarray:
+    """Radiance (H, W) of the brightest colour of each pixel."""
+    return decode(capture.images[k], capture.linear[k], 1.0)[0].max(-1)

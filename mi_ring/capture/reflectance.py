@@ -1,0 +1,79 @@
+"""Which parameters of a scene's BSDF BRDF-Net predicts: the paper's five, or those of any other Mitsuba BSDF."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.capture.scenefile import bsdf_element
+from mi_ring.errors import InputError
+from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
+from mi_ring.rendering.attributes import attributes_of, constants, load_bsdf
+
+
+def predicted_parameters(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
+    """The parameters of the shapenet's BSDF that BRDF-Net is to predict, and the BSDF that reads them, as XML.
+
+    `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where
+    there is none. Empty: those of the five numbers of `cooktorrance` that have no constant. Raises InputError, naming
+    what the BSDF has.
+    """
+    bsdf = shape.bsdf()
+    element = bsdf_element(ElementTree.parse(scene).getroot(), scene)[1]
+    kind = element.get("type")
+    for inner in element.iter():
+        if inner.tag == "ref" or inner.get("name") == "filename":
+            raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
+                             "without files and references; use constants")  # fmt: skip
+        inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
+    textures = constants(bsdf)
+    own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
+    names = ", ".join([*textures, *own])
+    if not ranges and kind != "cooktorrance":
+        raise InputError(f"{scene}: bsdf: --parameters must say which parameters of {kind} to predict, and their "
+                         f"ranges, for instance --parameters {next(iter(textures), 'reflectance')} 0 1; "
+                         f"it has {names}")  # fmt: skip
+    parameters = []
+    for name, (low, high) in (ranges or {p.name: (p.low, p.high) for p in own.values()}).items():
+        if not -math.inf < low < high:
+            raise InputError(f"--parameters: {name}: range is {low:g} to {high:g}, must be from lower to higher")
+        if name in own:
+            parameters.append(own[name]._replace(low=low, high=high))
+            continue
+        if len(textures.get(name, [])) != 1:
+            found = "more than one" if name in textures else "no"
+            raise InputError(f"{scene}: bsdf: --parameters: {kind} has {found} texture {name}; it has {names}")
+        texture = next((e for e in element.iter() if e.get("name") == name), None)
+        if texture is None:
+            raise InputError(f"{scene}: bsdf: {name}: has no value; --parameters needs one to start from, an <rgb> "
+                             "for a colour, a <float> for a number")  # fmt: skip
+        value = np.array(textures[name][0])
+        if not low <= value.mean() <= high:
+            raise InputError(f"{scene}: bsdf: {name}: is {value.mean():g}, must be within the range of --parameters, "
+                             f"{low:g} to {high:g}")  # fmt: skip
+        parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, initial_output(value, low, high)))
+        texture.clear()
+        texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}
+        ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{name}")
+    xml = ElementTree.tostring(element, "unicode")
+    try:
+        left = attributes_of(load_bsdf(xml)) - {f"vertex_{p.name}" for p in parameters}
+    except RuntimeError as error:
+        raise InputError(f"{scene}: bsdf: --parameters: {' '.join(str(error).split())}") from error
+    if left:
+        raise InputError(f"{scene}: bsdf: nothing writes {min(left)}, which {kind} reads; give that parameter a "
+                         "constant, or a range with --parameters")  # fmt: skip
+    if not parameters:
+        raise InputError(f"{scene}: bsdf: every parameter of {kind} is a constant; --parameters must say which of "
+                         f"{names} to predict")  # fmt: skip
+    return tuple(parameters), xml
+
+
+def initial_output(value: np.ndarray, low: float, high: float) -> float:
+    """What BRDF-Net's output must begin with for the parameter to begin with the mean of `value`; 0 without an end."""
+    if math.isinf(high):
+        return 0.0
+    share = (float(value.mean()) - low) / (high - low)
+    share = min(max(share, 0.05), 0.95)
+    return math.log(share / (1 - share))

@@ -1,0 +1,134 @@
+"""The XML of scene files: the one place that writes photographs, cameras and lights."""
+
+import math
+import os
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
+from mi_ring.rendering.lights import Light
+
+Element = ElementTree.Element
+
+
+def photograph_element(
+    name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
+    encoding: str | None = None, saturation: float | None = None, valid: str | None = None,
+) -> Element:  # fmt: skip
+    """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
+    element = ElementTree.Element("sensor", type="photograph", id=name)
+    for field, value in {"filename": filename, "mask": mask, "valid": valid, "encoding": encoding}.items():
+        if value:
+            ElementTree.SubElement(element, "string", name=field, value=value)
+    fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
+    for field, value in (fields | ({} if saturation is None else {"saturation": saturation})).items():
+        ElementTree.SubElement(element, "float", name=field, value=numbers(value))
+    add_pose(element, camera)
+    add_film(element, *camera.size)
+    if light:
+        element.append(emitter_element(light))
+    return element
+
+
+def emitter_element(light: Light) -> Element:
+    """A light as XML: `point` or `directional`."""
+    emitter = ElementTree.Element("emitter", type=light.kind)
+    tag, where, strength = {
+        "point": ("point", "position", "intensity"), "directional": ("vector", "direction", "irradiance")
+    }[light.kind]  # fmt: skip
+    x, y, z = (numbers(v) for v in light.vector)
+    ElementTree.SubElement(emitter, tag, name=where, x=x, y=y, z=z)
+    ElementTree.SubElement(emitter, "rgb", name=strength, value=numbers(light.rgb))
+    return emitter
+
+
+def perspective_element(camera: Camera, points: np.ndarray) -> Element:
+    """A camera as Mitsuba's `perspective`, whose clipping planes hold points (n, 3) between them.
+
+    Its pixels are square, so that it may have more or fewer rows.
+    """
+    (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
+    distance = np.linalg.norm(points - camera.position, axis=1)
+    height, cy = round(height * fx / fy), cy * fx / fy
+    sensor = ElementTree.Element("sensor", type="perspective")
+    for name, value in {
+        "fov": math.degrees(2 * math.atan(width / 2 / fx)),
+        "principal_point_offset_x": 0.5 - cx / width, "principal_point_offset_y": 0.5 - cy / height,
+        "near_clip": 0.5 * distance.min(), "far_clip": 2 * distance.max(),
+    }.items():  # fmt: skip
+        ElementTree.SubElement(sensor, "float", name=name, value=numbers(value))
+    ElementTree.SubElement(sensor, "string", name="fov_axis", value="x")
+    add_pose(sensor, camera)
+    add_film(sensor, width, height)
+    return sensor
+
+
+def add_pose(sensor: Element, camera: Camera) -> None:
+    """Give a sensor its `to_world`."""
+    transform = ElementTree.SubElement(sensor, "transform", name="to_world")
+    ElementTree.SubElement(transform, "matrix", value=numbers(camera.to_world))
+
+
+def add_film(sensor: Element, width: int, height: int) -> None:
+    """Give a sensor a film of this size [px]."""
+    film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
+    for name, pixels in (("width", width), ("height", height)):
+        ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
+
+
+def load_element(element: Element):
+    """The object of Mitsuba's that an element stands for."""
+    element.set("version", "3.0.0")
+    return mi.load_string(ElementTree.tostring(element, "unicode"))
+
+
+def numbers(values) -> str:
+    """As XML has them."""
+    return " ".join(f"{v:.9g}" for v in np.ravel(values))
+
+
+def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
+    """The scene file `source` with the fitted object and its `bsdf`, file names rewritten to be relative to `folder`.
+
+    Raises InputError for a scene that cannot be rewritten, and for a shapenet that a fit has no use for.
+    """
+    tree = ElementTree.parse(source)
+    old_bsdf, _ = bsdf_element(tree.getroot(), source)
+    for element in tree.iter("string"):
+        file = source.parent / element.get("value", "")
+        if element.get("value") and file.is_file():
+            element.set("value", Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
+    shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
+    for element in list(shape):
+        if element.get("name") in ("weights", "to_world"):
+            raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
+        if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
+            shape.remove(element)
+    shape.remove(old_bsdf)
+    shape.append(ElementTree.fromstring(bsdf))
+    ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
+    ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")
+    ElementTree.indent(tree)
+    return ElementTree.tostring(tree.getroot(), "utf-8")
+
+
+def bsdf_element(root: Element, scene: Path) -> tuple[Element, Element]:
+    """The shapenet's <bsdf>, or its <ref> to one, and the BSDF meant, in the XML of a scene.
+
+    Raises InputError if there is none, and where a part of the scene is not in the file.
+    """
+    for tag in ("include", "default", "path"):
+        if root.find(f".//{tag}") is not None:
+            raise InputError(f"{scene}: <{tag}>: a fit needs a scene without it; write out what it stands for")
+    shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
+    known = {e.get("id"): e for e in root.iter("bsdf")}
+    for child in shape:
+        if child.tag == "bsdf":
+            return child, child
+        if child.tag == "ref" and child.get("id") in known:
+            return child, known[child.get("id")]
+    raise InputError(f'{scene}: shapenet: has no <bsdf>; add for instance <bsdf type="cooktorrance"/>')

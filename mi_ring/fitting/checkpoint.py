@@ -1,0 +1,59 @@
+"""Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
+
+import hashlib
+import os
+from pathlib import Path
+
+from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
+from mi_ring.ring.saved import read_state
+from mi_ring.system.files import write_state
+
+NAME = "checkpoint.pt"
+
+
+def read_checkpoint(folder: Path, config: Config) -> dict:
+    """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
+    path = folder / NAME
+    state = read_state(path, "run without --resume to start anew")
+    if not {"settings", "files", "fit"} <= set(state):
+        raise InputError(f"{path}: --resume: not a checkpoint of this version of mi_ring; run without --resume")
+    for name, value in config.settings().items():
+        if state["settings"].get(name) != value:
+            raise InputError(f"{path}: --{name.replace('_', '-')}: was {state['settings'].get(name)} before, is {value} "
+                             "now; give the same settings to resume, or start anew without --resume")  # fmt: skip
+    return state
+
+
+def require_same_files(state: dict, capture: Capture, config: Config, folder: Path) -> None:
+    """Raise InputError if a file of the capture is not what it was when the checkpoint was made."""
+    before, now = state["files"], digests(capture, config)
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            raise InputError(f"{folder / NAME}: --resume: {name} has changed since, or is another file; start anew "
+                             "without --resume")  # fmt: skip
+
+
+def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
+    """Write what `--resume` needs; `files` are the `digests` of the capture's."""
+    write_state({"settings": fit.config.settings(), "files": files, "fit": fit.state()}, folder / NAME)
+
+
+def digests(capture: Capture, config: Config) -> dict[str, str]:
+    """What tells one file from another, of all that a fit reads: by name, relative to the scene."""
+    files = {capture.path, capture.shape.domain_file}
+    files |= {file for sensor in capture.sensors for file in (sensor.filename, sensor.mask, sensor.valid)}
+    if isinstance(config.domain, tuple):
+        files.add(Path(config.domain[1]))
+    return {Path(os.path.relpath(file, capture.path.parent)).as_posix(): digest(file) for file in files if file}
+
+
+def digest(file: Path) -> str:
+    """A hash of a file's content."""
+    result = hashlib.blake2b(digest_size=16)
+    with file.open("rb") as stream:
+        while block := stream.read(2**20):
+            result.update(block)
+    return result.hexdigest()

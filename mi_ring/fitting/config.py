@@ -1,0 +1,135 @@
+"""What the user chooses of a fit: one frozen dataclass, whose docstrings are the command's help."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mi_ring.errors import InputError
+
+#: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
+WEIGHTS = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The settings of a fit: all that defines its result but the photographs.
+
+    Raises InputError for what is out of range. `Config.preset` gives settings that go together.
+    """
+
+    domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
+    """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
+    the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
+    masks: Literal["auto", "given", "none"] = "auto"
+    """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
+    room; none: as if it had none, which finds them in a dark room, too; --weights.mask 0 does without any."""
+    seed: int = 0
+    """Random seed."""
+    iterations: int = 360
+    """Number of iterations, shared out among the stages. From a hull or a mesh it is fewer, see --shares."""
+    levels: tuple[int, ...] = (4, 5, 6)
+    """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
+    widths: tuple[int, ...] = (128, 256, 512)
+    """Width of the photographs in each stage, at most [px]."""
+    shares: tuple[float, ...] = (0.45, 0.46, 0.09)
+    """Share of the iterations of each stage. A hull or a mesh is near the object already: from there two thirds of the
+    first stage are exchanged for 40 % as many iterations of the second, which take about as long."""
+    batch: int = 8
+    """Photographs per iteration."""
+    steps: int = 5
+    """Euler steps of the flow, the paper's T."""
+    spp: int = 1
+    """Samples per pixel."""
+    loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
+    """How predicted and observed radiance are compared. l2: squared differences, the paper's; l1: absolute ones, which
+    few pixels that no surface explains do not rule; log: of logarithms, for what is dark; l1+log: the mean of both."""
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
+    base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
+    shadows: bool = True
+    """Is a point lit only if it sees the light, while fitting? Pictures of the result follow the scene's integrator."""
+    indirect: bool = True
+    """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
+    weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
+    """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
+    flow is, the paper's lambda."""
+    velocity_decay: float = 0.03
+    """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
+    while it finds its place, weak at the end, for details."""
+    laplacian_scale: float = 0.01
+    """The paper's alpha: how much the regulariser smoothes the velocity field."""
+    blur: float = 0.06
+    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to a pixel."""
+    optimizer: Literal["muon", "adam"] = "muon"
+    """muon: Muon for the hidden weights, Adam for the rest. adam: Adam for all."""
+    learning_rate: float = 3e-3
+    """Learning rate of Adam."""
+    muon_rate: float = 3e-2
+    """Learning rate of Muon."""
+    decay: float = 0.1
+    """The learning rates fall exponentially to this share."""
+    precision: Literal["auto", "bfloat16", "float32"] = "auto"
+    """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer GPUs)."""
+    subdivisions: int = 6
+    """Level of the mesh that is written."""
+    deterministic: bool = False
+    """The same result bit for bit on the same machine, on one thread."""
+
+    def __post_init__(self):
+        def require(condition: bool, name: str, what: str) -> None:
+            if not condition:
+                raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
+
+        for name in ("iterations", "steps", "batch", "spp"):
+            require(getattr(self, name) >= 1, name, "at least 1")
+        require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
+        for name in ("blur", "laplacian_scale"):
+            require(0 <= getattr(self, name) < math.inf, name, "0 or more")
+        for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
+            require(0 < getattr(self, name) < math.inf, name, "above 0")
+        require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
+        require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
+        for name in ("widths", "shares"):
+            value = getattr(self, name)
+            require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
+            require(all(0 < v < math.inf for v in value), name, "above 0")
+        object.__setattr__(self, "weights", WEIGHTS | self.weights)
+        require(all(0 <= w < math.inf for w in self.weights.values()), "weights", "0 or more")
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> "Config":
+        """The settings of a preset, `fast`, `default`, `fine` or `paper`, but for these changes.
+
+        Of `weights` only those that are given change. Raises InputError for another name.
+        """
+        if name not in PRESETS:
+            raise InputError(f"preset: is {name}, must be one of {', '.join(PRESETS)}")
+        settings = PRESETS[name] | changes
+        if "weights" in changes:
+            settings["weights"] = PRESETS[name].get("weights", {}) | changes["weights"]
+        return cls(**settings)
+
+    def settings(self) -> dict:
+        """All settings as plain data."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(Config)}
+        return json.loads(json.dumps(values, default=str))
+
+
+#: Settings that go together, by name.
+PRESETS: dict[str, dict] = {
+    "fast": {
+        "iterations": 120, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
+    },
+    "default": {},
+    "fine": {"iterations": 1000, "shares": (0.3, 0.4, 0.3)},
+    "paper": {
+        "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
+        "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
+        "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
+        "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
+    },
+}  # fmt: skip

@@ -1,0 +1,243 @@
+"""The loop of a fit: sample the domain, deform, render, weigh, step."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.loading import recompute_normals
+from mi_ring.capture.reflectance import predicted_parameters
+from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.optimizers import optimizers_of
+from mi_ring.fitting.schedule import stages_of
+from mi_ring.fitting.start import require_view_from_outside, starting_surface
+from mi_ring.fitting.terms import Term, default_terms
+from mi_ring.geometry.domain import Sphere
+from mi_ring.output import results
+from mi_ring.rendering import bridge
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_of, ring_state
+from mi_ring.system.machine import autocast, device
+
+FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
+
+TermLike = Term | Callable[[Iteration], Tensor | None]
+
+
+class Fit:
+    """A reconstruction in progress: networks, optimisers, random numbers and how far it is.
+
+        for it in Fit(capture, Config.preset("fast")):
+            print(it.number, it.loss)
+
+    `networks`: (Shape-Net, BRDF-Net), others than the paper's, as `mi_ring.nets.shapenet.Flow` and
+    `mi_ring.nets.brdfnet.ReflectanceMap` say. `terms`: of the loss, by name, each a `Term` or a function of an
+    `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration` when it is done. `state`: what
+    `state()` of an interrupted fit gave, to go on from there.
+
+    Raises InputError where capture, settings, terms and networks do not go together.
+    """
+
+    def __init__(
+        self, capture: Capture, config: Config | None = None, networks: tuple[nn.Module, nn.Module] | None = None,
+        terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
+        state: dict | None = None,
+    ):  # fmt: skip
+        self.capture, self.config = capture, config or Config()
+        given = default_terms if terms is None else terms
+        self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
+        self.callbacks = list(callbacks)
+        if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
+            raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
+        if self.config.deterministic:
+            recompute_normals(capture.scene)
+        self.random = torch.Generator().manual_seed(self.config.seed)
+        torch.manual_seed(self.config.seed)
+        self.exposure = capture.exposure()
+        self.ring = ring_of(state["ring"]) if state else self.new_ring(networks)
+        self.device = device()
+        self.ring.to(self.device)
+        self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
+        self.optimizers = optimizers_of(self.ring, self.config, self.device)
+        self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
+        self.iterations = self.stages[-1].last
+        self.autocast = autocast(self.config.precision, self.device)
+        self.iteration, self.seconds = 0, 0.0
+        self.failures = 0  # losses or gradients in a row that were not finite
+        if state:
+            self.restore(state)
+
+    def new_ring(self, networks: tuple[nn.Module, nn.Module] | None) -> Ring:
+        """The networks before the first iteration, on the surface that the fit starts from."""
+        capture, config = self.capture, self.config
+        domain, center, radius = starting_surface(capture, config.domain)
+        require_view_from_outside(capture, domain, center, radius)
+        parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
+        scale = capture.reflectance(center, self.exposure)
+        if math.pi * scale >= 1 and all(math.isfinite(p.high) for p in parameters):
+            raise InputError(f"{capture.path}: emitter: by the lights' intensities the object reflects "
+                             f"{math.pi * scale:.3g} times the light that it gets, which the ranges of --parameters do "
+                             "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
+        indirect = config.indirect and math.pi * scale < 1
+        if networks:
+            networks[1].predict(parameters, scale)
+        ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
+                    networks)  # fmt: skip
+        require_networks(ring)
+        if "velocity" in self.terms and config.weights["velocity"] and not hasattr(ring.shape_net, "velocity"):
+            raise InputError(f"networks: {type(ring.shape_net).__name__}: has no velocity, which the term of that name "
+                             "needs; give it one, or the term the weight 0")  # fmt: skip
+        return ring
+
+    @property
+    def albedo(self) -> float:
+        """Of the light it gets, how much the object reflects: more than all where the intensities are not true."""
+        return math.pi * self.capture.reflectance(self.ring.center.cpu().numpy(), self.exposure)
+
+    def __iter__(self) -> Iterator[Iteration]:
+        """The iterations that are left, each as it is done."""
+        while self.iteration < self.iterations:
+            yield self.step()
+
+    def step(self) -> Iteration:
+        """One iteration: sample the domain, deform, render, weigh, step. Raises InputError if the fit diverges."""
+        started = time.perf_counter()
+        it = self.predict()
+        loss = self.weigh(it)
+        self.descend(loss, it.progress)
+        it.loss = float(loss.detach())
+        it.detach()
+        self.iteration += 1
+        self.seconds += time.perf_counter() - started
+        for callback in self.callbacks:
+            callback(it)
+        return it
+
+    def predict(self) -> Iteration:
+        """Sample the domain, deform it, choose photographs and render them."""
+        config, number = self.config, self.iteration
+        stage = next(s for s in self.stages if number < s.last)
+        s, faces = self.ring.domain.sample(stage.level, self.random)
+        s = s.to(self.device)
+        with self.autocast():
+            vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
+
+        index, size = self.choose()
+        scale = -(-size[0] // stage.width)
+        observed, clipped, mask, masked, valid = (
+            None if t is None else t.to(self.device) for t in self.capture.observe(index, scale)
+        )
+        photographs = self.capture.photographs.select(index, size, scale)
+        self.surface.set_faces(faces)
+        predicted, coverage = bridge.render(
+            self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
+            shadows=config.shadows and self.capture.shadows,
+        )  # fmt: skip
+        if self.ring.indirect:
+            predicted = predicted + bridge.interreflection(self.surface, photographs, coverage, self.new_seed())
+        return Iteration(
+            self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
+            observed, clipped, mask, masked, valid, predicted, coverage,
+        )  # fmt: skip
+
+    def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
+        """Indices of the photographs of one iteration, all of one size (width, height)."""
+        first = int(torch.randint(len(self.capture), (), generator=self.random))
+        size = self.capture.sensors[first].size
+        alike = self.capture.sizes[size]
+        order = torch.randperm(len(alike), generator=self.random)[: self.config.batch]
+        return alike[order.numpy()], size
+
+    def new_seed(self) -> int:
+        """For the renderer."""
+        return int(torch.randint(2**31, (), generator=self.random))
+
+    def weigh(self, it: Iteration) -> Tensor:
+        """The weighted sum of the terms; what each is goes into the iteration."""
+        loss = torch.zeros((), device=self.device)
+        for name, term in self.terms.items():
+            weight = self.config.weights.get(name, term.weight)
+            value = term.function(it) if weight else None
+            if value is None:
+                continue
+            it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
+            it.terms[name] = float(value.detach())
+            loss = loss + it.weights[name] * value
+        return loss
+
+    def descend(self, loss: Tensor, progress: float) -> None:
+        """The backward pass and a step of the optimisers; none if the loss or its gradient is not finite."""
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
+        with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
+            loss.backward()
+        clip = torch.nn.utils.clip_grad_norm_
+        # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
+        norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
+        healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
+        self.failures = 0 if healthy else self.failures + 1
+        if self.failures >= FAILURES:
+            rate = "--muon-rate" if self.config.optimizer == "muon" else "--learning-rate"
+            raise InputError(f"{self.capture.path}: diverged at iteration {self.iteration}; try a lower {rate}")
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * self.config.decay**progress
+            if healthy:
+                optimizer.step()
+
+    def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
+        """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.
+
+        At most `width` pixels wide, of the surface at a `level`. It changes nothing of the fit; but not from within a
+        term, for whose backward pass the renderer keeps what it rendered.
+        """
+        self.surface.show(self.ring, *self.ring.domain.sample(level))
+        photograph = self.capture.photograph(k, -(-self.capture.sensors[k].size[0] // width))
+        rgb, _ = bridge.draw(self.surface, photograph, spp, shadows=self.capture.shadows, indirect=self.ring.indirect)
+        return rgb[0].numpy()
+
+    def save(self, folder: str | Path) -> None:
+        """Write the results into a folder: `ring.pt`, `mesh.ply`, `scene.xml`, `report.html`, as `mi_ring.fit` does.
+
+        Raises InputError if they cannot be written, ValueError for networks that are not registered.
+        """
+        results.save_fit(Path(folder), self)
+
+    def state(self) -> dict:
+        """What another `Fit` of the same capture needs to go on from here, for `torch.save`."""
+        return {
+            "ring": ring_state(self.ring, self.config.settings()),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "random": self.random.get_state(),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+        }
+
+    def restore(self, state: dict) -> None:
+        """Take up what a `state` says besides the ring."""
+        for optimizer, saved in zip(self.optimizers, state["optimizers"]):
+            optimizer.load_state_dict(saved)
+        self.random.set_state(state["random"])
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
+
+
+def require_networks(ring: Ring) -> None:
+    """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
+    s = torch.zeros(2, 3)
+    with torch.no_grad():
+        moved = ring.shape_net(s)
+        if moved.shape != s.shape:
+            raise InputError(f"networks: {type(ring.shape_net).__name__}: gives {tuple(moved.shape)} for points (2, 3)")
+        brdf_net = ring.brdf_net
+        evaluate = getattr(brdf_net, "evaluate", None)  # networks may do without
+        if evaluate and (found := evaluate(s).shape[-1]) != brdf_net.outputs:
+            names = ", ".join(p.name for p in brdf_net.bsdf_parameters)
+            raise InputError(f"networks: {type(brdf_net).__name__}: has {found} outputs, {names} need "
+                             f"{brdf_net.outputs}")  # fmt: skip

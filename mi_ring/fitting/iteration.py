@@ -1,0 +1,50 @@
+"""One iteration of a fit, as the terms of its loss, callbacks and loops see it."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from mi_ring.fitting.schedule import Stage
+from mi_ring.rendering.photographs import Photographs
+
+if TYPE_CHECKING:
+    from mi_ring.fitting.fit import Fit
+
+
+@dataclass
+class Iteration:
+    """What an iteration has sampled, predicted and weighed. Tensors are attached while the terms are computed.
+
+    V vertices; n photographs of H × W pixels, those of the capture box-filtered to the stage's width.
+    """
+
+    fit: "Fit"
+    number: int  #: from 1
+    progress: float  #: share of the iterations that came before it, in [0, 1)
+    stage: Stage
+    s: Tensor  #: (V, 3) domain points
+    faces: np.ndarray  #: (F, 3)
+    vertices: Tensor  #: (V, 3) [scene units]
+    material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
+    index: np.ndarray  #: (n,) which photographs
+    scale: int  #: how many pixels of the files are one of theirs, across
+    photographs: Photographs  #: their cameras and lights
+    observed: Tensor  #: (n, H, W, 3) linear radiance
+    clipped: Tensor  #: (n, H, W, 3) bool: the scene is at least as bright as observed
+    mask: Tensor  #: (n, H, W) the object's coverage by the masks, in [0, 1]
+    masked: Tensor  #: (n,) bool: which photographs have a mask
+    valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None: all do
+    predicted: Tensor  #: (n, H, W, 3) linear radiance
+    coverage: Tensor  #: (n, H, W) the object's coverage as predicted, in [0, 1]
+    loss: float = 0.0  #: the weighted sum of the terms
+    terms: dict[str, float] = field(default_factory=dict)  #: unweighted, by name
+    weights: dict[str, float] = field(default_factory=dict)  #: of the terms, in this iteration
+
+    def detach(self) -> None:
+        """Let go of the graph, when the backward pass is done."""
+        self.vertices, self.predicted, self.coverage = (
+            tensor.detach() for tensor in (self.vertices, self.predicted, self.coverage)
+        )
+        self.material = {name: value.detach() for name, value in self.material.items()}

@@ -1,0 +1,49 @@
+"""Muon: steps of orthogonalised momentum, for weight matrices."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+#: Coefficients of the quintic of Newton and Schulz, and how often it is applied (Jordan et al. 2024, "Muon: an
+#: optimizer for hidden layers in neural networks").
+COEFFICIENTS, ITERATIONS = (3.4445, -4.775, 2.0315), 5
+
+
+class Muon(torch.optim.Optimizer):
+    """`torch.optim.Muon` without weight decay, that orthogonalises in a `dtype` of one's choice.
+
+    PyTorch's own does so in bfloat16, which most processors emulate: there it takes 20 times as long as in float32.
+    """
+
+    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype, momentum: float = 0.95):
+        super().__init__(params, {"lr": lr, "momentum": momentum})
+        self.dtype = dtype
+
+    @torch.no_grad()
+    def step(self, closure=None):
+        """One step. A tall matrix takes a longer one, by the root of how much taller it is."""
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is None:
+                    continue
+                state = self.state[p]
+                if not state:
+                    state["momentum_buffer"] = torch.zeros_like(p.grad)
+                momentum = state["momentum_buffer"].lerp_(p.grad, 1 - group["momentum"])
+                update = orthogonalised(p.grad.lerp(momentum, group["momentum"]), self.dtype)
+                ratio = max(1.0, p.shape[0] / p.shape[1]) ** 0.5
+                p.add_(update.to(p.dtype), alpha=-group["lr"] * ratio)
+
+
+def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
+    """About the nearest matrix with orthonormal rows or columns: singular values are brought to between 0.7 and 1.2."""
+    a, b, c = COEFFICIENTS
+    x = matrix.to(dtype)
+    tall = x.shape[0] > x.shape[1]
+    x = x.T if tall else x
+    x = x / x.norm().clamp(min=1e-7)
+    for _ in range(ITERATIONS):
+        gram = x @ x.T
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.T if tall else x

@@ -1,0 +1,82 @@
+"""A fit from its first iteration to its results: progress, log, checkpoints, Ctrl-C."""
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from tqdm import tqdm
+
+from mi_ring.fitting.checkpoint import digests, write_checkpoint
+from mi_ring.fitting.fit import Fit
+from mi_ring.output import results
+
+CHECKPOINT_SECONDS = 30.0
+LOG_EVERY = 5
+FIXED_WORK = 3000  #: what an iteration costs besides its vertices, in vertices: for the time left
+
+
+@contextlib.contextmanager
+def interruptible():
+    """Yields a function that tells whether Ctrl-C was pressed. A second Ctrl-C ends the program at once."""
+    pressed = []
+
+    def press(number, frame):
+        pressed.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
+    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints in `folder`."""
+    vertices = {stage.level: len(fit.ring.domain.sample(stage.level)[0]) for stage in fit.stages}
+    work = [vertices[s.level] + FIXED_WORK for s in fit.stages for _ in range(s.first, s.last)]
+    saved, files = time.monotonic(), digests(fit.capture, fit.config)
+    bar = tqdm(
+        total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,
+        bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
+    )  # fmt: skip
+    results.start_log(folder, fit.iteration)
+    with bar:
+        while fit.iteration < fit.iterations and not interrupted():
+            it = fit.step()
+            stage = fit.stages.index(it.stage) + 1
+            where = f"stage {stage}/{len(fit.stages)}, iteration {it.number}/{fit.iterations}"
+            bar.set_description_str(where, refresh=False)
+            bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
+            bar.update(work[it.number - 1])
+            if it.number % LOG_EVERY == 0 or it.number == fit.iterations:
+                entry = {"iteration": it.number, "seconds": round(fit.seconds, 3), "loss": it.loss, **it.terms,
+                         "weights": it.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
+                         "stage": stage, "vertices": vertices[it.stage.level]}  # fmt: skip
+                results.log(folder, entry)
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                write_checkpoint(fit, files, folder)
+                saved = time.monotonic()
+    write_checkpoint(fit, files, folder)
+
+
+def run_session(fit: Fit, folder: Path) -> bool:
+    """Run a fit in a folder that has been prepared and write its results, whatever ends it. Was it interrupted?"""
+    fitted_scene = results.fitted_scene(fit, folder)
+    with interruptible() as interrupted:
+        print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
+        if fit.config.indirect and not fit.ring.indirect:
+            print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
+                  f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
+        if not fit.iteration:
+            results.write_inputs(folder / "inputs.png", fit)
+        try:
+            train(fit, folder, interrupted)
+        except Exception:
+            results.write(folder, fit, fitted_scene)
+            raise
+        results.write(folder, fit, fitted_scene)
+    return fit.iteration < fit.iterations

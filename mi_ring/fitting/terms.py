@@ -1,0 +1,101 @@
+"""The terms of the loss. All are means, so that their weights do not depend on sizes.
+
+Small pure functions of tensors, and what a fit makes of them: `default_terms`, functions of an `Iteration`.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.images import blur
+
+REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
+
+
+def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str) -> Tensor:
+    """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
+
+    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error.
+    `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
+    that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the mean of both.
+    """
+
+    def perceived(photographs: Tensor) -> Tensor:
+        linear = photographs / exposure
+        if kind in ("l2", "l1"):
+            return linear
+        log = (4 * linear).clamp(min=-0.5).log1p()
+        return log if kind == "log" else (linear + log) / 2  # both rise, so this is the mean of two losses
+
+    error = perceived(predicted) - perceived(observed)
+    error = torch.where(clipped, error.clamp(max=0), error)
+    return error.square().mean() if kind == "l2" else error.abs().mean()
+
+
+def mask_loss(coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None) -> Tensor:
+    """Squared difference of coverage and mask (n, H, W), blurred by a Gaussian of `sigma` [px].
+
+    The blur lets an outline feel a mask that it does not touch yet. Where not `valid` (n, H, W) there is no difference.
+    """
+    difference = coverage - mask if valid is None else (coverage - mask) * valid
+    return blur(difference, sigma).square().mean()
+
+
+def velocity_loss(velocity, x: Tensor, laplacian_scale: float, step: float = 0.02) -> Tensor:
+    """L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) of the flow's paths, α = `laplacian_scale`.
+
+    The Laplacian over ℝ³ is the seven-point stencil of width `step`, small against the period of the highest frequency.
+    """
+    offsets = step * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
+    v = velocity(torch.cat([x[None], x + offsets[:, None]]))
+    laplacian = (v[1:] - v[0]).sum(0) / step**2
+    return (v[0] - laplacian_scale * laplacian).square().sum(-1).mean()
+
+
+class Term(NamedTuple):
+    """A term of the loss."""
+
+    function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it has nothing to say this time
+    weight: float = 1.0  #: where `Config.weights` has none of its name; 0 switches it off
+    schedule: Callable[[Iteration], float] | None = None  #: a factor of the weight in the course of the fit
+
+
+def rgb(it: Iteration) -> Tensor:
+    """Colours: predicted photographs against observed ones."""
+    return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss)
+
+
+def mask(it: Iteration) -> Tensor | None:
+    """Silhouettes, of the photographs that have a mask."""
+    if not it.masked.any():
+        return None
+    # The blur shrinks, to a pixel for the last fifth of the fit.
+    sigma = it.fit.config.blur * (1 - it.progress / 0.8) * it.fit.capture.sensors[it.index[0]].size[0] / it.scale
+    coverage, threshold = it.coverage, it.fit.capture.threshold
+    if threshold is not None:  # of the object, such masks show what is bright
+        lit = torch.maximum(it.observed, it.predicted.detach()).amax(-1) > threshold
+        coverage = torch.where(lit, coverage, 0)
+    valid = None if it.valid is None else it.valid[it.masked]
+    return mask_loss(coverage[it.masked], it.mask[it.masked], max(1.0, sigma), valid)
+
+
+def velocity(it: Iteration) -> Tensor:
+    """L_reg at random points of the paths of the domain points, random in time."""
+    fit, net = it.fit, it.fit.ring.shape_net
+    chosen = torch.randperm(len(it.s), generator=fit.random)[:REGULARISED_POINTS]
+    steps = int(torch.randint(net.steps, (), generator=fit.random))
+    with torch.no_grad(), fit.autocast():
+        x = net.flow(it.s[chosen], steps)
+    # The velocity in float32 always: its second differences would drown in bfloat16.
+    return velocity_loss(net.velocity, x, fit.config.laplacian_scale)
+
+
+#: What a fit minimises unless told otherwise. Their weights are those of `Config.weights`.
+default_terms: dict[str, Term] = {
+    "rgb": Term(rgb),
+    "mask": Term(mask),
+    "velocity": Term(velocity, schedule=lambda it: it.fit.config.velocity_decay**it.progress),
+}

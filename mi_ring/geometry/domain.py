@@ -1,0 +1,134 @@
+"""Domains: the canonical surfaces that Shape-Net's flow starts from and on which BRDF-Net is defined."""
+
+import numpy as np
+import torch
+import trimesh
+from gpytoolbox import remesh_botsch, squared_distance
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+FINEST = 6  #: level up to which domains are remeshed; beyond it triangles are cut in four
+PLACES = 16  #: for each vertex to be at
+MOST_SAMPLES = 2**22  #: of the surface, among which they are found: at levels 7 and 8 some vertices have fewer places
+
+
+def closed_domain(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> tuple["Domain", np.ndarray, float]:
+    """The domain that a closed mesh is, with the normalising sphere: by default its middle and its mean radius."""
+    if mesh.volume < 0:
+        mesh.invert()
+    center = mesh.bounds.mean(0) if center is None else np.asarray(center)
+    radius = radius or float(np.linalg.norm(mesh.vertices - center, axis=1).mean())
+    return Domain((mesh.vertices - center) / radius, mesh.faces), center, radius
+
+
+class Domain:
+    """A closed surface in the normalised frame, given as a mesh, points (V, 3) and faces (F, 3), of any triangles.
+
+    Its samplings are other meshes of the same surface, of near-uniform triangles.
+    """
+
+    def __init__(self, points, faces):
+        self.points = np.asarray(points, np.float32)
+        self.faces = np.asarray(faces, np.int64)
+        self.levels: dict[int, tuple[Tensor, np.ndarray]] = {}
+        self.places: dict[int, Tensor] = {}
+
+    def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
+        """Points (V, 3) and faces (F, 3): about as many as an icosphere of that level has, 20 · 4^level.
+
+        With `random` the points are elsewhere on the surface each time, so that in the course of a fit all of it is
+        seen and not only what the vertices stand on. The faces stay the same.
+        """
+        if level not in self.levels:
+            points, faces = self.triangulate(level)
+            self.levels[level] = torch.from_numpy(np.asarray(points, np.float32)), np.asarray(faces, np.int64)
+        points, faces = self.levels[level]
+        return (points if random is None else self.move(level, points, random)), faces
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (N, 3) are inside, (N,) bool."""
+        inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
+        if inside.any():
+            from gpytoolbox import fast_winding_number  # here, for it takes a second
+
+            mesh = self.points.astype(float), self.faces.astype(np.int32)
+            inside[inside] = fast_winding_number(points[inside], *mesh) > 0.5
+        return inside
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """The points of the surface that are nearest to these (N, 3)."""
+
+        faces = self.faces.astype(np.int32)
+        _, face, weights = squared_distance(points.astype(float), self.points.astype(float), faces, use_cpp=True)
+        return (self.points[self.faces[face]] * weights[..., None]).sum(1)
+
+    def triangulate(self, level: int):
+        """The surface in about 20 · 4^level triangles."""
+        if level > FINEST:
+            return trimesh.remesh.subdivide(*self.sample(level - 1))
+
+        mesh = trimesh.Trimesh(self.points, self.faces)
+        edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
+        points, faces = remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+        remeshed = trimesh.Trimesh(points, faces)
+        if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
+            return points, faces
+        points, faces = self.points, self.faces  # too coarse for the surface's handles
+        while len(faces) < 20 * 4**level:
+            points, faces = trimesh.remesh.subdivide(points, faces)
+        return points, faces
+
+    def move(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
+        """Every point to one of the places around it, on the surface and well inside its cell."""
+        if level not in self.places:
+            self.places[level] = self.find_places(level)
+        chosen = torch.randint(PLACES, (len(points),), generator=random)
+        return self.places[level][torch.arange(len(points)), chosen]
+
+    def find_places(self, level: int) -> Tensor:
+        """Random points (V, PLACES, 3) of the surface around each point of a level."""
+        points, faces = self.sample(level)
+        coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
+        fine = trimesh.Trimesh(self.points, self.faces, process=False)
+        samples = min(4 * PLACES * len(points), MOST_SAMPLES)
+        dense, triangle = trimesh.sample.sample_surface(fine, samples, seed=level)
+        longest = coarse.edges_unique_length[coarse.faces_unique_edges].max(1)
+        height = 2 * coarse.area_faces / longest
+        reach = np.full(len(points), np.inf)
+        np.minimum.at(reach, faces, 0.45 * height[:, None])  # less than half of it: no triangle can turn over
+        distance, nearest = cKDTree(coarse.vertices).query(dense)
+        near = distance < reach[nearest]
+        dense, triangle, nearest = dense[near], triangle[near], nearest[near]
+        same_side = (fine.face_normals[triangle] * coarse.vertex_normals[nearest]).sum(1) > 0.5
+        dense, nearest = dense[same_side], nearest[same_side]
+        order = np.argsort(nearest, kind="stable")
+        dense, nearest = dense[order], nearest[order]
+        first, count = np.searchsorted(nearest, np.arange(len(points))), np.bincount(nearest, minlength=len(points))
+        rank = np.arange(PLACES) % np.maximum(count, 1)[:, None]
+        found = dense[np.minimum(first[:, None] + rank, len(dense) - 1)]
+        places = np.where(count[:, None, None] > 0, found, points.numpy()[:, None])
+        return torch.from_numpy(places.astype(np.float32))
+
+
+class Sphere(Domain):
+    """The unit sphere, sampled as an icosphere: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
+
+    def __init__(self):
+        icosahedron = trimesh.creation.icosahedron()
+        super().__init__(icosahedron.vertices, icosahedron.faces)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points, axis=1) < 1
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+    def triangulate(self, level: int):
+        mesh = trimesh.creation.icosphere(subdivisions=level)
+        return mesh.vertices, mesh.faces
+
+    def move(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
+        """All points by one rotation: the sphere looks the same from everywhere."""
+        rotation = Rotation.from_quat(torch.randn(4, generator=random).numpy()).as_matrix()
+        return points @ torch.as_tensor(rotation, dtype=torch.float32).T

@@ -1,0 +1,182 @@
+"""The visual hull: all points that are inside the masks, where a fit starts."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage
+import skimage.measure
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera, nearest_point
+
+SHOWN = 0.25  #: share of the photographs that must show a point, else it is outside
+MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
+
+
+class NoHull(InputError):
+    """No point in space is inside all masks."""
+
+
+class Silhouette(NamedTuple):
+    """A mask and its camera."""
+
+    mask: np.ndarray  #: (H, W) uint8, object above 127
+    camera: Camera
+    name: str  #: for messages
+    valid: np.ndarray | None = None  #: (H, W) uint8: it says nothing of pixels up to 127. None: of all it does
+
+
+def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """A mask (H, W) uint8 with so many pixels across, at most, and how many of its own are one of these across."""
+    scale = -(-mask.shape[1] // width)
+    height, width = (n // scale for n in mask.shape)
+    blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
+    return blocks.mean((1, 3)).astype(np.uint8), scale
+
+
+def small_silhouette(silhouette: Silhouette, width: int = WIDTH) -> Silhouette:
+    """With so many pixels across, at most."""
+    mask, scale = shrink_mask(silhouette.mask, width)
+    valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
+    return silhouette._replace(mask=mask, camera=silhouette.camera.shrunk(scale), valid=valid)
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of at most `most` of so many things, evenly spread."""
+    taken = min(most, count)
+    return [k * count // taken for k in range(taken)]
+
+
+def thinned(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
+    """At most so many of them, evenly, each with so many pixels across, at most."""
+    return [small_silhouette(silhouettes[k], width) for k in evenly(len(silhouettes), most)]
+
+
+class Hull:
+    """The visual hull of silhouettes. Raises InputError if there is none.
+
+    `center` (3,) and `reach` are those of a ball that holds it [scene units]. `wrong` is the share of the silhouettes
+    that may be wrong about a point.
+    """
+
+    def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02):
+        self.silhouettes = thinned(silhouettes, MOST, WIDTH)
+        self.what, self.wrong = what, wrong
+        self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
+        origins = np.stack([s.camera.position for s in self.silhouettes])
+        rays = [self.rays(s) for s in self.silhouettes]
+        self.center = nearest_point(origins, np.stack([r.mean(0) / np.linalg.norm(r.mean(0)) for r in rays]), what)
+        across = (np.cross(r, self.center - o) for r, o in zip(rays, origins))
+        self.reach = max(np.linalg.norm(a, axis=1).max() for a in across)
+
+    @staticmethod
+    def rays(silhouette: Silhouette) -> np.ndarray:
+        """Directions (n, 3) through the pixels of a mask."""
+        rows, columns = np.nonzero(silhouette.mask > 127)
+        if not len(rows):
+            raise InputError(f"{silhouette.name}: mask: nothing in it, or next to nothing: no pixels above 127")
+        return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
+
+    def depth(self, points: Tensor) -> Tensor:
+        """About how deep each point (N, 3) is inside the hull [scene units]; negative outside.
+
+        The distance from the outline, at the depth of the point, in the silhouette where it is smallest. So that a
+        faulty one does no harm some may be wrong. What lies outside a photograph it knows nothing of; but what few
+        photographs show is not the object.
+        """
+        worst = math.floor(self.wrong * len(self.silhouettes)) + 1
+        lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
+        for (mask, camera, _, valid), distance in zip(self.silhouettes, self.distances):
+            matrix, focal, centre = (torch.tensor(a, dtype=torch.float32) for a in camera[:3])
+            local = (points - matrix[:3, 3]) @ matrix[:3, :3]
+            z = local[:, 2]
+            place = (centre - focal * local[:, :2] / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
+            seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
+            if valid is not None:
+                row, column = (place * torch.tensor(mask.shape[::-1])).nan_to_num(-1).long().flip(1).T
+                row, column = row.clamp(0, mask.shape[0] - 1), column.clamp(0, mask.shape[1] - 1)
+                seen &= torch.from_numpy(valid > 127)[row, column]
+            inside = F.grid_sample(distance[None, None], 2 * place[None, None] - 1, align_corners=False)[0, 0, 0]
+            deep = torch.where(seen, inside * z / focal.mean(), torch.inf)
+            for low in lowest:  # in order, so that each hands on what is more than it keeps
+                deep, low[:] = torch.maximum(low, deep), torch.minimum(low, deep)
+            shown += seen
+        return torch.where(shown >= SHOWN * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
+
+    def shortfall(
+        self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
+    ) -> np.ndarray:
+        """By how much the hull misses silhouettes, by default those that it is made of: (N, pixels) [px], above 0.
+
+        Of so many pixels of each mask, or of its outline, how far the nearest of the hull is: 0 where the other
+        silhouettes leave something of what is behind the pixel.
+        """
+        random, result = np.random.default_rng(0), []
+        along = torch.linspace(-self.reach, self.reach, samples)[:, None]
+        for silhouette in self.silhouettes if of is None else of:
+            rays = self.rays(silhouette)
+            if outline:
+                inside = silhouette.mask > 127
+                rays = rays[~scipy.ndimage.binary_erosion(inside)[inside]]
+            rays = rays[random.integers(len(rays), size=pixels)]
+            origin = silhouette.camera.position
+            middle = origin + rays * (rays @ (self.center - origin))[:, None]
+            middle, rays = (torch.as_tensor(a, dtype=torch.float32) for a in (middle, rays))
+            deepest = self.depth((middle[:, None] + along * rays[:, None]).reshape(-1, 3)).reshape(pixels, samples)
+            pixel = np.linalg.norm(self.center - origin) / silhouette.camera.focal.mean()
+            result.append((-deepest.amax(1).numpy() / pixel).clip(0))
+        return np.array(result)
+
+    def grid(self, low, high, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
+        """Points (N, 3) and the shape of the grid that they form."""
+        axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
+        return torch.cartesian_prod(*axes), tuple(map(len, axes))
+
+    def require(self, inside: int) -> None:
+        """Raise NoHull if no point was found inside."""
+        if not inside:
+            raise NoHull(f"{self.what}: mask: no point in space is inside all masks; "
+                         "check to_world, fx, fy, cx, cy")  # fmt: skip
+
+    def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
+        """The hull's centre of mass (3,) and the radius of the ball of its volume [scene units]."""
+        spacing = 2 * self.reach / (resolution - 1)
+        points, _ = self.grid(self.center - self.reach, self.center + self.reach, spacing)
+        inside = points[self.depth(points) > 0].double()
+        self.require(len(inside))
+        return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
+
+    def surface(self, resolution: int = 128) -> trimesh.Trimesh:
+        """Closed surface of the largest piece [scene units], by marching cubes, so many along the longest side."""
+        low, high = self.center - self.reach, self.center + self.reach
+        spacing = 2 * self.reach / 64
+        points, shape = self.grid(low, high, spacing)
+        coarse = self.depth(points).reshape(shape).numpy()
+        inside = np.argwhere(coarse > -spacing)
+        self.require(len(inside))
+        low, high = low + spacing * (inside.min(0) - 1), low + spacing * (inside.max(0) + 1)
+        fine = (high - low).max() / resolution
+        points, shape = self.grid(low, high, fine)
+        index = (points.numpy() - (self.center - self.reach)).T / spacing
+        field = torch.from_numpy(scipy.ndimage.map_coordinates(coarse, index, order=1, mode="nearest"))
+        near = field.abs() < 2 * spacing  # elsewhere nothing but the sign matters
+        field[near] = self.depth(points[near])
+        field = field.reshape(shape).numpy().clip(-3 * fine, 3 * fine)
+        field = np.pad(scipy.ndimage.gaussian_filter(field, 1.0), 1, constant_values=-fine)  # closed at the border, too
+        self.require(int((field > 0).sum()))
+        vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
+        mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
+        return max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance of each pixel's centre from the outline of a mask (H, W) [px], above 0 inside."""
+    inside = mask > 127
+    edge = scipy.ndimage.distance_transform_edt
+    return np.where(inside, edge(inside) - 0.5, 0.5 - edge(~inside)).astype(np.float32)

@@ -1,0 +1,31 @@
+"""Meshes from files, and what is asked of a closed surface."""
+
+from pathlib import Path
+
+import trimesh
+
+from mi_ring.errors import InputError, require_file
+
+
+def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
+    """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
+    require_file(path, "the file of a mesh", field)
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:
+        raise InputError(f"{path}: {field}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices
+    return mesh
+
+
+def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
+    """A closed mesh from a file. Raises InputError, which names the `field`, if it is none."""
+    mesh = read_mesh(path, field)
+    if not (mesh.is_watertight and mesh.is_winding_consistent):
+        raise InputError(f"{path}: {field}: is not a closed surface")
+    return mesh
+
+
+def genus(mesh: trimesh.Trimesh) -> int:
+    """Number of handles of a closed surface, of all its pieces together."""
+    return mesh.body_count - mesh.euler_number // 2

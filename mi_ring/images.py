@@ -1,0 +1,67 @@
+"""Pictures as arrays: sRGB, box filter, Gaussian blur, files with all their bits."""
+
+import math
+from pathlib import Path
+
+import imageio.v3 as imageio
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring.system.files import write_file
+
+
+def srgb_to_linear(v):
+    """IEC 61966-2-1, on numpy arrays."""
+    return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(v):
+    """The inverse of `srgb_to_linear`, clipped to [0, 1]."""
+    v = np.clip(v, 0, 1)
+    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def to_bytes(encoded: np.ndarray) -> np.ndarray:
+    """[0, 1] to uint8."""
+    return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def box_filter(image: Tensor, scale: int) -> Tensor:
+    """(H, W, C) → (H // scale, W // scale, C), the mean over blocks."""
+    if scale == 1:
+        return image
+    return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32."""
+    # imageio reads PNGs of 16 bits as 8, silently; Mitsuba reads no TIFF.
+    tiff = path.suffix.lower() in (".tif", ".tiff")
+    pixels = np.array(imageio.imread(path) if tiff else mi.Bitmap(str(path)), copy=True)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+    return pixels if pixels.ndim == 3 else pixels[:, :, None]
+
+
+def blur(images: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur by `sigma` > 0 [px] of (..., H, W) images, zero outside."""
+    radius = int(3 * sigma + 0.5)
+    total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
+
+    def kernel(n):  # as a matrix: two products are ten times faster than two convolutions
+        distance = (torch.arange(n)[:, None] - torch.arange(n)).to(images)
+        return torch.where(distance.abs() <= radius, torch.exp(-0.5 * (distance / sigma) ** 2) / total, 0)
+
+    return kernel(images.shape[-2]) @ images @ kernel(images.shape[-1])
+
+
+def write_image(pixels: np.ndarray, path: Path) -> None:
+    """An image (H, W, C) as PNG, JPEG or EXR, by the file's name, whole or not at all."""
+    formats = mi.Bitmap.FileFormat
+    kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
+    write_file(path, stream.raw_buffer())

@@ -1,0 +1,84 @@
+"""Cameras of other tools: lenses in COLMAP's terms, and poses."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from mi_ring.errors import InputError
+from mi_ring.system.optional import need
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera without its pose, one of COLMAP's models: https://colmap.github.io/cameras.html"""
+
+    model: str  #: COLMAP's name
+    size: tuple[int, int]  #: (width, height) [px]
+    params: tuple[float, ...]  #: in COLMAP's order
+
+    def __post_init__(self):
+        if not (np.isfinite(self.size).all() and min(self.size) >= 1):
+            raise InputError(f"camera: is for photographs of {self.size[0]} x {self.size[1]} pixels; must be 1 or more")
+        object.__setattr__(self, "size", tuple(map(int, self.size)))
+        object.__setattr__(self, "params", tuple(map(float, self.params)))
+
+    @cached_property
+    def colmap(self):
+        """As a `pycolmap.Camera`, which knows the models. Raises InputError where pycolmap is not installed."""
+        pycolmap = need("pycolmap", f"camera model {self.model}")
+        return pycolmap.Camera(model=self.model, width=self.size[0], height=self.size[1], params=list(self.params))
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """[px]"""
+        if self.model == "PINHOLE":
+            return self.params[:2]
+        return self.colmap.focal_length_x, self.colmap.focal_length_y
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point [px]; the first pixel's centre is (0.5, 0.5)."""
+        if self.model == "PINHOLE":
+            return self.params[2:]
+        return self.colmap.principal_point_x, self.colmap.principal_point_y
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Without distortion? Asked of its corners, for a fisheye without coefficients is none."""
+        if self.model == "PINHOLE":
+            return True
+        rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
+        straight = rays[:, :2] * self.focal + self.centre
+        return np.allclose(self.colmap.img_from_cam(rays), straight, atol=1e-6)
+
+
+def pinhole(K: np.ndarray, size, shift: float, what: str) -> Lens:
+    """Of a calibration matrix; `shift` [px] is what its principal point lacks to have pixels' centres at 0.5."""
+    if not K[2, 2]:
+        raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
+    K = K / K[2, 2]
+    if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
+        raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here; is "
+                         "the matrix transposed?")  # fmt: skip
+    return Lens("PINHOLE", size, (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
+
+
+def inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Camera-to-world (4, 4) of world-to-camera x ↦ R x + t."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
+    return pose
+
+
+def decompose(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Calibration matrix (3, 3) and camera-to-world (4, 4) of a projection matrix K [R | t], up to scale (3, 4)."""
+    if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
+        raise InputError(f"{what}: is no projection matrix of a camera (singular)")
+    K, R = scipy.linalg.rq(P[:, :3])
+    signs = np.sign(np.diag(K))
+    K, R = K * signs, signs[:, None] * R
+    if np.linalg.det(R) < 0:  # P stands for -P as well
+        R, P = -R, -P
+    return K, inverse(R, np.linalg.solve(K, P[:, 3]))

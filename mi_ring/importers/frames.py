@@ -1,0 +1,90 @@
+"""What importers make: frames, each a photograph with its camera and light. One file a format beside this one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
+from mi_ring.importers.cameras import Lens
+from mi_ring.importers.reading import image_size
+from mi_ring.rendering.lights import Light
+from mi_ring.system import command
+
+SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
+MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes of an OpenGL camera, x right, y up, z back, in OpenCV's
+
+
+@dataclass
+class Frame:
+    """A photograph, its camera and its light."""
+
+    image: Path
+    lens: Lens  #: size, focal lengths, principal point, distortion [px]
+    pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
+    mask: Path | None = None  #: of the same size; `image` itself if its alpha channel is meant
+    light: Light | None = None  #: None: a point light of intensity 1 at the camera
+    saturation: float | None = None  #: encoded value at which pixels are clipped, if not full scale
+    encoding: str | None = None  #: "srgb" or "linear", if it is not what the type of file implies
+    name: str = ""  #: in the scene; that of the file, without suffix, if empty
+    pixels: np.ndarray | None = None  #: of an image that is no file yet, (H, W, 3) float32
+    fill_mask: bool = False  #: fill the holes in the mask
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]"""
+        return self.lens.size
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that takes it once lens distortion is undone."""
+        return Camera(self.pose @ MITSUBA, np.array(self.lens.focal), np.array(self.lens.centre), self.lens.size)
+
+    def at_camera(self, rgb, offset=(0, 0, 0)) -> Light:
+        """A point light beside this frame's camera, `offset` in the camera's axes [scene units]."""
+        return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
+
+
+@dataclass(frozen=True)
+class Source:
+    """What all formats have in common."""
+
+    src: Positional[Annotated[Path, arg(metavar="SRC")]]
+    """Where the data is."""
+    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
+    """Scene file to write. What belongs to it and is no file yet goes into a folder of its name."""
+    copy: bool = False
+    """Copy the photographs beside the scene file instead of referring to where they are."""
+    encoding: Literal["auto", "srgb", "linear"] = "auto"
+    """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
+    are written anew with 16."""
+
+
+def require_frames(frames: Sequence[Frame], source: Path) -> None:
+    """Raise InputError for invalid cameras, lights and names, and for files of another size than their camera's."""
+    if not frames:
+        raise InputError(f"{source}: SRC: found no photographs")
+    for frame in frames:
+        what = f"{frame.image}: camera"
+        command.require_utf8(str(frame.image))
+        rotation = frame.pose[:3, :3]
+        if not np.allclose(frame.pose[3], [0, 0, 0, 1], atol=1e-6):
+            raise InputError(f"{what}: the last row of its pose is {frame.pose[3]}, must be 0 0 0 1; is it transposed?")
+        if not np.isfinite(frame.pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            raise InputError(f"{what}: its pose is no rotation and translation")
+        if np.linalg.det(rotation) < 0:
+            raise InputError(f"{what}: its rotation is left-handed, a mirror; check the order and signs of its axes")
+        if not np.isfinite(frame.lens.params).all() or min(frame.lens.focal) <= 0:
+            raise InputError(f"{what}: its parameters are {', '.join(f'{p:g}' for p in frame.lens.params)}; must be finite, with "
+                             "focal lengths above 0")  # fmt: skip
+        if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
+            raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
+                             "must be finite and not negative")  # fmt: skip
+        for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
+            if file and (size := image_size(file)) != frame.size:
+                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *size, *frame.size))

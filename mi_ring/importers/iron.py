@@ -1,0 +1,31 @@
+"""cam_dict_norm.json of IRON."""
+
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import inverse, pinhole
+from mi_ring.importers.frames import Frame, Source
+from mi_ring.importers.reading import first_file, image_size, load_json, matrix, with_suffix
+
+
+@dataclass(frozen=True)
+class Iron(Source):
+    """IRON: cam_dict_norm.json with a folder image beside it; light at the camera.
+
+    SRC is that folder, or one that holds it as train.
+    """
+
+    def frames(self) -> Iterator[Frame]:
+        path = first_file([f / "cam_dict_norm.json" for f in (self.src, self.src / "train")], "SRC")
+        cameras = load_json(path)
+        if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
+            raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
+        for key in sorted(cameras):  # names end in .png, whatever the files' end is
+            image = with_suffix((path.parent / "image" / key).with_suffix(""), f"{path}: {key}")
+            K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
+            to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)
+            size = matrix(cameras[key].get("img_size", image_size(image)), (2,), f"{path}: {key}.img_size")
+            pose = inverse(to_camera[:3, :3], to_camera[:3, 3])
+            yield Frame(image, pinhole(K, size, 0.0, f"{path}: {key}.K"), pose)

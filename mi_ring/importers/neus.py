@@ -1,0 +1,62 @@
+"""cameras_sphere.npz of IDR, NeuS and WildLight."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import decompose, pinhole
+from mi_ring.importers.frames import Frame, Source
+from mi_ring.importers.reading import entry, first_file, image_size, load_npz, matrix, numbered
+
+
+@dataclass(frozen=True)
+class Neus(Source):
+    """IDR, NeuS, WildLight: cameras_sphere.npz or cameras.npz with folders image and mask; light at the camera.
+
+    SRC is the folder. WildLight's light_energy_* become intensities; photographs without flash are left out.
+    """
+
+    def frames(self) -> Iterator[Frame]:
+        path = first_file([self.src / "cameras_sphere.npz", self.src / "cameras.npz"], "SRC")
+        cameras = load_npz(path)
+        numbers = sorted(int(key[10:]) for key in cameras if re.fullmatch(r"world_mat_\d+", key))
+        pictures, array = numbered(self.src / "image"), self.src / "images.npy"
+        if array.is_file():
+            stack = load_npz(array)
+            if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers):
+                raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3): "
+                                 f"one photograph for each world_mat in {path.name}")  # fmt: skip
+            pictures = dict.fromkeys(numbers, array)
+        elif not pictures:
+            raise InputError(f"{self.src}: image: no photographs in this folder, and no images.npy")
+        masks = numbered(self.src / "mask")
+        energies = any(key.startswith("light_energy_") for key in cameras)
+        if not set(pictures) <= set(numbers):  # names that are no numbers of cameras: by their order
+            if len(pictures) != len(numbers):
+                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(pictures)} photographs")
+            pictures, masks = (dict(zip(numbers, [files[n] for n in sorted(files)])) for files in (pictures, masks))
+        for k, image in pictures.items():
+            pixels = stack[numbers.index(k)].astype(np.float32) if image == array else None
+            size = image_size(image) if pixels is None else pixels.shape[1::-1]
+            projection = entry(cameras, f"world_mat_{k}", (4, 4), path)
+            K, pose = decompose(projection[:3], f"{path}: world_mat_{k}")
+            camera = pinhole(K, size, 0.5, f"{path}: world_mat_{k}")
+            frame = Frame(image, camera, pose, masks.get(k), name=f"{k:03}", pixels=pixels)
+            if masks and not frame.mask:
+                raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
+            if energies:
+                energy = np.ravel(cameras.get(f"light_energy_{k}", 0.0))
+                energy = matrix(np.repeat(energy, 3) if len(energy) == 1 else energy, (3,), f"{path}: light_energy_{k}")
+                if not energy.any():
+                    continue
+                unit = entry(cameras, f"scale_mat_{k}", (4, 4), path)[0, 0]  # energies are for the object's unit sphere
+                frame.light = frame.at_camera(energy * unit**2)
+                frame.encoding = "linear"
+                if "max_intensity" in cameras:
+                    frame.saturation = float(matrix(np.squeeze(cameras["max_intensity"]), (), f"{path}: max_intensity"))
+                    if frame.saturation <= 0:
+                        raise InputError(f"{path}: max_intensity: is {frame.saturation}; must be positive")
+            yield frame

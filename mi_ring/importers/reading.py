@@ -1,0 +1,142 @@
+"""Reads what is asked of foreign files; anything else is one clear error."""
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import scipy.linalg
+from PIL import Image
+
+from mi_ring.errors import InputError
+from mi_ring.images import read_image
+from mi_ring.importers.frames import SUFFIXES
+
+
+def pixels_of(path: Path) -> np.ndarray:
+    """Pixels (H, W, C) of an image file. Raises InputError if it cannot be read."""
+    return read_as(path, "image", read_image)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) [px] of an image file. Raises InputError if it cannot be read."""
+
+    def size(file):
+        if path.suffix.lower() == ".exr":
+            return tuple(mi.Bitmap(str(file)).size())
+        with Image.open(file) as image:
+            return image.size
+
+    return read_as(path, "image", size)
+
+
+def has_alpha(path: Path) -> bool:
+    """Does an image file have an alpha channel?"""
+    if path.suffix.lower() == ".exr":
+        return pixels_of(path).shape[2] in (2, 4)
+
+    def alpha(file):
+        with Image.open(file) as image:
+            return image.mode in ("LA", "RGBA")
+
+    return read_as(path, "image", alpha)
+
+
+def existing(path: Path, field: str) -> Path:
+    """A file that must be there."""
+    if not path.is_file():
+        raise InputError(f"{path}: {field}: no such file")
+    return path
+
+
+def first_file(candidates: list[Path], field: str) -> Path:
+    """The first of these files that there is."""
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
+
+
+def with_suffix(path: Path, field: str) -> Path:
+    """An image file whose name may lack its suffix."""
+    if path.is_file():
+        return path
+    for suffix in SUFFIXES:
+        if (file := path.with_name(path.name + suffix)).is_file():
+            return file
+    raise InputError(f"{field}: no such file: {path}, nor with any of {' '.join(SUFFIXES)}")
+
+
+def numbered(folder: Path) -> dict[int, Path]:
+    """Images of a folder by the numbers that they are called, or by their order if some are called otherwise."""
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    if all(path.stem.isdigit() for path in files):
+        return {int(path.stem): path for path in files}
+    return dict(enumerate(files))
+
+
+def chosen(wanted, there_are, option: str, where: Path) -> list[int]:
+    """Those wanted, or all. Raises InputError if one does not exist."""
+    for number in wanted:
+        if number not in there_are:
+            raise InputError(f"{option}: {number}: not in {where}, which has {min(there_are)} to {max(there_are)}")
+    return sorted(wanted or there_are)
+
+
+def matrix(values, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Finite numbers of this shape. Raises InputError for anything else."""
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != shape or (array.ndim == 0 and np.isnan(array)):
+        shown = "missing" if values is None else f"of shape {array.shape}" if array.size > 1 else values
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        raise InputError(f"{what}: is {shown}; must be {wanted}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{what}: has NaN or infinite numbers")
+    return array
+
+
+def entry(arrays, key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
+    """An array of a .mat or .npz file."""
+    return matrix(arrays.get(key), shape, f"{path}: {key}")
+
+
+def read_as(path: Path, what: str, read):
+    """`read(path)`. Raises InputError if there is no such file or if it is not what it should be."""
+    try:
+        return read(existing(path, what))
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read as {what} ({' '.join(str(error).split())})") from error
+
+
+def load_mat(path: Path) -> dict:
+    """The variables of a MATLAB file."""
+    return read_as(path, "MATLAB file", scipy.io.loadmat)
+
+
+def load_npz(path: Path):
+    """A dictionary of arrays, or the one array of a .npy file."""
+
+    def arrays(file):
+        content = np.load(file)
+        return content if isinstance(content, np.ndarray) else dict(content)
+
+    return read_as(path, "NumPy file", arrays)
+
+
+def load_json(path: Path):
+    """What a JSON file holds."""
+    return read_as(path, "JSON", lambda file: json.loads(file.read_text()))
+
+
+def load_table(path: Path, columns: int) -> np.ndarray:
+    """A text file of so many numbers a line."""
+    text = read_as(path, "table of numbers", Path.read_text)
+    if not text.strip():
+        raise InputError(f"{path}: is empty; must have {columns} numbers a line")
+    table = read_as(path, "table of numbers", lambda _: np.loadtxt(text.splitlines(), ndmin=2))
+    return matrix(table, (len(table), columns), str(path))

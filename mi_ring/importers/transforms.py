@@ -1,0 +1,95 @@
+"""transforms.json of NeRF, instant-ngp and nerfstudio."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.importers.frames import OPENGL, Frame, Light, Source
+from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
+
+
+@dataclass(frozen=True)
+class Transforms(Source):
+    """transforms.json of NeRF, instant-ngp, nerfstudio; the frames' pl_pos and pl_intensity are their lights.
+
+    SRC is the file, or a folder with transforms.json or transforms_train.json.
+    """
+
+    def frames(self) -> Iterator[Frame]:
+        path = self.src
+        if path.is_dir():
+            path = first_file([path / "transforms.json", path / "transforms_train.json"], "SRC")
+        top = load_json(path)
+        frames = top.get("frames") if isinstance(top, dict) else None
+        if not isinstance(frames, list) or not frames:
+            raise InputError(f"{path}: frames: found none; must be a list of photographs")
+        for number, own in enumerate(frames):
+            where = f"frames[{number}]"
+            if not isinstance(own, dict):
+                raise InputError(f"{path}: {where}: is no object")
+            name = own.get("file_path", own.get("img_path"))
+            if not isinstance(name, str):
+                raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
+            image = with_suffix(path.parent / name, f"{path}: {where}.file_path")
+            pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
+            camera = transforms_camera({**top, **own}, image, f"{path}: {where}")
+            mask = own.get("mask_path")
+            frame = Frame(image, camera, pose)
+            if mask is not None:
+                frame.mask = existing(path.parent / str(mask), f"{where}.mask_path")
+            elif has_alpha(image):
+                frame.mask = image
+            intensity = np.ones(3)
+            if own.get("pl_intensity") is not None:
+                rgb = own["pl_intensity"]
+                rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
+                intensity = matrix(rgb, (3,), f"{path}: {where}.pl_intensity")
+                frame.light = frame.at_camera(intensity)
+            if own.get("pl_pos") is not None:
+                position = matrix(own["pl_pos"], (3,), f"{path}: {where}.pl_pos")
+                frame.light = Light("point", position, intensity)
+            yield frame
+
+
+def transforms_camera(given: dict, image: Path, where: str) -> Lens:
+    """The camera of one frame of transforms.json: `given` are the file's fields and above them the frame's own."""
+
+    def number(*names, default=None):
+        value = next((given[name] for name in names if given.get(name) is not None), default)
+        if not isinstance(value, int | float):
+            raise InputError(f"{where}.{names[0]}: is {'missing' if value is None else value}; must be a number")
+        return float(value)
+
+    def angle(name):
+        if not 0 < (value := number(name)) < math.pi:
+            raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
+        return value
+
+    width, height = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)
+    if given.get("camera_intrinsics") is not None:
+        cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")
+    else:
+        fx = fy = None
+        if "camera_angle_x" in given:
+            fx = fy = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
+        if "camera_angle_y" in given:
+            fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
+        fx = number("fl_x", default=fx)
+        fy = number("fl_y", default=fy if "fl_x" not in given else fx)
+        cx, cy = number("cx", default=width / 2), number("cy", default=height / 2)
+    k1, k2, k3, k4, p1, p2 = (number(name, default=0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = given.get("camera_model") or "OPENCV"
+    if model == "OPENCV_FISHEYE" or given.get("is_fisheye"):
+        return Lens("OPENCV_FISHEYE", (width, height), (fx, fy, cx, cy, k1, k2, k3, k4))
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"):
+        raise InputError(f"{where}.camera_model: is {model}; must be OPENCV, OPENCV_FISHEYE or PINHOLE")
+    if k4:
+        raise InputError(f"{where}.k4: is {k4}; OPENCV has no such term of distortion, must be 0")
+    if not any((k1, k2, k3, p1, p2)):
+        return Lens("PINHOLE", (width, height), (fx, fy, cx, cy))
+    return Lens("FULL_OPENCV", (width, height), (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))

@@ -1,0 +1,146 @@
+"""What there is to say of each photograph of a capture, and what is to be mended."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from mi_ring.capture.capture import Capture
+from mi_ring.geometry.hull import WIDTH, shrink_mask
+from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
+
+CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares beyond which something is said
+
+
+@dataclass
+class PhotographQuality:
+    """What there is to say of one photograph. Distances are in radii of the normalising sphere."""
+
+    name: str
+    distance: float  #: from the camera to the object
+    light: float  #: from the light to the object; infinite if it is distant
+    angle: float  #: between light and camera, seen from the object [deg]
+    object: float | None  #: share of the photograph that is object
+    clipped: float  #: share of the object that is clipped
+    dark: float  #: share of the object that is black, or nearly
+    background: float | None  #: brightness of what is not object, in that of the object
+    brightness: float  #: brightness of the object, for the light it gets
+    agreement: float | None  #: share of the mask that the other masks agree to
+
+
+HEADS = (
+    "photograph", "distance", "light", "angle", "object", "clipped", "dark", "background", "brightness", "agreement",
+)
+
+
+def measure(capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]) -> list[PhotographQuality]:
+    """The rows of all photographs."""
+    lights, rows = capture.photographs.lights, []
+    of_each = zip(capture.sensors, capture.names, lights.toward(center), lights.distances(center),
+                  lights.irradiance(center).mean(1))  # fmt: skip
+    for k, (sensor, name, to_light, away, received) in enumerate(of_each):
+        to_camera = sensor.camera.position - center
+        cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
+        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(sensor.size) // WIDTH))[:4])
+        image = rgb.max(-1)
+        inside = mask > 0.5 if masked else image > 0.02 * image.max()
+        outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
+        level = float(np.quantile(image[inside], 0.9)) if inside.any() else 0.0  # what is lit, not in shadow
+        around = None if outside is None or not outside.any() else float(np.median(image[outside]))
+        rows.append(PhotographQuality(
+            name=name, distance=float(np.linalg.norm(to_camera) / radius),
+            light=float(away / radius),
+            angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            object=float(inside.mean()) if masked else None,
+            clipped=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
+            dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
+            background=None if around is None else around / max(level, 1e-9),
+            brightness=level / max(received, 1e-30), agreement=agreement.get(capture.outline(k)),
+        ))  # fmt: skip
+    return rows
+
+
+def units(capture: Capture, center: np.ndarray) -> str | None:
+    """Are the lights in other units than the cameras?"""
+    lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
+    cameras = np.stack([sensor.camera.position for sensor in capture.sensors])
+    if not point.any() or np.ptp(cameras, axis=0).max() == 0:
+        return None
+    away = np.linalg.norm(cameras[point] - center, axis=1)
+
+    def beside(scale):  # distance from light to camera, for that from camera to object
+        return float(np.median(np.linalg.norm(scale * lights[point] - cameras[point], axis=1) / away))
+
+    scale = min((0.001, 0.01, 0.1, 1, 10, 100, 1000), key=beside)
+    if scale != 1 and beside(1) > 0.8 and beside(scale) < 0.5:
+        return (f"lights are in other units than cameras: multiply their positions by {scale:g} "
+                f"and their intensities by {scale**2:g}")  # fmt: skip
+    return None
+
+
+def facing(capture: Capture, center: np.ndarray) -> str | None:
+    """Do the cameras look at the object?"""
+    cameras = [sensor.camera for sensor in capture.sensors]
+    away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
+    if away.mean() > 0.5:
+        return (f"{away.sum()} of {len(away)} cameras look away from the object: z of to_world is forward, here; "
+                "of OpenGL's (NeRF's, Blender's) axes: to_world @ diag(-1, 1, -1, 1)")  # fmt: skip
+    return f"{', '.join(np.array(capture.names)[away][:5])}: looking away from the object" if away.any() else None
+
+
+def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
+    """What is to be mended, each in one line."""
+    found = []
+    agree = [row.agreement for row in rows if row.agreement is not None]
+    if capture.whole and agree and np.median(agree) >= CONFORMS:  # those of bright parts only need not agree
+        strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
+        if not strays and max(sensor.size[0] for sensor in capture.sensors) <= WIDTH:
+            found += filter(None, [half_pixel(capture.hull)])
+        for row in strays:
+            found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
+    found += filter(None, [units(capture, center)])
+    lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind
+    typical = np.median([row.brightness for row in lit]) if lit else 1.0
+    for row in lit:
+        if not typical / 4 < row.brightness < 4 * typical:
+            times = f"{row.brightness / typical:.2g} times as bright as the others"
+            found.append(f"{row.name}: is {times}, for the light it gets: its exposure or its light is wrong")
+    for name, limit, text in (
+        ("clipped", CLIPPED, "of the object is over-exposed; expose less"),
+        ("dark", DARK, "of the object is black: under-exposed, or unlit"),
+        ("background", AMBIENT, "of the object's brightness is in the background: the room was not dark"),
+    ):
+        shares = [value for row in rows if (value := getattr(row, name)) is not None]
+        if shares and np.median(shares) > limit:
+            found.append(f"{np.median(shares):.0%} {text}")
+    views = len({sensor.camera.to_world.tobytes() for sensor in capture.sensors})
+    if views < 8:
+        found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")
+    return found
+
+
+def quality_table(rows: list[PhotographQuality]) -> str:
+    """The rows as text."""
+    typical = np.median([row.brightness for row in rows])
+
+    def cells(row):
+        yield row.name
+        yield f"{row.distance:.2f}"
+        yield "distant" if np.isinf(row.light) else f"{row.light:.2f}"
+        yield f"{row.angle:.0f}"
+        for share in (row.object, row.clipped, row.dark, row.background):
+            yield "-" if share is None else f"{share:.1%}"
+        yield f"{row.brightness / typical:.2f}" if typical else "-"
+        yield "-" if row.agreement is None else f"{row.agreement:.0%}"
+
+    lines = [HEADS, *map(tuple, map(cells, rows))]
+    widths = [max(map(len, column)) for column in zip(*lines)]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
+
+
+def drop_empty(capture: Capture) -> list[str]:
+    """Forget masks with nothing in them and return the names of their photographs."""
+    empty = [k for k, mask in enumerate(capture.masks) if mask is not None and not (shrink_mask(mask, WIDTH)[0] > 127).any()]
+    for k in empty:
+        capture.masks[k] = None
+    return [capture.names[k] for k in empty]

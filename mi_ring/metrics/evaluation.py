@@ -1,0 +1,62 @@
+"""All numbers of a fit against the truth."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.geometry.meshes import genus
+from mi_ring.metrics.predictions import SPP, compare_photographs
+from mi_ring.metrics.surfaces import THRESHOLDS, compare_shapes, compare_surfaces, load_true_mesh, self_intersections
+from mi_ring.ring.saved import load_fit
+
+LINES = {  # of the table
+    "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
+    "flipped": "seen from the back, share", "chamfer": "Chamfer distance, % of the diagonal",
+    **{f"f_score_{t}": f"F-score at {t} % of the diagonal" for t in THRESHOLDS}, "genus": "genus",
+    "self_intersections": "triangles that cross others", "psnr": "PSNR, dB", "ssim": "SSIM",
+}  # fmt: skip
+
+
+def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP) -> dict:
+    """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
+
+    What is not defined is left out: the genus of a surface that is not closed, for instance.
+    """
+    ring = load_fit(run)
+    capture = load_capture(run / "scene.xml")
+    unseen = novel and load_capture(novel)
+    truth_mesh, truth = load_true_mesh(mesh)
+    guess_mesh, guess = load_true_mesh(run / "mesh.ply")
+    numbers, views = compare_surfaces(capture, guess, truth, float(np.linalg.norm(truth_mesh.extents)))
+    numbers |= compare_shapes(guess_mesh, truth_mesh)
+    for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
+        if surface.is_watertight:
+            numbers[key] = genus(surface)
+    numbers["self_intersections"] = self_intersections(guess_mesh)
+    predicted, photographs = compare_photographs(capture, ring, spp)
+    numbers |= {f"{key}_input": value for key, value in predicted.items()}
+    lists = {"views": [view | photograph for view, photograph in zip(views, photographs)]}
+    if unseen:
+        predicted, lists["novel_views"] = compare_photographs(unseen, ring, spp)
+        numbers |= {f"{key}_novel": value for key, value in predicted.items()}
+    return numbers | lists
+
+
+def evaluation_table(numbers: dict[str, float]) -> str:
+    """The numbers of all photographs as text, those that belong together in one line."""
+    lines = []
+    for start, words in LINES.items():
+        found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
+        if found:
+            lines.append(f"{words:36}" + "".join(f"{value:>10}  {what:6}" for what, value in found.items()).rstrip())
+    return "\n".join(lines)
+
+
+def rounded(value):
+    """Four digits after the point, all that mean anything, of all numbers in lists and dictionaries."""
+    if isinstance(value, dict):
+        return {key: rounded(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return round(value, 4) if isinstance(value, float) else value

@@ -1,0 +1,116 @@
+"""Do the masks agree with each other? If not, which mistake with the cameras would explain it?"""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+
+from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
+from mi_ring.geometry.hull import Hull, Silhouette, evenly, small_silhouette, thinned
+
+CONFORMS = 0.9  #: share of a mask that the others agree to, at least
+
+
+def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
+    """Of each mask, by its file, the share that the others agree to; and what is wrong with all of them.
+
+    A single one that is wrong spoils the hull for all. It is told by a hull for which some may be wrong.
+    """
+    if not capture.hull:
+        return {}, []
+    silhouettes = [small_silhouette(silhouette) for silhouette in capture.silhouettes()]
+    pixels = max(16, 12800 // len(silhouettes))
+
+    def shares(hull):
+        return (hull.shortfall(silhouettes, pixels) < 1).mean(1)
+
+    agree, why = shares(capture.hull), None
+    if capture.whole and agree.min() < CONFORMS:
+        why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
+        if not why:
+            tolerant = copy.copy(capture.hull)
+            tolerant.wrong = max(0.1, 1.01 / len(tolerant.silhouettes))
+            robust = shares(tolerant)
+            if np.median(robust) >= CONFORMS:
+                agree = robust
+            else:
+                why = "cameras or masks are wrong"
+    wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else []
+    return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
+
+
+def with_camera(silhouette: Silhouette, **changed) -> Silhouette:
+    """A silhouette whose camera differs in these fields."""
+    return silhouette._replace(camera=silhouette.camera._replace(**changed))
+
+
+#: What a camera-to-world matrix may be by mistake, and the one that it should have been.
+MATRICES = {
+    "": lambda m: m,
+    "to_world is world-to-camera: invert it": np.linalg.inv,
+    "the rotation in to_world is transposed: transpose its upper left 3 x 3": lambda m: np.block(
+        [[m[:3, :3].T, m[:3, 3:]], [m[3:]]]
+    ),
+}
+AXES = {
+    "": (1, 1, 1),
+    "its axes are OpenCV's (COLMAP's), x right, y down: to_world @ diag(-1, -1, 1, 1)": (-1, -1, 1),
+    "its axes are OpenGL's (NeRF's, Blender's), x right, y up: to_world @ diag(-1, 1, -1, 1)": (-1, 1, -1),
+    "its y and z are flipped: to_world @ diag(1, -1, -1, 1)": (1, -1, -1),
+}
+#: Other mistakes: what a silhouette should have been.
+OTHERS = {
+    "cx and cy are exchanged": lambda s: with_camera(s, centre=s.camera.centre[[1, 0]]),
+    "fx, fy, cx, cy are for photographs of half the size: double them": lambda s: with_camera(
+        s, focal=2 * s.camera.focal, centre=2 * s.camera.centre
+    ),
+    "fx, fy, cx, cy are for photographs of twice the size: halve them": lambda s: with_camera(
+        s, focal=s.camera.focal / 2, centre=s.camera.centre / 2
+    ),
+    "photographs or masks are upside down": lambda s: s._replace(mask=s.mask[::-1]),
+    "photographs or masks are mirrored": lambda s: s._replace(mask=s.mask[:, ::-1]),
+}
+
+
+def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
+    """Share of the masks' pixels that all masks agree to; 0 if there is no hull."""
+    try:
+        return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
+    except InputError:
+        return 0.0
+
+
+def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
+    """The mistake with the cameras that explains why the masks do not agree, and its mend; None if none does."""
+    some = thinned(silhouettes, 32, 96)
+    guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
+    for first, change in MATRICES.items():
+        for second, axes in AXES.items():
+            name = "; then ".join(part for part in (first, second) if part)
+            guesses[name] = [
+                with_camera(s, to_world=change(s.camera.to_world) @ np.diag([*axes, 1.0])) for s in some
+            ]
+    as_it_is = share_agreed(guesses.pop(""))
+    scores = {name: share_agreed(guess) for name, guess in guesses.items()}
+    best = max(scores, key=scores.get)
+    if scores[best] < max(CONFORMS, as_it_is + 0.05):
+        return None
+    return f"{best} (the masks then agree to {scores[best]:.0%})"
+
+
+def half_pixel(hull: Hull) -> str | None:
+    """Are all principal points off by half a pixel? Then outlines do not quite meet the hull.
+
+    Of photographs that are shrunk for the hull it cannot be told, and matters little.
+    """
+    gaps, hull, some = {}, copy.copy(hull), evenly(len(hull.silhouettes), 32)
+    silhouettes, hull.distances = ([values[k] for k in some] for values in (hull.silhouettes, hull.distances))
+    for shift in (-0.5, 0.0, 0.5):
+        hull.silhouettes = [with_camera(s, centre=s.camera.centre + shift) for s in silhouettes]
+        gaps[shift] = float(np.mean(hull.shortfall(pixels=50, samples=96, outline=True).clip(max=2)))
+    best = min(gaps, key=gaps.get)
+    if gaps[0.0] > 0.01 and gaps[best] < 0.5 * gaps[0.0]:
+        do = "add 0.5 to" if best > 0 else "subtract 0.5 from"
+        return f"principal points seem off by half a pixel: {do} cx and cy (the first pixel's centre is 0.5, 0.5)"
+    return None

@@ -1,0 +1,97 @@
+"""Photographs by `photometric` and by Mitsuba's path tracer, side by side."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.capture.loading import open_scene
+from mi_ring.errors import InputError, SceneError
+from mi_ring.plugins import flash, photograph, shapenet
+from mi_ring.rendering.attributes import attributes_of, require_attributes
+from mi_ring.rendering.photographs import Photographs, pixel_rays
+from mi_ring.rendering.pictures import render_photographs
+from mi_ring.rendering.scenes import assembled, own_emitters
+
+BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
+LANES = 1 << 21  #: rays per launch, at most
+
+
+@dataclass
+class Pictures:
+    """Independent renderings (16, H, W, 3) of one photograph: linear radiance."""
+
+    photometric: np.ndarray
+    unshadowed: np.ndarray  #: same samples as photometric
+    path: np.ndarray
+    direct: np.ndarray  #: the direct light of `path`, same samples
+
+
+def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
+    """The scene with its photographs, lit for stock integrators too. Raises InputError, one line."""
+    scene, sensors = open_scene(path)
+    try:
+        for shape in scene.shapes():
+            require_attributes(shape)
+            if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
+                raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
+        Photographs.of(sensors)
+        return with_flash(scene), sensors
+    except SceneError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def with_flash(scene: mi.Scene) -> mi.Scene:
+    """The scene with one `flash` emitter, through which stock integrators see the light of a photograph.
+
+    A `shapenet` brings it along; a scene of other shapes is assembled anew. Raises SceneError if there are several,
+    each of which would add the light once more.
+    """
+    count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
+    if count > 1:
+        raise SceneError(f"flash: found {count} of them, so that the light would count {count} times; "
+                         'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
+    if count == 1:
+        return scene
+    return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *own_emitters(scene)])
+
+
+def render_both(scene, photographs, k, sensor, scale, spp, depth, seed) -> Pictures:
+    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 times, each with `spp` samples per pixel of its own.
+
+    `photometric` and `path` have different samples, but both along rays of ours: the film's filter has no part in it.
+    Seeds up to `seed` + 31 are used.
+    """
+    width, height = (s // scale for s in sensor.size)
+    pixels = width * height
+    group = max(1, min(BATCHES, LANES // (pixels * spp)))
+    parts = []
+    for first in range(0, BATCHES, group):
+        batch = photographs.select([k] * min(group, BATCHES - first), sensor.size, scale)
+        own, other = seed + 2 * first, seed + 2 * first + 1
+        parts.append([
+            render_photographs(scene, batch, spp, own),
+            render_photographs(scene, batch, spp, own, shadows=False),
+            render_path(scene, batch, sensor, spp, other, depth),
+            render_path(scene, batch, sensor, spp, other, 2),
+        ])  # fmt: skip
+        dr.eval(parts[-1])
+    return Pictures(*(
+        np.concatenate([np.stack([np.array(c).reshape(-1, height, width) for c in p[:3]], -1) for p in which])
+        for which in zip(*parts)
+    ))  # fmt: skip
+
+
+def render_path(scene, photographs, sensor, spp, seed, depth):
+    """Like `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
+    photograph.Photograph.current = sensor
+    ray, _ = pixel_rays(photographs, spp, seed)
+    ray.time = photograph.SHUTTER
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, dr.width(ray))
+    integrator = mi.load_dict({"type": "path", "max_depth": depth})
+    radiance, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))
+    dr.schedule(radiance)
+    return [dr.block_sum(c, spp) / spp for c in radiance]

@@ -1,0 +1,47 @@
+"""How near predicted photographs are to the files: PSNR and SSIM."""
+
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from mi_ring.capture.capture import Capture
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.rendering import bridge
+from mi_ring.ring.ring import Ring
+
+SPP = 64  #: samples per pixel of predicted photographs, by default
+WINDOW = 11  #: of SSIM [px]
+
+
+def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[str, float], list[dict]]:
+    """`psnr` [dB] and `ssim` of predictions as 8-bit sRGB against the files, sRGB in [0, 1].
+
+    Of all photographs, from the mean of their squared errors and as the mean of their SSIM, and of each. What is
+    predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR.
+    """
+    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    squares, views = [], []
+    for k, name in enumerate(capture.names):
+        rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
+        predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
+        observed = linear_to_srgb(capture.observe([k])[0][0].numpy())
+        squares.append(np.mean((predicted - observed) ** 2))
+        views.append({"name": name} | decibels(squares[-1]) | ssim(predicted, observed))
+    similar = [view["ssim"] for view in views if "ssim" in view]
+    return decibels(np.mean(squares)) | ({"ssim": float(np.mean(similar))} if similar else {}), views
+
+
+def decibels(square: float) -> dict[str, float]:
+    """PSNR of a mean squared error."""
+    return {"psnr": float(-10 * np.log10(square))} if square else {}
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+    """Structural similarity of images (H, W, 3) in [0, 1], mean over channels, none if they are less than its window.
+
+    Wang et al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 pixels, σ = 1.5 px.
+    """
+    if min(a.shape[:2]) < WINDOW:
+        return {}
+    wang = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return {"ssim": float(structural_similarity(a, b, data_range=1, channel_axis=-1, **wang))}

@@ -1,0 +1,155 @@
+"""Do two renderers agree within Monte Carlo noise?"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy import stats
+
+from mi_ring.errors import InputError
+from mi_ring.images import linear_to_srgb
+from mi_ring.metrics.path_tracing import BATCHES, Pictures
+
+BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
+ROUNDING = 1e-6  #: two ways to compute the same radiance in float32 may differ by this much, relative
+IMPLAUSIBLE = 0.75  #: share of interreflection that hardly any object has
+
+
+@dataclass
+class Comparison:
+    """What is found out about one photograph, or about all. Shares are of the mean radiance of `path`."""
+
+    name: str
+    radiance: float  #: mean of `path` over all pixels and channels
+    difference: float  #: mean of photometric − path
+    absolute_difference: float  #: mean over pixels of the size of photometric − path, of which …
+    noise: float  #: … Monte Carlo noise explains this much
+    psnr: float  #: photometric against path [dB], sRGB, at most 100
+    shadows: float  #: what photometric without shadows has too much
+    interreflection: float  #: what path has beyond direct light
+    unexplained: float  #: mean of photometric − direct light of path
+    unexplained_noise: float  #: its standard error
+    p_direct: float  #: of a difference this large if photometric and the direct light of path agree
+    p_path: float  #: likewise of photometric and all of path
+
+
+def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
+    """Probability that independent pictures a, b (16, H, W, 3) float64 differ this much if equally distributed.
+
+    The lesser of two p-values, corrected (Šidák): of the mean of all pixels, by Student's t, and of all blocks of
+    8 × 8 pixels, as follows. If a and b agree, each of the 16 differences d of a block is as likely as −d, however
+    heavy its tails. Over all choices of signs, (Σ d)² / Σ d² has the mean 1 and the variance 2 − 2 Σ d⁴ / (Σ d²)²;
+    blocks are independent, so that their sum follows a gamma distribution of known mean and variance. Channels share
+    their samples and would not be independent, so blocks take turns: red, green, blue.
+    """
+    whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
+    error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
+    p_whole = 2 * stats.t.sf(abs(whole.mean()) / error, count - 1) if error else 1.0
+
+    a, b = blocks(a), blocks(b)
+    differ = (a != b).any(0)
+    d, level = (a - b)[:, differ], (a + b).mean(0)[differ]
+    energy = (d**2).sum(0)
+    ratio = d.sum(0) ** 2 / (energy + (count * ROUNDING * level) ** 2)
+    variance = (2 - 2 * ((d**2 / energy) ** 2).sum(0)).sum()
+    if variance < 1e-6:  # no block differs more than once: signs say nothing
+        return float(p_whole)
+    p_blocks = stats.gamma.sf(ratio.sum(), len(ratio) ** 2 / variance, scale=variance / len(ratio))
+    return sidak([p_whole, p_blocks])
+
+
+def blocks(x: np.ndarray) -> np.ndarray:
+    """Sums (16, h, w) over blocks of pixels, each in one channel, of (16, H, W, 3); the last may be cut off."""
+    _, height, width, _ = x.shape
+    x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
+    x = x.reshape(len(x), x.shape[1] // BLOCK, BLOCK, -1, BLOCK, 3).sum((2, 4))
+    row, column = np.indices(x.shape[1:3])
+    return x[:, row, column, (row + column) % 3]
+
+
+def sidak(p: Sequence[float]) -> float:
+    """Probability that the least of so many independent p-values is as small as this (Šidák 1967)."""
+    return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
+
+
+def compare_renderers(name: str, pictures: Pictures) -> Comparison:
+    """The numbers of one photograph. Raises InputError if there are pixels that are no numbers."""
+    for which, picture in vars(pictures).items():
+        if bad := int((~np.isfinite(picture)).any((0, 3)).sum()):
+            raise InputError(f"{name}: {which}: {bad} pixels are NaN or infinite; check BSDF and mesh")
+    photometric, unshadowed, path, direct = (p.astype(np.float64) for p in vars(pictures).values())
+    level = path.mean() or photometric.mean() or 1.0
+    difference, unexplained = photometric - path, photometric - direct
+    noise = np.sqrt(2 / np.pi) * difference.std(0, ddof=1) / np.sqrt(BATCHES)  # mean of |x| for a normal x
+    error = np.mean((linear_to_srgb(photometric.mean(0)) - linear_to_srgb(path.mean(0))) ** 2)
+    return Comparison(
+        name=name,
+        radiance=float(path.mean()),
+        difference=float(difference.mean() / level),
+        absolute_difference=float(np.abs(difference.mean(0)).mean() / level),
+        noise=float(noise.mean() / level),
+        psnr=float(-10 * np.log10(max(error, 1e-10))),
+        shadows=float((unshadowed - photometric).mean() / level),
+        interreflection=float((path - direct).mean() / level),
+        unexplained=float(unexplained.mean() / level),
+        unexplained_noise=float(unexplained.mean((1, 2, 3)).std(ddof=1) / np.sqrt(BATCHES) / level),
+        p_direct=p_of_agreement(photometric, direct),
+        p_path=p_of_agreement(photometric, path),
+    )
+
+
+def all_as_one(rows: list[Comparison]) -> Comparison:
+    """All photographs as one: shares of all the light, p-values corrected for their number."""
+    column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
+    weight = column["radiance"] / (column["radiance"].sum() or 1.0)
+    shares = {name: float((weight * values).sum()) for name, values in column.items()}
+    return Comparison(**shares | {
+        "name": "all",
+        "radiance": float(column["radiance"].mean()),
+        "psnr": float(-10 * np.log10(np.mean(10 ** (-column["psnr"] / 10)))),
+        "unexplained_noise": float(np.sqrt(((weight * column["unexplained_noise"]) ** 2).sum())),
+        "p_direct": sidak(column["p_direct"]),
+        "p_path": sidak(column["p_path"]),
+    })  # fmt: skip
+
+
+def percent(x: float) -> str:
+    """A share."""
+    return f"{100 * x:.2f} %"
+
+
+def probability(p: float) -> str:
+    """A p-value as far as it means anything."""
+    return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
+
+
+def comparison_table(rows: list[Comparison]) -> str:
+    """The numbers as text, one line each; shares are of the radiance of `path`."""
+    cells = [("", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
+              "unexplained %", "p direct", "p path")]  # fmt: skip
+    cells += [(
+        r.name, f"{r.radiance:.4g}", f"{100 * r.difference:+.2f}", f"{100 * r.absolute_difference:.2f}",
+        f"{100 * r.noise:.2f}", f"{r.psnr:.1f} dB", f"{100 * r.shadows:.2f}", f"{100 * r.interreflection:.2f}",
+        f"{100 * r.unexplained:+.3f} ± {100 * r.unexplained_noise:.3f}",
+        *(probability(p).removeprefix("p ").removeprefix("= ") for p in (r.p_direct, r.p_path)),
+    ) for r in rows]  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    return "\n".join("  ".join([c[0].ljust(widths[0]), *map(str.rjust, c[1:], widths[1:])]) for c in cells)
+
+
+def verdict(rows: list[Comparison], everything: Comparison, significance: float) -> list[str]:
+    """The findings in words."""
+    p = probability(everything.p_direct)
+    if everything.p_direct >= significance:
+        direct = f"direct light agrees with path ({p})"
+    else:
+        worst = min(rows, key=lambda row: (row.p_direct, -abs(row.unexplained)))
+        way = "brighter" if worst.unexplained > 0 else "darker"
+        direct = (f"direct light DISAGREES with path ({p}), most of all in {worst.name}: "
+                  f"photometric is {percent(abs(worst.unexplained))} {way} on average")  # fmt: skip
+    doubt = ": are the lights' intensities true?" if everything.interreflection > IMPLAUSIBLE else ""
+    return [
+        direct,
+        f"shadows take away {percent(everything.shadows)} of the light",
+        f"interreflection is {percent(everything.interreflection)} of the light{doubt}",
+    ]

@@ -1,0 +1,82 @@
+"""Points in chunks, one per thread: how the networks share the processor's cores."""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+CHUNK = 8192  #: points that a thread computes at once, at most
+
+_pool: tuple[int, ThreadPoolExecutor] | None = None  # one for the whole process: (threads, executor)
+_lock = threading.Lock()
+
+
+def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
+    """Values at points (n, 3) by `forward`, which returns those of a chunk and what the way back needs of it.
+
+    Chunks are computed one per thread, and are as many for each; a GPU computes all points at once.
+    """
+    chunks = 1
+    if x.device.type == "cpu":
+        threads = torch.get_num_threads()
+        chunks = threads * -(-len(x) // (threads * CHUNK))
+    parts = x.detach().tensor_split(max(1, min(chunks, len(x))))
+    ctx.sizes = [len(part) for part in parts]
+    values, ctx.kept = zip(*in_parallel(torch.no_grad()(forward), parts))
+    return torch.cat(values)
+
+
+def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Gradients of the points and of the parameters of `ctx.layers`, by `backward(gradient, kept, sums)` of each chunk.
+
+    Raises RuntimeError if the parameters were changed since, and the second time.
+    """
+    _ = ctx.saved_tensors  # torch's own checks: the layers may share the parameters' memory
+    if ctx.kept is None:
+        raise RuntimeError("the backward pass of a network was taken a second time; retain_graph does not keep it, "
+                           "but mi_ring.nets.mlp.plain_autograd() does")  # fmt: skip
+
+    @torch.no_grad()
+    def run(gradient, kept):
+        sums = ctx.layers.zeros()
+        return backward(gradient, kept, sums), sums
+
+    gradients, sums = zip(*in_parallel(run, gradient.split(ctx.sizes), ctx.kept))
+    ctx.kept = None
+    return torch.cat(gradients), [sum(parts) for parts in zip(*sums)]
+
+
+def in_parallel(function, *arguments) -> list:
+    """`map` over as many threads as torch is set to use, each computing alone."""
+    threads = min(torch.get_num_threads(), len(arguments[0]))
+    if threads == 1:
+        return list(map(function, *arguments))
+    return list(pool(threads).map(function, *arguments))
+
+
+def pool(threads: int) -> ThreadPoolExecutor:
+    """The process's workers, at least so many, for which torch uses one thread each."""
+    global _pool
+    with _lock:
+        if _pool is None or _pool[0] < threads:
+            before = torch.get_num_threads()
+            executor = ThreadPoolExecutor(threads, "mi_ring", initializer=torch.set_num_threads, initargs=(1,))
+            started = threading.Barrier(threads + 1)
+            for _ in range(threads):
+                executor.submit(started.wait)
+            started.wait()
+            torch.set_num_threads(before)  # torch takes what the last thread set for the number of all later ones
+            _pool = threads, executor
+        return _pool[1]
+
+
+def forget_pool() -> None:
+    """A forked process has no threads but one."""
+    global _pool
+    _pool = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=forget_pool)

@@ -1,0 +1,118 @@
+"""The multilayer perceptron that both networks are, differentiated by hand."""
+
+import contextlib
+import contextvars
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from mi_ring.nets.chunks import backward_in_chunks, forward_in_chunks
+from mi_ring.nets.encoding import PosEnc
+
+_plain = contextvars.ContextVar("plain", default=False)
+
+WIDTH = 256  #: of the hidden layers
+SLOPE = 0.01  #: of the leaky ReLU
+
+
+@contextlib.contextmanager
+def plain_autograd():
+    """Within it the networks are PyTorch's own operations: slower, more memory, but differentiable as often as one likes.
+
+    For Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
+    """
+    token = _plain.set(True)
+    try:
+        yield
+    finally:
+        _plain.reset(token)
+
+
+class MLP(nn.Module):
+    """`outputs` functions of a point: its encoding, `depth` hidden layers of leaky ReLUs, a linear layer."""
+
+    def __init__(self, depth: int, outputs: int):
+        super().__init__()
+        self.encoding = PosEnc()
+        sizes = [self.encoding.width] + [WIDTH] * depth
+        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:]))
+        self.output = nn.Linear(WIDTH, outputs)
+
+    def evaluate(self, x: Tensor) -> Tensor:
+        """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
+
+        Differentiable once and by one backward pass, which frees what was kept for it; within `plain_autograd` as
+        often as one likes.
+        """
+        if _plain.get():
+            x = self.encoding(x)
+            for layer in self.hidden:
+                x = F.leaky_relu(layer(x), SLOPE)
+            return self.output(x)
+        values = _Evaluate.apply(x.reshape(-1, 3), *self.operands(x))
+        return values.reshape(*x.shape[:-1], self.output.out_features)
+
+    def operands(self, x: Tensor) -> list:
+        """What `_Evaluate` and Shape-Net's `_Flow` take last.
+
+        The encoding, the precision of the products, whether gradients are wanted, weights and biases in turn.
+        """
+        dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # what autocast makes of it, on any device
+        parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
+        return [self.encoding, dtype, torch.is_grad_enabled(), *parameters]
+
+
+class Layers:
+    """An MLP's weights and biases in the precision of the products: values by `forward`, gradients by `backward`."""
+
+    def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters):
+        self.encoding, self.dtype = encoding, dtype
+        self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
+
+    def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
+        """Encoding and activations of the hidden layers, only the last unless `keep`, and output of points (n, 3)."""
+        activations = [self.encoding(x).to(self.dtype)]
+        for w, b in zip(self.weights[:-1], self.biases):
+            activations.append(F.leaky_relu_(F.linear(activations[-1], w, b), SLOPE))
+            if not keep:
+                del activations[0]
+        return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
+
+    def zeros(self) -> list[Tensor]:
+        """To sum up the parameters' gradients in, in their order, in float32 at least."""
+        dtype = torch.promote_types(self.dtype, torch.float32)
+        return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
+
+    def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
+        """From the gradient of the output to that of the points; those of the parameters are added to `sums`."""
+        gradient = gradient.to(self.dtype)
+        for k in reversed(range(len(self.weights))):
+            sums[2 * k] += gradient.T @ activations[k]
+            sums[2 * k + 1] += gradient.sum(0)
+            gradient = gradient @ self.weights[k]
+            if k:
+                gradient = torch.ops.aten.leaky_relu_backward(gradient, activations[k], SLOPE, True)
+        return self.encoding.backward(activations[0], gradient)
+
+
+class _Evaluate(torch.autograd.Function):
+    """An MLP at points (n, 3). Only encoding and activations are kept, in the precision of the products."""
+
+    @staticmethod
+    def forward(ctx, x, encoding, dtype, keep, *parameters):
+        ctx.layers = layers = Layers(encoding, dtype, parameters)
+        ctx.save_for_backward(*parameters)
+
+        def forward(x):
+            activations, output = layers.forward(x, keep)
+            return output, activations if keep else None
+
+        return forward_in_chunks(ctx, forward, x)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient):
+        gradient, sums = backward_in_chunks(ctx, ctx.layers.backward, gradient)
+        return gradient, None, None, None, *sums

@@ -1,0 +1,142 @@
+"""Texture atlases: a fitted surface cut open and flattened, and its networks baked into images."""
+
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import scipy.ndimage
+import torch
+import trimesh
+import xatlas
+from tqdm import tqdm
+
+from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.ring.ring import Ring
+
+CUT = 5  #: level at which surfaces are cut open, at most: the time grows with the square of the triangles
+PADDING = 4  #: between charts [texels]
+CHUNK = 2**17  #: texels that the networks see at once
+
+
+class Atlas(NamedTuple):
+    """A mesh whose vertices are split along seams, V of them."""
+
+    s: np.ndarray  # (V, 3) domain points
+    uv: np.ndarray  # (V, 2) in [0, 1], the first texel at (0, 0)
+    vertices: np.ndarray  # (V, 3) [scene units]
+    normals: np.ndarray  # (V, 3), the same on both sides of seams
+    tangents: np.ndarray  # (V, 4), as in glTF: along u, and the sign of the bitangent n × t
+    faces: np.ndarray  # (F, 3)
+    whole: np.ndarray  # (V,) vertex of the surface before it was cut: equal on both sides of seams
+    subdivisions: int
+
+
+def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
+    """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
+    s, faces = ring.domain.sample(min(subdivisions, CUT))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.bilinear = resolution, PADDING, True
+    charts = xatlas.Atlas()
+    charts.add_mesh(flowed(ring, s.numpy(), time), faces.astype(np.uint32))  # of size 1: it drops small triangles
+    charts.generate(pack_options=options)
+    origin, faces, uv = charts[0]
+    s, uv, faces = s.numpy()[origin], np.clip(uv, 0, 1), faces.astype(np.int64)
+    for _ in range(subdivisions - CUT):
+        s, uv, faces = subdivide(ring, s, uv, faces)
+    return assemble(ring, s, uv, faces, subdivisions, time)
+
+
+def flowed(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
+    """The surface (V, 3) in the normalised frame at domain points (V, 3)."""
+    with torch.no_grad():
+        return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
+
+
+def subdivide(ring: Ring, s, uv, faces, *more):
+    """Every triangle cut in four, new points on the domain; `more` (V, n) is interpolated like `uv`."""
+    columns = [s, uv, *more]
+    ends = np.cumsum([c.shape[1] for c in columns])[:-1]
+    finer, faces = trimesh.remesh.subdivide(np.hstack(columns).astype(np.float64), faces)
+    s, *rest = np.split(finer, ends, axis=1)
+    s = np.concatenate([s[: len(columns[0])], ring.domain.project(s[len(columns[0]) :])])
+    return (s.astype(np.float32), rest[0], faces, *rest[1:])
+
+
+def assemble(ring: Ring, s, uv, faces, subdivisions: int, time: float) -> Atlas:
+    """An atlas with its vertices, normals and tangents."""
+    points, normals, whole = seamless_surface(ring, s, faces, time)
+    # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
+    (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
+    sign = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
+    along = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * sign[:, None]
+    tangents, signs = np.zeros((len(s), 3)), np.zeros(len(s))
+    for corner in faces.T:
+        np.add.at(tangents, corner, along)
+        np.add.at(signs, corner, sign)
+    tangents -= (tangents * normals).sum(1, keepdims=True) * normals
+    length = np.linalg.norm(tangents, axis=1, keepdims=True)
+    aside = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])  # where there is no direction, any will do
+    tangents = np.where(length > 0, tangents / np.maximum(length, 1e-30), aside)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    # With u to the right and v down, as glTF has it, the bitangent n × t points to smaller v.
+    tangents = np.hstack([tangents, np.where(signs < 0, 1.0, -1.0)[:, None]])
+    vertices = ring.center.cpu().numpy() + float(ring.radius) * points
+    return Atlas(s, uv, vertices, normals, tangents, faces, whole, subdivisions)
+
+
+def seamless_surface(ring: Ring, s, faces, time: float):
+    """Points (V, 3) in the normalised frame, smooth normals (V, 3) that know of no seam, and `Atlas.whole`."""
+    once, whole = np.unique(s, axis=0, return_inverse=True)
+    whole = whole.ravel()
+    points = flowed(ring, once, time)
+    normals = trimesh.Trimesh(points, whole[faces], process=False).vertex_normals
+    return points[whole], normals[whole], whole
+
+
+class Texels(NamedTuple):
+    """What the texels of a square texture show; those between charts show what the nearest ones in charts do."""
+
+    s: np.ndarray  # (N, 3) domain points of the N texels in charts
+    normals: np.ndarray  # (N, 3), unit length, in the tangent frame of the atlas: along t, along the bitangent, along n
+    index: np.ndarray  # (resolution, resolution): which of the N
+
+
+def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
+    """The texels of an atlas. The normals are those of the surface at the level of the fit, if that is finer."""
+    bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
+    s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
+    for _ in range(ring.subdivisions - atlas.subdivisions):
+        s, uv, faces, *frame = subdivide(ring, s, uv, faces, *frame)
+    finer = len(faces) > len(atlas.faces)
+    normals = seamless_surface(ring, s, faces, time)[1] if finer else atlas.normals
+
+    flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
+    y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
+    centre = mi.Point3f(*((np.stack([x, y]) + 0.5) / resolution).astype(np.float32), 1)
+    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(mi.Ray3f(centre, [0, 0, -1]))
+    inside = np.array(hit.is_valid())
+    corners = faces[np.array(hit.prim_index)[inside]]
+    b = np.array(hit.prim_uv).T[inside]
+    weights = np.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
+
+    def at(values):
+        return (values[corners] * weights).sum(1).astype(np.float32)
+
+    n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(normals)
+    # m = x t + y b + z n, solved: what a renderer does with the interpolated frame, inverted.
+    n, t, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, t, b))
+    local = np.stack([(np.cross(p, q) * m).sum(1) for p, q in ((b, n), (n, t), (t, b))], 1)
+    local *= np.sign((np.cross(b, n) * t).sum(1, keepdims=True))
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    inside = inside.reshape(resolution, resolution)
+    number = np.cumsum(inside).reshape(inside.shape) - 1
+    nearest = scipy.ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return Texels(at(s), local, number[tuple(nearest)])
+
+
+def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
+    """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
+    with torch.no_grad():
+        chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
+        parts = [ring.brdf_net(chunk) for chunk in tqdm(chunks, "baking", leave=False, disable=len(chunks) < 3 or None)]
+    return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

@@ -1,0 +1,73 @@
+"""The contact sheet of a capture: where everything is, masks and hull over the photographs."""
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.metrics.captures import PhotographQuality
+from mi_ring.metrics.mask_agreement import CONFORMS
+from mi_ring.metrics.surfaces import hits
+from mi_ring.rendering.plain_mesh import scene_of
+
+CELL = 200  # of the contact sheet [px]
+
+
+def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
+    """Cameras (with the way they look), lights and the normalising sphere from above and from two sides."""
+    cameras, lights = np.stack([sensor.camera.to_world for sensor in capture.sensors]), capture.photographs.lights
+    reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
+    away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())
+    figure = Figure(figsize=(12, 4), dpi=100)
+    canvas, panels = FigureCanvasAgg(figure), figure.subplots(1, 3)
+    for panel, (a, b) in zip(panels, ((0, 1), (0, 2), (1, 2))):
+        panel.add_patch(Circle(center[[a, b]], radius, color="tab:green", alpha=0.3))
+        panel.scatter(*away[:, [a, b]].T, s=12, c="tab:orange", label="lights")
+        panel.quiver(*cameras[:, [a, b], 3].T, *(0.25 * reach * cameras[:, [a, b], 2]).T, color="tab:blue", angles="xy",
+                     scale_units="xy", scale=1, width=0.004, label="cameras")  # fmt: skip
+        panel.set_xlabel("xyz"[a])
+        panel.set_ylabel("xyz"[b])
+        panel.set_aspect("equal", "datalim")
+        panel.autoscale_view()
+    panels[0].legend(loc="upper right", fontsize=8)
+    figure.tight_layout()
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
+    """The contact sheet: where everything is; on photographs the visual hull in green and the mask's outline in red."""
+    top = plan(capture, center, radius)
+    try:
+        mesh = capture.hull.surface() if capture.hull else None
+    except InputError:
+        mesh = None
+    hull = mesh and scene_of(mesh.vertices, mesh.faces)
+    some = capture.spread()
+    columns = max(1, min(top.width // CELL, len(some)))
+    page = Image.new("RGB", (max(top.width, columns * CELL), top.height + -(-len(some) // columns) * (CELL + 16)))
+    page.paste(top)
+    white = 3 * capture.exposure()
+    for place, k in enumerate(some):
+        scale = max(1, max(capture.sensors[k].size) // CELL)
+        observed, _, mask, masked, _ = capture.observe([k], scale)
+        picture = linear_to_srgb(observed[0].numpy() / white)
+        if hull:
+            seen = hits(hull, capture.photograph(k, scale))[0].reshape(picture.shape[:2])
+            picture = 0.7 * picture + 0.3 * seen[..., None] * np.array([0.1, 1.0, 0.2])
+        if masked:
+            inside = mask[0].numpy() > 0.5
+            picture[inside & ~ndimage.binary_erosion(inside)] = (1.0, 0.2, 0.2)
+        cell = Image.fromarray(to_bytes(picture))
+        cell.thumbnail((CELL, CELL))
+        x, y = place % columns * CELL, top.height + place // columns * (CELL + 16)
+        page.paste(cell, (x, y + 16))
+        fits = "" if rows[k].agreement is None else f"  {rows[k].agreement:.0%}"
+        good = rows[k].agreement is None or rows[k].agreement >= CONFORMS
+        ImageDraw.Draw(page).text((x + 2, y + 2), rows[k].name + fits, fill=(255, 255, 255) if good else (255, 90, 90))
+    return page

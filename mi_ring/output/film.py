@@ -1,0 +1,56 @@
+"""Pictures and films of rendered views."""
+
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.system.files import writing
+
+
+def write_picture(linear: np.ndarray, path: Path) -> None:
+    """Write (H, W, 3) linear radiance: EXR as it is, anything else 8-bit sRGB."""
+    exr = path.suffix.lower() == ".exr"
+    write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
+
+
+def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:
+    """Write an MP4 file that browsers play, H.264 with an even number of rows and columns, whole or not at all.
+
+    Raises InputError if it cannot be written. `size`: (width, height) [px] of the pictures.
+    """
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    odd_columns, odd_rows = size[0] % 2, size[1] % 2
+    # Not through imageio, which takes a film that was cut short, on a full disk for instance, for a whole one.
+    ffmpeg = subprocess.Popen(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
+            "-s", f"{size[0] + odd_columns}x{size[1] + odd_rows}", "-r", str(fps), "-i", "-",
+            "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
+            # Which colours are meant: browsers would guess by the size of the pictures.
+            "-vf", "scale=out_color_matrix=bt709,setparams=color_primaries=bt709:color_trc=iec61966-2-1",
+            f"file:{partial}",
+        ],
+        stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # Ctrl-C is for us alone
+    )  # fmt: skip
+    try:
+        with contextlib.suppress(BrokenPipeError):  # it ended, and says below why
+            for picture in pictures:
+                image = to_bytes(linear_to_srgb(picture))
+                ffmpeg.stdin.write(np.pad(image, ((0, odd_rows), (0, odd_columns), (0, 0)), "edge").tobytes())
+        complaint = ffmpeg.communicate()[1].decode(errors="replace").split("\n")[0]
+        if ffmpeg.returncode:
+            raise InputError(f"{path}: cannot be written ({complaint or 'ffmpeg was killed'}); make room or choose "
+                             "another place")  # fmt: skip
+        with writing(path):
+            os.replace(partial, path)
+    finally:
+        ffmpeg.kill()
+        ffmpeg.wait()
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,75 @@
+"""A scene for Mitsuba without mi_ring: textures and stock plugins alone."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.capture.loading import open_scene
+from mi_ring.capture.scenefile import emitter_element, perspective_element
+from mi_ring.errors import InputError
+from mi_ring.images import write_image
+from mi_ring.output import gltf
+from mi_ring.output.atlas import Atlas, Texels
+from mi_ring.output.ply import write_ply
+from mi_ring.rendering.lights import Lights
+from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.system.files import write_file
+
+
+def first_photograph(run: Path) -> mi.Sensor:
+    """The first photograph of a fit, as its scene.xml has it. Raises InputError if there is none."""
+    if not run.is_dir():
+        raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
+    return open_scene(run / "scene.xml")[1][0]
+
+
+def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, photograph: mi.Sensor) -> list[Path]:
+    """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone."""
+    files = [path]
+    mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
+    params = mi.traverse(mesh)
+    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's know of the seams
+    params.update()
+    files.append(path.with_name(f"{path.stem}_object.ply"))
+    write_ply(mesh, files[-1])
+
+    def bitmap(parent, name: str, image: np.ndarray) -> None:
+        """A texture (N, 3) or (N,) of the texels."""
+        files.append(path.with_name(f"{path.stem}_{name}.exr"))
+        write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
+        texture = ElementTree.SubElement(parent, "texture", name=name, type="bitmap")
+        ElementTree.SubElement(texture, "string", name="filename", value=files[-1].name)
+        if image.ndim == 1:
+            ElementTree.SubElement(texture, "boolean", name="raw", value="true")
+
+    scene = ElementTree.Element("scene", version="3.0.0")
+    ElementTree.SubElement(scene, "integrator", type="path")
+    shape = ElementTree.SubElement(scene, "shape", type="ply", id="object")
+    ElementTree.SubElement(shape, "string", name="filename", value=files[1].name)
+    element, scale = ElementTree.fromstring(bsdf), 1.0
+    if element.get("type") == "cooktorrance":
+        material = gltf.metallic_roughness(bsdf, values)
+        scale = material.scale
+        distribution = next((e.get("value") for e in element if e.get("name") == "distribution"), "ggx")
+        element = ElementTree.SubElement(shape, "bsdf", type="blendbsdf")
+        bitmap(element, "weight", material.specular)
+        bitmap(ElementTree.SubElement(element, "bsdf", type="diffuse"), "reflectance", material.base_color)
+        gloss = ElementTree.SubElement(element, "bsdf", type="roughconductor")
+        ElementTree.SubElement(gloss, "string", name="material", value="none")
+        ElementTree.SubElement(gloss, "string", name="distribution", value=distribution)
+        bitmap(gloss, "alpha", material.roughness**2)
+    else:
+        shape.append(element)
+        for texture in [t for t in element.iter("texture") if t.get("type") == "mesh_attribute"]:
+            name = texture.get("name")
+            parent = next(e for e in element.iter() if texture in e)
+            parent.remove(texture)
+            bitmap(parent, name, values[name])
+    light = Lights.of([photograph])[0]
+    scene.append(perspective_element(photograph.camera, atlas.vertices))
+    scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
+    ElementTree.indent(scene)
+    write_file(path, ElementTree.tostring(scene, "utf-8"))
+    return files

@@ -1,0 +1,42 @@
+"""Textured meshes as OBJ with MTL and PNG."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.images import write_image
+from mi_ring.output import gltf
+from mi_ring.output.atlas import Atlas, Texels
+from mi_ring.system.files import write_file
+
+
+def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
+    """OBJ with MTL and PNG. Positions and normals are those of the closed mesh, seams exist only in the texture."""
+    baked, files = gltf.textures(material, texels), {}
+    for name, image in {
+        "diffuse": baked["baseColorTexture"], "normal": baked["normalTexture"],
+        "specular": baked["specularTexture"][..., 3, None],
+        "roughness": baked["metallicRoughnessTexture"][..., 1, None],
+        "metallic": baked["metallicRoughnessTexture"][..., 2, None],
+    }.items():  # fmt: skip
+        files[name] = path.with_name(f"{path.stem}_{name}.png")
+        write_image(image, files[name])
+    library = path.with_suffix(".mtl")
+    write_file(library, "\n".join([
+        "newmtl fitted", "illum 2", "Kd 1 1 1", f"map_Kd {files['diffuse'].name}",
+        "Ks {0:.4g} {0:.4g} {0:.4g}".format(min(0.04 * material.specular_color, 1)), f"map_Ks {files['specular'].name}",
+        "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
+        f"norm {files['normal'].name}", "",
+    ]))  # fmt: skip
+    closed, first = np.unique(atlas.whole, return_index=True)
+    whole = np.searchsorted(closed, atlas.whole)
+    corners = np.stack([whole, np.arange(len(whole)), whole], 1)[atlas.faces] + 1
+    text = io.StringIO()
+    text.write(f"mtllib {library.name}\no object\nusemtl fitted\n")
+    np.savetxt(text, atlas.vertices[first], "v %.9g %.9g %.9g")
+    np.savetxt(text, atlas.uv * [1, -1] + [0, 1], "vt %.9g %.9g")  # v points up in OBJ
+    np.savetxt(text, atlas.normals[first], "vn %.5f %.5f %.5f")
+    np.savetxt(text, corners.reshape(-1, 9), "f %d/%d/%d %d/%d/%d %d/%d/%d")
+    write_file(path, text.getvalue())
+    return [path, library, *files.values()]

@@ -1,0 +1,29 @@
+"""Meshes as PLY, with the material at each vertex."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import torch
+
+from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.ring.ring import Ring
+from mi_ring.system.files import write_file
+
+
+def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> None:
+    """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …)."""
+    s, faces = ring.domain.sample(subdivisions)
+    with torch.no_grad():
+        s = s.to(ring.center.device)
+        vertices, material = ring.surface(s, time), ring.brdf_net(s)
+    mesh = mesh_of(vertices.cpu().numpy(), faces)
+    for name, value in material.items():
+        mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
+    write_ply(mesh, path)
+
+
+def write_ply(mesh: mi.Mesh, path: Path) -> None:
+    """A mesh as PLY, whole or not at all."""
+    stream = mi.MemoryStream()
+    mesh.write_ply(stream)
+    write_file(path, stream.raw_buffer())

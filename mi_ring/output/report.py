@@ -1,0 +1,209 @@
+"""report.html: one self-contained page that shows whether to trust a fit."""
+
+import base64
+import io
+import math
+from dataclasses import dataclass
+from importlib import resources
+
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy import ndimage
+from skimage.measure import block_reduce
+from skimage.registration import phase_cross_correlation
+
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.rendering import bridge
+from mi_ring.system.command import scene_name
+from mi_ring.version import __version__
+
+REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
+PICTURE = 480  # width and height of the pictures, at most [px]
+MISFIT, COVERED = 3.0, 0.9  # a PSNR this far below the others' [dB], IoU: say so
+SATURATED = 0.25  # share of the object's pixels: more than mi_ring.check allows, for that is of the median photograph
+SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
+
+
+@dataclass
+class PhotographPanel:
+    """One photograph of the page: its numbers and pictures as data URIs."""
+
+    name: str
+    psnr: float
+    iou: float | None
+    saturated: float  # share of the object's pixels
+    shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
+    pictures: dict[str, str]
+
+
+def report_html(fit, log: list[dict], glb: bytes | None = None) -> str:
+    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer."""
+    capture, ring = fit.capture, fit.ring
+    rows, errors = [], []
+    for k in capture.spread():
+        row, error = panel_of(fit, k, capture.names[k])
+        rows.append(row)
+        errors.append(error)
+    masked = [row.iou for row in rows if row.iou is not None]
+    s, faces = ring.domain.sample(ring.subdivisions)
+    numbers = {
+        "Photographs": f"{len(capture)}" + (f"; below are {len(rows)} of them, as are the next two numbers"
+                                             if len(rows) < len(capture) else ""),
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels, 4 samples each)",
+        "Silhouettes": (f"{np.mean(masked):.4f} intersection over union with the masks"
+                        if masked else "no masks of the whole object"),
+        "Iterations": f"{fit.iteration} of {fit.iterations}",
+        "Fit time": f"{fit.seconds:.0f} s",
+        "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
+        "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
+    }
+    files = resources.files("mi_ring.output")
+    template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
+    return template.render(
+        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(log, fit), settings=fit.config.settings(),
+        findings=fit_findings(rows, fit.iteration, fit.iterations), view=first_view(fit),
+        glb=glb and base64.b64encode(glb).decode(), viewer=files.joinpath("viewer", "viewer.min.js").read_text("utf-8"),
+    )  # fmt: skip
+
+
+def first_view(fit) -> dict[str, list[float]]:
+    """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
+    eye = fit.capture.sensors[0].camera.position
+    irradiance = np.median(fit.capture.photographs.lights.irradiance(fit.ring.center.cpu().numpy()), axis=0)
+    return {"up": fit.capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
+
+
+def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -> list[str]:
+    """What stands out, each in one sentence that says what to do."""
+    found = []
+    if iteration < iterations:
+        found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
+
+    typical, scatter = middle([row.psnr for row in rows])
+    limit = typical - max(MISFIT, 3 * scatter)
+    if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
+        found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
+                     "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
+    masked = [row for row in rows if row.iou is not None]
+    if few := worst((row.iou, row.name, f"IoU {row.iou:.2f}") for row in masked if row.iou < COVERED):
+        found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
+                     "and pose are right.")  # fmt: skip
+    if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
+        found.append(f"{few}: so much of the object is saturated; the fit only knows that it is at least this bright. "
+                     "Expose less.")  # fmt: skip
+
+    rows = [row for row in rows if row.shift is not None]
+    if rows:
+        shift, scatter = middle([row.shift for row in rows])
+        scatter = np.hypot(*scatter)
+        if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(rows))):
+            found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cx and cy, or the "
+                         "poses, seem off by as much or more; the first pixel's centre is (0.5, 0.5).")  # fmt: skip
+        away = [(row.name, np.subtract(row.shift, shift)) for row in rows]
+        limit = max(SHIFTED, 3 * scatter)
+        if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
+            found.append(f"{few} of the prediction: shifted as the others are not; mend the pose, or leave the "
+                         "photograph out.")  # fmt: skip
+    return found
+
+
+def middle(values) -> tuple[np.ndarray, np.ndarray]:
+    """Median of values (n, ...) and, from the median absolute deviation, their standard deviation."""
+    median = np.median(values, axis=0)
+    return median, 1.4826 * np.median(np.abs(values - median), axis=0)
+
+
+def worst(photographs, most: int = 5) -> str:
+    """Names and numbers of the lowest (rank, name, number), in one line; empty if there are none."""
+    ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
+    return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
+
+
+def sides(x: float, y: float) -> str:
+    """A shift in words."""
+    return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
+
+
+def panel_of(fit, k: int, name: str) -> tuple[PhotographPanel, float]:
+    """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
+    capture = fit.capture
+    observed, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k])[:4])
+    predicted, coverage = (t[0].numpy() for t in bridge.draw(
+        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
+    ))  # fmt: skip
+    photo, guess, found = linear_to_srgb(observed), linear_to_srgb(predicted), coverage > 0.5
+    inside = mask > 0.5 if masked else found
+    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
+    parameters = fit.ring.brdf_net.bsdf_parameters
+    maps = {key: m[0] for key, m in bridge.maps(fit.surface, small, parameters).items()}
+    normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
+    pictures = {
+        "photograph": photo,
+        "prediction": guess,
+        "4 × difference": 4 * np.abs(photo - guess),
+        "normals": normal,
+    }
+    for p in parameters:
+        if math.isinf(p.high):
+            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(fit.ring.brdf_net.scale)))
+        else:
+            value = (maps[p.name] - p.low) / (p.high - p.low)
+            pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
+    error = float(np.mean((photo - guess) ** 2))
+    row = PhotographPanel(
+        name=name,
+        psnr=-10 * np.log10(max(error, 1e-10)),
+        iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
+        saturated=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
+        shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
+        pictures={title: data_uri(picture) for title, picture in pictures.items()},
+    )
+    return row, error
+
+
+def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
+    """How far `photo` (H, W, 3) is right of and below `guess` [px], where `inside` (H, W); None if one is black."""
+    if not (photo.any() and guess.any() and inside.any()):
+        return None
+    rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]
+    a, b = (picture[rows, columns].mean(-1) for picture in (photo, guess))
+    scale = -(-max(a.shape) // REGISTERED)
+    a, b = (block_reduce(picture, scale, np.mean) for picture in (a, b))
+    down, right = scale * phase_cross_correlation(a, b, upsample_factor=20, normalization=None)[0]
+    return float(right), float(down)
+
+
+def data_uri(picture: np.ndarray) -> str:
+    """An (H, W) or (H, W, 3) picture in [0, 1] as a small WebP."""
+    image = Image.fromarray(to_bytes(picture))
+    image.thumbnail((PICTURE, PICTURE))
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=85)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def loss_curve(log: list[dict], fit) -> str:
+    """The loss and its weighted terms over the iterations as an SVG data URI."""
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for term in ("loss", *fit.terms):
+        points = []
+        for entry in log:
+            weight = 1.0 if term == "loss" else entry["weights"].get(term, 0.0)
+            points.append((entry["iteration"], weight * entry.get(term, 0.0)))
+        points = [(iteration, value) for iteration, value in points if value > 0]
+        if points:
+            label = "loss" if term == "loss" else f"weighted {term}"
+            axes.semilogy(*zip(*points), label=label, linewidth=2 if term == "loss" else 1)
+    for stage in fit.stages[1:]:
+        if stage.first < fit.iteration:
+            axes.axvline(stage.first, color="0.7", linewidth=1, linestyle=":")
+    axes.set_xlabel("iteration (dotted: next stage)")
+    axes.grid(alpha=0.3)
+    if log:
+        figure.legend(loc="outside right upper")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg")
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()

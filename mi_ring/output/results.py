@@ -1,0 +1,130 @@
+"""The results of a fit: everything that is written into its folder."""
+
+import contextlib
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from mi_ring.capture.scenefile import fitted_scene_xml
+from mi_ring.errors import InputError
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.output import gltf, report
+from mi_ring.output.ply import write_mesh
+from mi_ring.rendering import bridge
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
+from mi_ring.system.command import scene_name
+from mi_ring.system.files import locked, write_file, write_state, writing
+
+VIEWED, TEXELS = 5, 1024  #: level of the report's object, and texels across its textures
+
+
+def default_folder(scene: Path) -> Path:
+    """Where the results of a scene go: out/<its name>. Raises InputError if those of another scene are there."""
+    folder = Path("out") / scene_name(scene)
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        other = folder / json.loads((folder / "config.json").read_text())["scene"]
+        if other.is_file() and scene.is_file() and not other.samefile(scene):
+            raise InputError(f"{folder}: holds the results of another scene, {os.path.relpath(other)}; say with --out "
+                             "where those of this one are to go")  # fmt: skip
+    return folder
+
+
+def prepare(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
+    """Make the folder and write config.json: the options as used, the scene's file relative to the folder.
+
+    A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
+    written or holds the scene.
+    """
+    folder = folder.resolve()
+    if folder in scene.resolve().parents:
+        raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
+    with writing(f"{folder}: --out"):
+        if not resume and any((folder / name).exists() for name in ("ring.pt", "checkpoint.pt")):
+            aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
+            folder.rename(aside)
+            print(f"The results that were in {folder}/ are now in {aside}/")
+        folder.mkdir(parents=True, exist_ok=True)
+    where = Path(os.path.relpath(scene.resolve(), folder)).as_posix()
+    write_file(folder / "config.json", json.dumps(options | {"scene": where}, indent=2, default=str))
+
+
+def save_fit(folder: Path, fit) -> None:
+    """All results of a `Fit`, finished or not, into a folder of its own."""
+    with locked(folder):
+        prepare(folder, fit.capture.path, fit.config.settings())
+        start_log(folder, 0)
+        write(folder, fit, fitted_scene(fit, folder))
+
+
+def fitted_scene(fit, folder: Path) -> bytes:
+    """scene.xml of a fit. Raises InputError for a scene that cannot be rewritten."""
+    return fitted_scene_xml(fit.capture.path, folder, fit.ring.subdivisions, fit.ring.bsdf)
+
+
+def start_log(folder: Path, iteration: int) -> None:
+    """Make log.jsonl, or take those entries out that are after `iteration`: they will be written again."""
+    entries = read_log(folder) if iteration and (folder / "log.jsonl").exists() else []
+    text = "".join(json.dumps(entry) + "\n" for entry in entries if entry["iteration"] <= iteration)
+    write_file(folder / "log.jsonl", text)
+
+
+def log(folder: Path, entry: dict) -> None:
+    """One more line of log.jsonl."""
+    path = folder / "log.jsonl"
+    with writing(path), path.open("a") as file:
+        file.write(json.dumps(entry) + "\n")
+
+
+def read_log(folder: Path) -> list[dict]:
+    """The entries of log.jsonl; a line that was cut off when the process was killed is none."""
+    lines = (folder / "log.jsonl").read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("}\n")]
+
+
+def write_inputs(path: Path, fit) -> None:
+    """inputs.png: the start surface drawn over photographs, in green, where mask or pose errors show at once."""
+    s, faces = fit.ring.domain.sample(4)
+    fit.surface.show(fit.ring, s, faces)
+    some = fit.capture.spread()
+    columns = min(10, len(some))
+    cell = 160
+    sheet = Image.new("RGB", (columns * cell, -(-len(some) // columns) * cell))
+    for place, k in enumerate(some):
+        scale = max(1, max(fit.capture.sensors[k].size) // cell)
+        observed = fit.capture.observe([k], scale)[0]
+        _, coverage = bridge.draw(fit.surface, fit.capture.photograph(k, scale), spp=4, shadows=False)
+        tint = 0.35 * coverage[0, ..., None].numpy() * np.array([0.1, 1.0, 0.2])
+        picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
+        picture.thumbnail((cell, cell))
+        ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
+        sheet.paste(picture, (place % columns * cell, place // columns * cell))
+    buffer = io.BytesIO()
+    sheet.save(buffer, "PNG")
+    write_file(path, buffer.getvalue())
+
+
+def write(folder: Path, fit, scene: bytes) -> None:
+    """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
+    write_state(ring_state(fit.ring, fit.config.settings()), folder / "ring.pt")
+    write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply")
+    write_file(folder / "scene.xml", scene)
+    s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
+    fit.surface.show(fit.ring, s, faces)
+    print("Writing the report", flush=True)
+    write_file(folder / "report.html", report.report_html(fit, read_log(folder), viewed(fit.ring)))
+    print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
+
+
+def viewed(ring: Ring) -> bytes | None:
+    """The object for the report's viewer as GLB, where that is possible."""
+    level = min(VIEWED, ring.subdivisions)
+    try:
+        return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)))
+    except Exception as error:  # whatever it is, the report is worth more
+        print(f"The report goes without a view of the object: {' '.join(str(error).split())}")
+        return None

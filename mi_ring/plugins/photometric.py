@@ -1,0 +1,114 @@
+"""The `photometric` integrator: photographs of the scene, each lit by its own light (Mitsuba plugin)."""
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` keeps the classes of an older variant
+
+from mi_ring.plugins.flash import flash_light
+from mi_ring.plugins.photograph import Photograph
+from mi_ring.rendering.attributes import require_attributes
+from mi_ring.rendering.boundaries import boundaries
+from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.shading import shade
+
+
+class Photometric(ADIntegrator):
+    """The paper's image formation for photographs (equation 2): camera k sees the object lit by light k alone.
+
+    Direct light only: radiance = B · max(0, n·i) · intensity / d² for the nested point light of the photograph being
+    rendered, B · max(0, n·i) · irradiance for a directional one. Emitters at the top level of the scene (an environment
+    map, a lamp) light every photograph, one emitter sample each.
+
+    =========== ======= =============================================================================== =====
+    Parameter   Type    Description                                                                     Flags
+    =========== ======= =============================================================================== =====
+    ``shadows`` boolean is a point lit only if it sees the light of its photograph? Default: true
+    =========== ======= =============================================================================== =====
+
+    Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
+
+    Gradients, through `mi.render` and through `render_photographs`, are those with respect to vertices, BSDFs, cameras,
+    lights and the placement of other shapes: shading by automatic differentiation, and the motion of outlines, creases
+    and edges of cast shadows, of all meshes, rectangles, disks, spheres and cylinders, by sampling these edges (Li et
+    al. 2018, "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
+
+    What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
+    about the photographs' own lights, others always cast shadows. What Mitsuba's integrators have in common
+    (``max_depth``, ``hide_emitters``, …) is accepted and has no effect. Gradients need an RGB variant and a
+    `photograph` sensor; the soft shadows of area lights and environment maps give none when they move.
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <integrator type="photometric"><boolean name="shadows" value="true"/></integrator>
+
+        .. code-block:: python
+
+            {"type": "photometric", "shadows": True}
+    """
+
+    def __init__(self, props=None):
+        props = mi.Properties() if props is None else props
+        super().__init__(props)
+        self.shadows = props.get("shadows", True)
+        self.checked = None
+        self.edges = None
+
+    def sample(self, mode, scene, sampler, ray, depth=None, δL=None, state_in=None, active=True, **kwargs):
+        self.require_attributes(scene)
+        si = scene.ray_intersect(mi.Ray3f(ray), active)
+        radiance = shade(scene, si, flash_light, sampler.next_2d, self.shadows)
+        return radiance, si.is_valid(), [], None
+
+    def require_attributes(self, scene):
+        """Refuse a scene that would silently render black, once per scene."""
+        shapes = scene.shapes()  # not the scene, which holds this integrator: nobody would free the two
+        if shapes != self.checked:
+            for shape in shapes:
+                require_attributes(shape)
+            self.checked = shapes
+
+    def differentiable(self, scene, sensor, seed, spp):
+        """The image of `render`, attached, the motion of edges included."""
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        if not (mi.is_rgb and isinstance(sensor, Photograph)):
+            raise ValueError("photometric: gradients need an RGB variant and a photograph sensor")
+        self.edges = Edges.of(scene, self.edges)
+        film = sensor.film()
+        sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
+        ray, weight, where = self.sample_rays(scene, sensor, sampler)
+        radiance, valid, _, _ = self.sample(dr.ADMode.Backward, scene, sampler, ray)
+        block = film.create_block()
+        block.set_coalesce(block.coalesce() and spp >= 4)
+        coverage = dr.select(valid, mi.Float(1), 0)
+        ADIntegrator._splat_to_block(block, film, where, radiance * weight, 1.0, coverage, [], ray.wavelengths)
+        film.put_block(block)
+        one = Photographs.attached(sensor)
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        low = mi.Point2f(film.crop_offset()) - border
+        window = low, low + mi.Point2f(film.crop_size()) + 2 * border  # where `sample_rays` puts its samples
+        for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows, window):
+            block = film.create_block()
+            block.set_coalesce(False)
+            # The film divides by the sum of the weights, `spp` per pixel.
+            step = [dr.select(active, value * spp, 0) for value in step]
+            ADIntegrator._splat_to_block(block, film, where, mi.Color3f(step[:3]), 0.0, step[3], [], ray.wavelengths)
+            film.put_block(block)
+        return film.develop()
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        image = self.differentiable(scene, sensor, seed, spp)
+        dr.forward_to(image)
+        return dr.grad(image)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        image = self.differentiable(scene, sensor, seed, spp)
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)
+
+
+mi.register_integrator("photometric", Photometric)

@@ -1,0 +1,20 @@
+"""What the plugins read of their properties."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+
+def beside_scene(name: str) -> Path:
+    """A file that a scene names, relative to the scene's own folder (to the working directory outside of a file)."""
+    return Path(str(mi.file_resolver()[0])) / name
+
+
+def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
+    """A property of a plugin that is a finite number. Raises ValueError, which names it, if it is anything else."""
+    value = props.get(name, default)
+    if isinstance(value, int | float) and np.isfinite(value) and (value > 0 or not positive):
+        return float(value)
+    wanted = "a positive number" if positive else "a number"
+    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {value}, must be {wanted}')

@@ -1,0 +1,136 @@
+"""The `shapenet` shape: the reconstructed surface as a mesh (Mitsuba plugin)."""
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.plugins.properties import beside_scene, number
+from mi_ring.rendering.attributes import require_attributes
+from mi_ring.rendering.plain_mesh import FACES, POSITIONS
+
+
+class ShapeNetMesh(mi.Mesh):
+    """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
+
+    ================ ========= ========================================================================== =======
+    Parameter        Type      Description                                                                Flags
+    ================ ========= ========================================================================== =======
+    ``weights``      string    a saved fit (``ring.pt``). Default: none, the shape is the undeformed
+                               domain
+    ``subdivisions`` integer   level of the icosphere, 0 to 8: 10 · 4ⁿ + 2 vertices. Default: 5
+    ``domain``       string    mesh file (scene units), closed: the canonical surface instead of the
+                               sphere. Not together with ``weights``, which carry their own. Default:
+                               none
+    ``center``       point     centre of the normalising sphere [scene units]; with ``weights`` theirs.
+                               Default: the middle of ``domain``, else the origin, but a fit estimates
+                               it from masks or cameras
+    ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of
+                               ``domain``, else 1
+    ``to_world``     transform applied on top of everything. Default: none
+    ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
+                               to false to place a fit into a scene of your own. Default: true
+    (nested)         bsdf      usually `cooktorrance`, which reads the attributes below; exposed as       P, ∂
+                               ``bsdf``
+    ================ ========= ========================================================================== =======
+
+    ==================== ===== ========================================================================== =======
+    Exposed              Type  Description                                                                Flags
+    ==================== ===== ========================================================================== =======
+    ``vertex_positions`` float 3 per vertex [scene units]                                                 P, ∂, D
+    ``vertex_normals``   float 3 per vertex; computed anew whenever positions change                      P, ∂, D
+    ``faces``            int   3 vertices per triangle                                                    P
+    ``vertex_diffuse``   float 3 per vertex; this and the next two: of a fit with `cooktorrance`          P, ∂
+    ``vertex_specular``  float 1 per vertex                                                               P, ∂
+    ``vertex_roughness`` float 1 per vertex                                                               P, ∂
+    ==================== ===== ========================================================================== =======
+
+    The mesh carries smooth normals and, for each parameter that the fit of ``weights`` predicts, the attribute
+    ``vertex_<parameter>``: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
+    ``vertex_roughness`` (1). Without ``weights`` it has these, 0.5, 0 and 0.5. A nested BSDF that asks for another
+    attribute, or for one with another number of channels, is an error. What it does not do: texture coordinates;
+    colours in spectral variants, where Mitsuba takes three-channel attributes for the coefficients of a spectrum.
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <shape type="shapenet" id="object">
+              <string name="weights" value="ring.pt"/><integer name="subdivisions" value="6"/>
+              <bsdf type="cooktorrance"/>
+            </shape>
+
+        .. code-block:: python
+
+            {
+                "type": "shapenet", "weights": "ring.pt", "subdivisions": 6,
+                "bsdf": {"type": "cooktorrance"},
+            }
+    """
+
+    def __init__(self, props):
+        import torch  # here, with all that needs it: `import mi_ring` is quick
+
+        from mi_ring.geometry.domain import Sphere, closed_domain
+        from mi_ring.geometry.meshes import load_closed_mesh
+        from mi_ring.ring.saved import load_fit
+
+        self.subdivisions = props.get("subdivisions", 5)
+        if not isinstance(self.subdivisions, int) or self.subdivisions not in range(9):
+            raise ValueError(f'shapenet "{props.id()}": subdivisions is {self.subdivisions}, must be 0 to 8')
+        given = {key: props[key] for key in ("center", "radius", "domain", "weights") if key in props}
+        for key in ("center", "radius", "domain"):
+            if key in given and "weights" in given:
+                raise ValueError(f'shapenet "{props.id()}": weights carry their own {key}; give only one of the two')
+        to_world = props.get("to_world", mi.ScalarTransform4f())
+        if isinstance(to_world, str | int | float):
+            raise ValueError(f'shapenet "{props.id()}": to_world is {to_world}, must be a <transform>')
+        to_world = np.array(to_world.matrix)
+        if props.get("flash", True):
+            # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
+            props["flash"] = mi.load_dict({"type": "flash"})
+
+        #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
+        self.center = np.array(given["center"]).ravel() if "center" in given else None
+        self.radius = number(props, "radius", positive=True) if "radius" in given else None
+        if self.center is not None and not (self.center.dtype.kind == "f" and np.isfinite(self.center).all()):
+            raise ValueError(f'shapenet "{props.id()}": center is {given["center"]}, must be a <point>')
+        #: The domain that it names, with its own normalising sphere, or None.
+        self.domain, self.domain_file = None, None
+        if "domain" in given:
+            self.domain_file = beside_scene(given["domain"])
+            self.domain = closed_domain(load_closed_mesh(self.domain_file, "domain"), self.center, self.radius)
+        sphere = Sphere(), np.zeros(3) if self.center is None else self.center, self.radius or 1.0
+        domain, center, radius = self.domain or sphere
+        self.ring = load_fit(beside_scene(given["weights"])) if "weights" in given else None
+
+        material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
+                    "roughness": torch.tensor(0.5)}  # fmt: skip
+        if self.ring is None:
+            s, faces = domain.sample(self.subdivisions)
+            vertices = torch.as_tensor(center, dtype=torch.float32) + radius * s
+            material = {name: m.expand(len(s), *m.shape) for name, m in material.items()}
+        else:
+            s, faces = self.ring.domain.sample(self.subdivisions)
+            with torch.no_grad():
+                vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
+        matrix = torch.tensor(to_world, dtype=torch.float32)
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if np.linalg.det(to_world[:3, :3]) < 0:
+            faces = np.fliplr(faces)  # a mirror would turn the surface inside out
+
+        super().__init__(props.id(), len(vertices), len(faces), props, True, False)
+        if not self.id():
+            self.set_id("object")
+        params = mi.traverse(self)
+        # Scalar variants have array types of their own.
+        params[POSITIONS] = type(params[POSITIONS])(vertices.numpy().ravel())
+        params[FACES] = type(params[FACES])(np.asarray(faces, np.uint32).ravel())
+        params.update()
+        for name, value in material.items():
+            self.add_attribute(f"vertex_{name}", value[0].numel(), value.contiguous().numpy().ravel())
+        require_attributes(self)
+
+    def to_string(self):
+        return f"ShapeNetMesh[id={self.id()}, vertices={self.vertex_count()}, subdivisions={self.subdivisions}]"
+
+
+mi.register_shape("shapenet", ShapeNetMesh)

@@ -1,0 +1,223 @@
+"""The one seam between torch and Dr.Jit: from torch tensors to photographs, and the gradients back."""
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from mi_ring.images import blur
+from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
+from mi_ring.rendering.attributes import load_bsdf, require_attributes
+from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.indirect import render_indirect
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.pictures import render_maps, render_photographs
+from mi_ring.rendering.plain_mesh import FACES, POSITIONS
+from mi_ring.rendering.scenes import assembled, own_emitters
+
+
+def to_drjit(tensor: Tensor):
+    """A tensor, flattened, as a Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
+    return mi.Float(tensor.detach().contiguous().ravel())
+
+
+def to_torch(array) -> Tensor:
+    """A Dr.Jit Float as a tensor (n,) of the same memory (DLPack). Neither side may write to it."""
+    return dr.detach(array).torch()
+
+
+class Surface:
+    """The `shapenet` shape of a loaded scene, as something that torch tensors are written to.
+
+    With a `Ring` it is a shape of its own, with the BSDF that the ring's parameters are those of, in a scene of its own
+    that shares all other objects with the given one and leaves that as it is. Without, it is the given shape itself.
+    Other shapes and top-level emitters of the scene take part in every picture but are not changed.
+    """
+
+    def __init__(self, scene: mi.Scene, shape: mi.Mesh, ring=None):
+        if ring is not None:
+            scene, shape = dressed(scene, shape, ring)
+        self.scene, self.shape = scene, shape
+        self.params = mi.traverse(scene)
+        self.prefix = f"{shape.id()}."
+        self.faces = np.array(shape.faces_buffer()).reshape(-1, 3)  # as they are, or will be with the next vertices
+        self.faces_changed, self.edges = False, None
+        self.written = 0
+
+    def set_faces(self, faces: np.ndarray) -> None:
+        """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
+        if faces is not self.faces:
+            self.faces, self.faces_changed = faces, True
+
+    def write(self, vertices: Tensor, attributes: dict[str, Tensor], gradients: bool = False) -> list:
+        """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes. Returns the Dr.Jit arrays, in that order.
+
+        Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
+        Raises ValueError for another number of vertices than the triangles have, and for attributes of another size.
+        """
+        needed = int(self.faces.max()) + 1
+        if vertices.shape != (needed, 3):
+            raise ValueError(f"vertices: of shape {tuple(vertices.shape)}, but the triangles need ({needed}, 3)")
+        for name, value in attributes.items():
+            channels = 1 if value.ndim == 1 else value.shape[-1]
+            if value.numel() != needed * channels or channels not in (1, 3):
+                raise ValueError(f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)")
+        tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
+        arrays = {name: to_drjit(t) for name, t in tensors.items()}
+        if gradients:
+            dr.enable_grad(*arrays.values())
+        if self.faces_changed:
+            self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
+            self.faces_changed = False
+        for name, array in arrays.items():
+            self.params[self.prefix + name] = array
+        self.params.update()
+        self.written += 1
+        return list(arrays.values())
+
+    def show(self, ring, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
+        """Write a `Ring` at domain points (V, 3) with these triangles, where the flow has them at `time` in [0, 1]."""
+        with torch.no_grad():
+            self.set_faces(faces)
+            s = s.to(ring.center.device)
+            self.write(ring.surface(s, time), ring.brdf_net(s))
+
+
+def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
+    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape."""
+    new = mi.load_dict({
+        "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
+        "bsdf": {"type": "cooktorrance"},
+    })  # fmt: skip
+    for parameter in ring.brdf_net.bsdf_parameters:
+        if not new.has_attribute(f"vertex_{parameter.name}"):
+            values = np.zeros(new.vertex_count() * parameter.channels, np.float32)
+            new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
+    new.set_bsdf(load_bsdf(ring.bsdf))
+    require_attributes(new)
+    shapes = [new if other == shape else other for other in scene.shapes()]
+    return assembled(shapes, own_emitters(scene), scene.sensors(), scene.integrator()), new
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *attributes):
+        gradients = any(t.requires_grad for t in (vertices, *attributes))
+        arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
+        if gradients:
+            surface.edges = Edges.of(surface.scene, surface.edges)
+        edges = surface.edges if gradients else None
+        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, edges)
+        dr.eval(channels)
+        ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *attributes)])
+        return pictures([to_torch(channel) for channel in channels], photographs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, rgb_grad, alpha_grad):
+        if ctx.save is None:
+            raise RuntimeError("the backward pass of a picture was taken a second time; render it again instead")
+        surface, written, arrays, channels, shapes = ctx.save
+        if surface.written != written:
+            raise RuntimeError("the surface was written again since this picture: call backward before the next one")
+        ctx.save = None  # Dr.Jit's graph is used up
+        for channel, grad in zip(channels, (*rgb_grad.unbind(-1), alpha_grad)):
+            if dr.grad_enabled(channel):
+                dr.set_grad(channel, to_drjit(grad))
+                dr.enqueue(dr.ADMode.Backward, channel)
+        dr.traverse(dr.ADMode.Backward)
+        # Copied: torch may add to a gradient in place.
+        grads = [to_torch(dr.grad(a)).clone().reshape(shape) for a, shape in zip(arrays, shapes)]
+        return None, None, None, None, None, None, *grads
+
+
+def render(
+    surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
+    seed: int = 0, shadows: bool = True,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Predicted photographs of the surface, each under its own light, differentiable.
+
+    `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
+    `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
+    samples.
+
+    Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
+    those of shading, of outlines and of edges of cast shadows, for radiance and for coverage; by one backward pass,
+    before the surface is written again, else RuntimeError.
+    """
+    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values())
+
+
+def draw(
+    surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
+    indirect: bool = False,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Like `render`, of the surface as last written, without gradients, in the processor's memory.
+
+    `indirect`: with interreflection. However many pixels and samples, it takes about a gigabyte
+    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take.
+    """
+    parts = []
+    for pixels in photographs.chunks(spp):
+        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, pixels=pixels)
+        dr.eval(channels)
+        parts.append([to_torch(channel) for channel in channels])
+    rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
+    if indirect:
+        rgb = rgb + interreflection(surface, photographs, coverage, seed + 1, width=128, spp=32)
+    return rgb.cpu(), coverage.cpu()
+
+
+def interreflection(
+    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16
+) -> Tensor:
+    """What interreflection adds to pictures of the surface as last written: linear radiance (N, H, W, 3).
+
+    `photographs`: as they were rendered; `coverage` (N, H, W): of that picture, through which alone gradients flow: the
+    outline feels this light too, shape and material do not (they are corrected for it, as in "Shape from
+    Interreflections", Nayar, Ikeuchi and Kanade, IJCV 1991). It varies slowly: it is rendered at most `width` pixels
+    wide (a few good pixels did better than many noisy ones), smoothed, and spread over what the object covers, so that
+    its edges are those of the picture.
+    """
+    factor = -(-max(photographs.size) // width)
+    small = photographs.select(np.array(photographs.index), photographs.size, factor)
+    rgb, alpha = pictures([to_torch(c) for c in render_indirect(surface.scene, small, spp, seed)], small)
+    images = torch.cat([rgb, alpha[..., None]], -1).movedim(-1, 1)
+    images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
+    images = F.interpolate(images, scale_factor=factor, mode="bilinear", align_corners=False)
+    below, right = coverage.shape[1] - images.shape[2], coverage.shape[2] - images.shape[3]
+    images = F.pad(images, (0, right, 0, below), mode="replicate")
+    return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
+
+
+def pictures(channels: list[Tensor], photographs: Photographs) -> tuple[Tensor, Tensor]:
+    """The renderer's four channels (N·H·W,) as pictures ((N, H, W, 3), (N, H, W))."""
+    width, height = photographs.size
+    shape = (len(photographs), height, width)
+    picture = [channel.reshape(shape) for channel in channels]
+    return torch.stack(picture[:3], dim=-1), picture[3].clone()
+
+
+def maps(
+    surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
+) -> dict[str, np.ndarray]:
+    """What the pixels of `photographs` see of the surface as last written, zero where they see none.
+
+    `normal` (N, H, W, 3) in world space, and these BSDF parameters by name, (N, H, W, 3) or (N, H, W).
+    """
+    width, height = photographs.size
+    attributes, parts = {f"vertex_{p.name}": p.channels for p in parameters}, []
+    for pixels in photographs.chunks(1):
+        channels = render_maps(surface.scene, photographs, attributes, pixels)
+        parts.append(np.stack([np.array(c) for c in channels], -1))
+    channels = np.concatenate(parts).reshape(len(photographs), height, width, -1)
+    result, first = {"normal": channels[..., :3]}, 3
+    for p in parameters:
+        result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
+        first += p.channels
+    return result

@@ -1,0 +1,114 @@
+"""Curves in space: samples of outlines, borders and edges of shadows, and those of shapes that are no meshes."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+CURVE_SAMPLES = 256  #: samples per curve of any other shape
+LEAVE = 2.0**-19  #: see `leave`
+#: How far to both sides of an edge one has to look for the jump [px]. Radiance grows like the square root of the
+#: distance to an outline, so that there it must be little; the edge of a shadow is known with less precision.
+ROOT, JUMP = 1e-4, 1e-2
+
+
+def leave(point, distance):
+    """How far from `point` a ray must start so as not to meet the surface that it leaves [scene units].
+
+    In proportion to the rounding error of a point that was found `distance` away from where one looked.
+    """
+    return LEAVE * (dr.max(dr.abs(point)) + distance)
+
+
+@dataclass
+class Curve:
+    """Samples of curves in space, any number per photograph."""
+
+    view: mi.UInt32  #: the photograph
+    point: mi.Point3f  #: attached to what moves the curve
+    tangent: mi.Vector3f  #: detached: the piece of the curve that the sample stands for [scene units]
+    inside: mi.Point3f  #: detached: what the curve bounds lies on this side of it
+    active: mi.Bool
+    offset: float  #: how far to both sides of it one has to look [px]
+    shadow: bool = False  #: is it an edge of light and not of a shape?
+
+
+# Curves of the other shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in
+# [0, 1), and of the eye: a point for w = 1, a direction for w = 0.
+def circle(u, v, t):
+    """A unit circle in the plane of `u` and `v`."""
+    s, c = dr.sincos(2 * dr.pi * t)
+    return u * c + v * s, 2 * dr.pi * (v * c - u * s)
+
+
+def square_border(e, w, t):
+    """Border of [-1, 1]²."""
+    side, along = dr.floor(4 * t), 8 * (t - 0.25 * dr.floor(4 * t)) - 1
+    x = dr.select(side == 0, along, dr.select(side == 1, 1, dr.select(side == 2, -along, -1)))
+    y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
+    dx = dr.select(side == 0, 8, dr.select(side == 2, -8, 0))
+    dy = dr.select(side == 1, 8, dr.select(side == 3, -8, 0))
+    return mi.Point3f(x, y, 0), mi.Vector3f(dx, dy, 0), mi.Point3f(0)
+
+
+def disk_border(e, w, t):
+    """Border of the unit disk."""
+    p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
+    return mi.Point3f(p), dp, mi.Point3f(0)
+
+
+def cylinder_border(e, w, t, z):
+    """Border of the cylinder at its end `z`."""
+    p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
+    return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
+
+
+def sphere_outline(e, w, t):
+    """Points of the unit sphere with p · e = w, where its normal is at right angles to the view."""
+    e2 = dr.squared_norm(e)
+    frame = mi.Frame3f(e * dr.rsqrt(e2))
+    p, dp = circle(frame.s, frame.t, t)
+    r = dr.sqrt(dr.maximum(1 - w * w / e2, 0))
+    return mi.Point3f(e * (w / e2) + r * p), r * dp, mi.Point3f(0)
+
+
+def cylinder_outline(e, w, t, side=1.0):
+    """A line along the cylinder x² + y² = 1, 0 < z < 1, where its normal is at right angles to the view."""
+    e2 = e.x * e.x + e.y * e.y
+    r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
+    p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)
+    return p, mi.Vector3f(0, 0, dr.full(mi.Float, 1, dr.width(t))), mi.Point3f(0, 0, t)
+
+
+CURVES = {
+    "Rectangle": [square_border],
+    "Disk": [disk_border],
+    "Sphere": [sphere_outline],
+    "Cylinder": [
+        lambda e, w, t: cylinder_border(e, w, t, z=0.0),
+        lambda e, w, t: cylinder_border(e, w, t, z=1.0),
+        cylinder_outline,
+        lambda e, w, t: cylinder_outline(e, w, t, side=-1.0),
+    ],
+}
+
+
+def outline_of(shape, eye, views, seed) -> list[Curve]:
+    """The outline and the border of a shape that is no mesh, as `views` eyes see it."""
+    to_world = mi.traverse(shape)["to_world"]
+    curves = []
+    for k, curve in enumerate(CURVES[shape.class_name()]):
+        lane = dr.arange(mi.UInt32, views * CURVE_SAMPLES)
+        view = lane // CURVE_SAMPLES
+        jitter = mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed) + k)
+        t = (mi.Float(lane % CURVE_SAMPLES) + jitter) / CURVE_SAMPLES
+        with dr.suspend_grad():
+            where, finite = eye(view)
+            inverse = dr.detach(to_world).inverse()
+            e = dr.select(finite, mi.Vector3f(inverse @ mi.Point3f(where)), inverse @ where)
+            p, tangent, inside = curve(e, dr.select(finite, mi.Float(1), 0), t)
+            tangent = dr.detach(to_world) @ mi.Vector3f(tangent) / CURVE_SAMPLES
+            inside = dr.detach(to_world) @ inside
+            dr.eval(p, tangent, inside)
+        curves.append(Curve(view, to_world @ p, tangent, inside, dr.isfinite(p.x), ROOT))
+    return curves

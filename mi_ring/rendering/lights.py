@@ -1,0 +1,125 @@
+"""The lights of photographs, point lights and directional ones: one as numbers, those of many as Dr.Jit buffers."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.errors import SceneError
+
+FAR = 1e9  #: distance of a directional light [scene units]
+
+
+class Light(NamedTuple):
+    """The light of one photograph, in the world."""
+
+    kind: Literal["point", "directional"]
+    vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
+    rgb: np.ndarray  #: (3,) intensity [W/sr], or irradiance [W/m²]
+
+
+@dataclass(frozen=True)
+class Lights:
+    """The lights of N photographs, as Dr.Jit buffers that may be attached; and what numpy asks of them."""
+
+    places: object  #: Float, 3 per light: position [scene units], or unit direction toward a distant one
+    finite: object  #: Bool: a point light? Else it is distant
+    strengths: object  #: Float, 3 per light: intensity [W/sr], or irradiance [W/m²]
+
+    @classmethod
+    def of(cls, sensors: Sequence) -> "Lights":
+        """The nested lights of `photograph` sensors. Raises SceneError for one that is none or not positive."""
+        # By way of numpy: Dr.Jit would compile a kernel for each number of photographs.
+        columns = [[np.ravel(part) for part in parts_of(sensor)] for sensor in sensors]
+        places, finite, strengths = (np.concatenate(column) for column in zip(*columns))
+        return cls(mi.Float(places), mi.Bool(finite), mi.Float(strengths))
+
+    @classmethod
+    def attached(cls, sensor) -> "Lights":
+        """The light of one photograph, attached to the sensor's parameters."""
+        place, finite, strength = parts_of(sensor)
+        return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength)))
+
+    def eye(self, k):
+        """Light `k`, one per lane, as an eye of `Edges`: (where, is that a point and not a direction?)."""
+        return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
+
+    def sample(self, k, si):
+        """(DirectionSample3f, radiance · d⁻²) of light `k`, one per lane, at surface interactions `si`."""
+        where, finite = self.eye(k)
+        strength = dr.gather(mi.Color3f, self.strengths, k)
+        ds = dr.zeros(mi.DirectionSample3f)
+        to_light = dr.select(finite, where - si.p, where)
+        distance2 = dr.squared_norm(to_light)
+        ds.d = to_light * dr.rsqrt(distance2)
+        ds.dist = dr.select(finite, dr.sqrt(distance2), FAR)
+        ds.p = si.p + ds.d * ds.dist
+        return ds, strength * dr.select(finite, dr.rcp(distance2), 1)
+
+    def __len__(self) -> int:
+        return dr.width(self.finite)
+
+    def __getitem__(self, k: int) -> Light:
+        place, rgb = self.positions()[k], self.rgb()[k]
+        return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
+
+    def is_finite(self) -> np.ndarray:
+        """Which are point lights, (N,) bool."""
+        return np.array(self.finite)
+
+    def positions(self) -> np.ndarray:
+        """(N, 3) positions [scene units]; of distant lights the unit directions toward them."""
+        return np.array(self.places).reshape(-1, 3).astype(float)
+
+    def rgb(self) -> np.ndarray:
+        """(N, 3) intensities [W/sr], of distant lights irradiances [W/m²]."""
+        return np.array(self.strengths).reshape(-1, 3).astype(float)
+
+    def toward(self, point: np.ndarray) -> np.ndarray:
+        """(N, 3) from a point (3,) to the lights [scene units]; of distant ones the unit directions."""
+        places = self.positions()
+        return np.where(self.is_finite()[:, None], places - point, places)
+
+    def distances(self, point: np.ndarray) -> np.ndarray:
+        """(N,) from a point (3,) [scene units]; infinite for distant lights."""
+        return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
+
+    def irradiance(self, point: np.ndarray) -> np.ndarray:
+        """(N, 3) what each light brings to a point (3,), on a surface that faces it: equation 2's intensity / d²."""
+        distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
+        return self.rgb() / distance2[:, None]
+
+
+def place_of(emitter):
+    """Where a lamp is, attached: (Vector3f, True), or (direction toward it, False) if it is infinitely far away.
+
+    None for lamps that are neither: area lights, environment maps.
+    """
+    params = mi.traverse(emitter)
+    match emitter.class_name():
+        case "PointLight":
+            return mi.Vector3f(params["position"]), True
+        case "SpotLight":
+            m = params["to_world"].matrix
+            return mi.Vector3f(m[0, 3], m[1, 3], m[2, 3]), True
+        case "DirectionalEmitter":
+            m = params["to_world"].matrix
+            return -mi.Vector3f(m[0, 2], m[1, 2], m[2, 2]), False
+
+
+def parts_of(sensor):
+    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength)."""
+    light = sensor.light
+    kind = light.class_name()
+    if kind not in ("PointLight", "DirectionalEmitter"):
+        raise SceneError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
+    where, finite = place_of(light)
+    strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
+    if not (dr.all(dr.isfinite(strength) & (strength >= 0)) and dr.any(strength > 0)):
+        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
+    if not dr.all(dr.isfinite(where)):
+        raise SceneError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
+    return where, finite, strength

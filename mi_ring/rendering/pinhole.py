@@ -1,0 +1,39 @@
+"""Pinhole cameras in Dr.Jit: rays through pixels and back."""
+
+import drjit as dr
+import mitsuba as mi
+
+
+def camera_ray(to_world, focal, centre, pixel):
+    """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
+
+    `to_world`: Matrix4f camera-to-world; `focal`, `centre`: Point2f (fx, fy), (cx, cy) [px]; `pixel`: Point2f [px],
+    x right, y down. Arguments may hold one camera or one camera per lane. Returns (origin, unit direction).
+    """
+    x, y = (pixel.x - centre.x) / focal.x, (pixel.y - centre.y) / focal.y
+    m = to_world
+    direction = mi.Vector3f(
+        -m[0, 0] * x - m[0, 1] * y + m[0, 2],
+        -m[1, 0] * x - m[1, 1] * y + m[1, 2],
+        -m[2, 0] * x - m[2, 1] * y + m[2, 2],
+    )
+    return mi.Point3f(m[0, 3], m[1, 3], m[2, 3]), dr.normalize(direction)
+
+
+def camera_coordinates(to_world, vector):
+    """A direction in the world in the axes of a camera: the inverse of the upper left 3 × 3 of `to_world`."""
+    # Not its transpose, though it is a rotation: its entries are differentiated one by one.
+    return dr.rcp(mi.Matrix3f([[to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
+
+
+def project(to_world, focal, centre, point):
+    """The inverse of `camera_ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point."""
+    x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
+    return mi.Point2f(centre.x - focal.x * x / z, centre.y - focal.y * y / z), z
+
+
+def project_tangent(to_world, focal, point, tangent):
+    """Pixels that a point moves in the picture for a step `tangent` in the world: the derivative of `project`."""
+    x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
+    dx, dy, dz = camera_coordinates(to_world, tangent)
+    return mi.Vector2f(focal.x * (x * dz - dx * z), focal.y * (y * dz - dy * z)) / (z * z)

@@ -1,0 +1,24 @@
+"""Meshes of Mitsuba's own kind."""
+
+import mitsuba as mi
+import numpy as np
+
+# Mitsuba's names of mesh parameters; 3.10 renames them.
+POSITIONS, FACES = "vertex_positions", "faces"
+
+
+def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
+    """A plain mesh of vertices (V, 3) and faces (F, 3), perhaps with smooth normals and texture coordinates (V, 2)."""
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
+    params = mi.traverse(mesh)
+    params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())
+    params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+    if uv is not None:
+        params["vertex_texcoords"] = mi.Float(np.asarray(uv, np.float32).ravel())
+    params.update()
+    return mesh
+
+
+def scene_of(vertices, faces) -> mi.Scene:
+    """A scene that holds this mesh alone, with smooth normals."""
+    return mi.load_dict({"type": "scene", "mesh": mesh_of(vertices, faces)})

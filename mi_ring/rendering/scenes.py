@@ -1,0 +1,16 @@
+"""Mitsuba scenes, put together anew of the parts of another."""
+
+import mitsuba as mi
+
+
+def own_emitters(scene) -> list:
+    """The emitters of a scene that are no part of its shapes, and so do not come along with them."""
+    of_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
+    return [emitter for emitter in scene.emitters() if emitter not in of_shapes]
+
+
+def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
+    """A scene of these objects. Meshes keep their names and are not merged."""
+    parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
+    scene = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
+    return mi.load_dict(scene, optimize=False, parallel=False)

@@ -1,0 +1,64 @@
+"""Direct light: what a surface reflects toward the viewer (equation 2 of the paper)."""
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_ring.rendering.curves import leave
+
+MIN_COSINE = 1e-3  #: grazing cosines are clamped here: see `CookTorrance`
+
+
+def shade(scene, si, light, next_2d, shadows):
+    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²)."""
+    context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
+    # At an outline interpolated normals turn away before the faces do. Black there would be an edge of its own.
+    rim = (si.wi.z < MIN_COSINE) & (dr.dot(si.wi, si.to_local(si.n)) > 0)
+    si.wi = dr.normalize(mi.Vector3f(si.wi.x, si.wi.y, dr.select(rim, MIN_COSINE, si.wi.z)))
+
+    def reflected(ds, weight, shadows):
+        lit = active & dr.any(weight != 0)
+        if shadows:
+            lit &= sees(scene, si, ds, lit)
+        value = bsdf.eval(context, si, si.to_local(ds.d), lit)
+        return dr.select(lit, value * weight, 0)
+
+    radiance = reflected(*light(si), shadows)
+    for emitter in lamps(scene):
+        radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
+        if emitter.is_environment():
+            radiance += dr.select(active, 0, emitter.eval(si, ~active))
+    return radiance
+
+
+def lamps(scene) -> list:
+    """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own."""
+    return [emitter for emitter in scene.emitters() if not getattr(emitter, "of_photographs", False)]
+
+
+def sees(scene, si, ds, active=True):
+    """Does the surface at `si` see the light at `ds`?"""
+    n, d = dr.detach(si.n), dr.detach(ds.d)
+    origin = dr.detach(si.p) + n * dr.mulsign(leave(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
+    to_light = dr.detach(ds.p) - origin
+    distance = dr.norm(to_light)
+    # Short of the light, which may be a surface
+    ray = mi.Ray3f(origin, to_light / distance, (1 - 2.0**-10) * distance, si.time, si.wavelengths)
+    return ~scene.ray_test(ray, active)
+
+
+def next_2d(seed, lanes, stream=None):
+    """A source of 2-D samples: independent streams, the lane's own or the one that `stream` (UInt32) says."""
+    # Hashed as in Mitsuba's samplers: neighbouring streams would otherwise resemble each other.
+    stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
+    rng = mi.PCG32(lanes, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream))
+    return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
+
+
+def trace(scene, ray, view, photographs, shadows, next_2d):
+    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph."""
+    shadows = shadows and not photographs.colocated
+    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    dr.eval(hit)  # one traversal serves the image and its gradient
+    si = hit.compute_surface_interaction(ray)
+    radiance = shade(scene, si, lambda si: photographs.light(view, si), next_2d, shadows)
+    return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]

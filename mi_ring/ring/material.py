@@ -1,0 +1,99 @@
+"""Fitted materials: exchanged between objects, and edited."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor, nn
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.domain import Sphere
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import load_fit
+
+SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")  #: Mitsuba's names
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOptions:
+    """Another material for the object."""
+
+    material: Path | None = None
+    """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain."""
+    specular_scale: float = 1.0
+    """Factor of the specular reflectance."""
+    roughness_add: float = 0.0
+    """Is added to the roughness."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors of red, green and blue."""
+
+
+def dress(ring: Ring, options: MaterialOptions) -> None:
+    """Give a ring the material that the options ask for. Raises InputError if it cannot have it."""
+    if options.material:
+        other = load_fit(options.material)
+        if not same_domain(ring, other):
+            own = "another" if about(ring) == about(other) else about(ring)
+            raise InputError(f"{options.material}: --material: was fitted from {about(other)}, the shape from {own}; a "
+                             "material is a function on where the fit started: fit both with the same --domain, "
+                             "sphere or mesh FILE")  # fmt: skip
+        ring.brdf_net, ring.bsdf = other.brdf_net, other.bsdf
+        ring.indirect = ring.indirect and other.indirect
+    gains, offsets = {}, {}
+    if options.specular_scale != 1:
+        at_least_0("--specular-scale", options.specular_scale)
+        gains = dict.fromkeys(named(ring, "--specular-scale", SPECULAR), options.specular_scale)
+    if options.tint != (1, 1, 1):
+        at_least_0("--tint", options.tint)
+        for name in named(ring, "--tint", [p.name for p in ring.brdf_net.bsdf_parameters if p.channels == 3]):
+            gains[name] = np.multiply(gains.get(name, 1.0), options.tint)
+    if options.roughness_add != 0:
+        if not np.isfinite(options.roughness_add):
+            raise InputError(f"--roughness-add: is {options.roughness_add}, must be a number")
+        offsets = dict.fromkeys(named(ring, "--roughness-add", ROUGHNESS), options.roughness_add)
+    if gains or offsets:
+        ring.brdf_net = Edited(ring.brdf_net, gains, offsets)
+
+
+def at_least_0(option: str, value) -> None:
+    """Raise InputError for a factor, or one of several, that is negative or not finite."""
+    if not (np.isfinite(value).all() and np.min(value) >= 0):
+        raise InputError(f"{option}: is {value}, must be 0 or more")
+
+
+def named(ring: Ring, option: str, names) -> list[str]:
+    """Which of these parameters the material has. Raises InputError if none."""
+    parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
+    found = [name for name in parameters if name in names]
+    if not found:
+        raise InputError(f"{option}: this material has no such parameter; it has {', '.join(parameters)}")
+    return found
+
+
+def same_domain(a: Ring, b: Ring) -> bool:
+    """Are two rings functions on the same surface?"""
+    if isinstance(a.domain, Sphere) or isinstance(b.domain, Sphere):
+        return type(a.domain) is type(b.domain)
+    return np.array_equal(a.domain.points, b.domain.points) and np.array_equal(a.domain.faces, b.domain.faces)
+
+
+def about(ring: Ring) -> str:
+    """The domain of a ring, for messages."""
+    return "a sphere" if isinstance(ring.domain, Sphere) else f"a mesh of {len(ring.domain.points):,} vertices"
+
+
+class Edited(nn.Module):
+    """A BRDF-Net with gains and offsets, by the names of its parameters, kept within the parameters' ranges."""
+
+    def __init__(self, net, gains: dict, offsets: dict):
+        super().__init__()
+        self.net, self.gains, self.offsets = net, gains, offsets
+        self.bsdf_parameters, self.scale = net.bsdf_parameters, net.scale
+
+    def forward(self, s: Tensor) -> dict[str, Tensor]:
+        values = self.net(s)
+        for p in self.bsdf_parameters:
+            gain = values[p.name].new_tensor(self.gains.get(p.name, 1.0))
+            value = gain * values[p.name] + self.offsets.get(p.name, 0.0)
+            values[p.name] = value.clamp(p.low, p.high)
+        return values

@@ -1,0 +1,38 @@
+"""The ring: both networks, the domain and the normalisation, which together are a reconstructed object."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets.brdfnet import COOK_TORRANCE, BRDFNet, Parameter
+from mi_ring.nets.shapenet import ShapeNet
+
+
+class Ring(nn.Module):
+    """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
+
+    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
+    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
+    sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
+    paper's, which have `steps`, `scale` and `parameters`; as `mi_ring.nets.shapenet.Flow` and
+    `mi_ring.nets.brdfnet.ReflectanceMap` say.
+    """
+
+    def __init__(
+        self, center: Sequence[float] | Tensor, radius: float, scale: float = 1.0, domain: Domain | None = None,
+        parameters: Sequence[Parameter] = COOK_TORRANCE, bsdf: str = '<bsdf type="cooktorrance"/>',
+        indirect: bool = False, steps: int = 20, subdivisions: int = 6,
+        networks: tuple[nn.Module, nn.Module] | None = None,
+    ):  # fmt: skip
+        super().__init__()
+        self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
+        self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions
+        self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
+        self.register_buffer("radius", torch.tensor(float(radius)))
+        self.domain = domain or Sphere()
+
+    def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
+        """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""
+        return self.center + self.radius * self.shape_net(s, time)

@@ -1,0 +1,86 @@
+"""`ring.pt`: a reconstructed object as a file, its networks by their registered names."""
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import torch
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets.registry import architecture_of, build
+from mi_ring.ring.ring import Ring
+from mi_ring.version import __version__
+
+FORMAT = 4  #: version of the file
+ADVICE = "give the results folder of a fit, or its ring.pt"
+
+
+def ring_state(ring: Ring, config: dict | None = None) -> dict:
+    """What `ring.pt` holds, to be written by `torch.save`. Raises ValueError for networks that are not registered."""
+    domain = None
+    if not isinstance(ring.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
+        domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
+    return {
+        "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
+        "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
+        "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
+    }  # fmt: skip
+
+
+def ring_of(state: dict) -> Ring:
+    """The inverse of `ring_state`. Raises InputError for networks that are not registered here."""
+    domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
+    ring = Ring(
+        torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
+        subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
+    )  # fmt: skip
+    ring.load_state_dict(state["networks"])
+    return ring
+
+
+def migrated(state: dict) -> dict:
+    """The state of a file of format 3, which mi_ring 0.1 wrote, as of today."""
+    return state | {
+        "format": FORMAT, "shape_net": {"name": "shapenet", "arguments": {"steps": state["steps"]}},
+        "brdf_net": {"name": "brdfnet", "arguments": {"parameters": state["parameters"]}},
+        "subdivisions": state["config"].get("subdivisions", 6),
+    }  # fmt: skip
+
+
+def read_state(path: Path, advice: str) -> dict:
+    """What `torch.save` wrote. Raises InputError if there is no such file, or if it is of another kind."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+    except (RuntimeError, pickle.UnpicklingError, EOFError, zipfile.BadZipFile, ValueError) as error:
+        raise InputError(f"{path}: not written by mi_ring ({str(error).splitlines()[0]}); {advice}") from error
+    if not isinstance(state, dict):
+        raise InputError(f"{path}: not written by mi_ring (holds a {type(state).__name__}); {advice}")
+    return state
+
+
+def load_fit(path: str | Path) -> Ring:
+    """The object of a fit: from its results folder, or from a `ring.pt`.
+
+    Raises InputError if there is none, if it was written by a newer mi_ring or by one that is too old, and if its
+    networks are not registered here.
+    """
+    path = Path(path)
+    path = path / "ring.pt" if path.is_dir() else path
+    state = read_state(path, ADVICE)
+    if "format" not in state or "networks" not in state:
+        raise InputError(f"{path}: not a saved fit; {ADVICE}")
+    version = state["format"]
+    if version not in (3, FORMAT):
+        raise InputError(f"{path}: format version {version}, of mi_ring {state.get('mi_ring', '0.1 or older')}; this "
+                         f"one, {__version__}, reads versions 3 and {FORMAT}")  # fmt: skip
+    try:
+        return ring_of(migrated(state) if version == 3 else state)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: damaged, or of other networks than it says ({str(error).splitlines()[0]})") from error

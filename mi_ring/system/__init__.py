@@ -1,0 +1,4 @@
+"""The machine that all runs on: LLVM, threads, whole files, the command line.
+
+May import: mitsuba, drjit, torch, tyro, filelock.
+"""

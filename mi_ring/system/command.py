@@ -1,0 +1,95 @@
+"""What all commands share: arguments from a dataclass, one line for a user's mistake."""
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import tyro
+
+from mi_ring.errors import InputError
+
+
+def parse(
+    config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP,
+    description: str | None = None,
+):  # fmt: skip
+    """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood.
+
+    The help begins with `description`, by default the docstring of the dataclass.
+    """
+    for word in (*arguments, os.getcwd()):
+        require_utf8(word)
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(complaint_in(box.getvalue())) from None
+
+
+def require_utf8(name: str) -> None:
+    """Raise InputError for a file's name that is not UTF-8: it may be any bytes."""
+    shown = os.fsencode(name).decode(errors="replace")
+    if shown != name:
+        raise InputError(f"{shown}: this name is not UTF-8, which Mitsuba and XML need; rename it")
+
+
+def complaint_in(box: str) -> str:
+    """The complaint, in one line, of the box that tyro draws: a title, the complaint, rules and advice between them.
+
+    Of the advice, which options are spelled alike is kept.
+    """
+    parts = [[]]
+    for line in (line.strip("│ ") for line in box.splitlines() if line.startswith("│")):
+        if set(line) == {"─"}:
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
+    complaint = " ".join(parts[0]) or " ".join(box.split())
+    union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
+    if union:  # of kinds of values; why each is not meant is of no interest
+        kinds = re.sub("[{}]", "", union[2].replace("{None}|", "")).replace(",", "|")
+        complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), kinds)
+    for kind, error in (
+        ("whole number", r"invalid literal for int\(\) .*"),
+        ("number", "could not convert string to float"),
+    ):
+        complaint = re.sub(rf"^Error parsing (\S+): {error}: '(.*)'", rf"\1: is \2; must be a {kind}", complaint)
+    complaint = re.sub(r"^Error parsing \w+: (?=--)", "", complaint)  # by the dataclass itself
+    return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
+
+
+def scene_name(scene: Path) -> str:
+    """The name of a scene: that of the file, or of its folder where the file is just called scene.xml."""
+    return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
+
+
+def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit: status 2 and one line on standard error for anything the user can mend.
+
+    With `--traceback` among the arguments the whole way to the error is shown instead.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    traceback = "--traceback" in arguments
+    arguments = [argument for argument in arguments if argument != "--traceback"]
+    try:
+        sys.exit(main(arguments) or 0)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # `mi-ring … | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except (InputError, OSError) as error:
+        # A file that may not be read, a folder that is gone; other errors of the system are nobody's mistake but ours.
+        if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
+            raise
+        message = error if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
+        print(f"{program}: {message}", file=sys.stderr)
+        sys.exit(2)

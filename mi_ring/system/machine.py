@@ -1,0 +1,127 @@
+"""The machine that a fit runs on: variant, cores, threads, precision, memory."""
+
+import contextlib
+import ctypes
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import torch
+
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
+
+
+def device() -> torch.device:
+    """Where torch must keep its tensors: where the current variant of Mitsuba computes. Nothing is copied then."""
+    return torch.device("cuda" if mi.variant().startswith("cuda") else "cpu")
+
+
+def has_fast_bfloat16(device: torch.device) -> bool:
+    """Are matrix products faster in bfloat16 than in float32? Most processors emulate it.
+
+    Asked of what the processor can do, not measured: a fit that is repeated must not depend on a measurement.
+    """
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    # With AVX512-BF16 alone it is half as fast as float32. PyTorch can be told to do without what there is.
+    told = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+    return told and torch.cpu._is_amx_tile_supported()
+
+
+def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
+    """A context in which the networks' matrix products have this precision, `auto` the faster one."""
+    if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
+        return lambda: torch.autocast(device.type, torch.bfloat16)
+    return contextlib.nullcontext
+
+
+def set_variant(variant: str) -> str:
+    """Switch Mitsuba to a variant and return its name: that of the processor, where there is no GPU to use."""
+    reason = None
+    if variant.startswith("cuda"):
+        if not torch.cuda.is_available():
+            reason = "PyTorch finds none" if torch.version.cuda else "this PyTorch is built without CUDA"
+        elif not dr.has_backend(dr.JitBackend.CUDA):
+            reason = "Dr.Jit finds none, or its driver is too old"
+        else:
+            mi.set_variant(variant)
+            try:
+                mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})  # the first scene loads OptiX
+            except RuntimeError as error:
+                reason = " ".join(str(error).split())
+    if reason:
+        print(f"--variant {variant}: no GPU to use ({reason}); going on with llvm_ad_rgb, on the processor")
+        variant = "llvm_ad_rgb"
+    mi.set_variant(variant)
+    return variant
+
+
+def cores() -> int:
+    """Of the processor, those that this process may use: by its affinity, and by the quota of its container."""
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux
+    count = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return max(1, min(count, math.ceil(quota(Path("/sys/fs/cgroup")))))
+
+
+def quota(root: Path) -> float:
+    """The processor time per time that control groups allow this process; infinite without a limit.
+
+    Of groups above its own, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
+    """
+    limit = math.inf
+    with contextlib.suppress(OSError):
+        groups = Path("/proc/self/cgroup").read_text().splitlines()
+        own = next((line.split(":", 2)[2] for line in groups if line.startswith("0::")), "/")  # version 2
+        folder = root / own.lstrip("/")
+        for group in (folder, *folder.parents):
+            limit = min(limit, share_of(group / "cpu.max"))
+            if group == root:
+                break
+    for name in ("cpu", "cpu,cpuacct"):  # version 1
+        with contextlib.suppress(OSError, ValueError):
+            time = int((root / name / "cpu.cfs_quota_us").read_text())
+            if time > 0:
+                limit = min(limit, time / int((root / name / "cpu.cfs_period_us").read_text()))
+    return limit
+
+
+def share_of(file: Path) -> float:
+    """What a `cpu.max` allows; infinite if it says so or is not there."""
+    try:
+        time, period = file.read_text().split()
+        return math.inf if time == "max" else int(time) / int(period)
+    except (OSError, ValueError):
+        return math.inf
+
+
+@contextlib.contextmanager
+def threads_of(count: int = 0) -> Iterator[None]:
+    """So many threads of torch and Dr.Jit, by default all `cores`, and those of before at the end.
+
+    Parallel sums depend on the order in which threads finish: one thread is what determinism costs. Not for reading: on
+    one, Mitsuba waits forever for an EXR.
+    """
+    before = torch.get_num_threads(), dr.thread_count()
+    torch.set_num_threads(count or cores())
+    dr.set_thread_count(count or cores())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        dr.set_thread_count(before[1])
+
+
+def keep_memory() -> None:
+    """Have glibc keep freed memory, for the rest of the process.
+
+    The system takes longer to hand out and clear pages than most operations take to use them.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt  # glibc alone has it
+    except (AttributeError, TypeError, OSError):  # macOS, musl; Windows
+        return
+    mallopt(M_MMAP_MAX, 0)
+    mallopt(M_TRIM_THRESHOLD, 2**31 - 1)

@@ -1,0 +1,3 @@
+"""The version of the package, stamped into `ring.pt` and the report."""
+
+__version__ = "0.2.0"
