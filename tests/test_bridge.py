@@ -10,8 +10,9 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring.rendering import bridge
+from mi_ring.rendering import bridge, photographs
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.ring.ring import Ring
 
 WIDTH, HEIGHT, COUNT = 35, 25, 2  # [px], photographs
 CENTER = np.array([0.3, -0.2, 0.15])
@@ -255,3 +256,59 @@ def test_nothing_is_compiled_and_nothing_kept_after_the_first_iterations():
     before = resident()
     assert iterate(30) == 0
     assert resident() - before < 8e6
+
+
+def test_a_second_backward_pass_of_a_picture_is_refused():
+    """Dr.Jit's graph is used up by the first: the second would return the first gradient, whatever it was asked for."""
+    setting = Setting(OFF_CAMERA, shadows=True)
+    vertices = setting.vertices.clone().requires_grad_()
+    rgb, _ = bridge.render(setting.surface, setting.photographs, vertices, setting.material, spp=1)
+    loss = rgb.sum()
+    loss.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="a second time; render it again"):
+        loss.backward()
+
+
+def test_vertices_that_do_not_go_with_the_triangles_are_refused():
+    """Mitsuba would read beyond the end of them."""
+    setting = Setting(OFF_CAMERA, shadows=True)
+    for vertices, material, words in (
+        (setting.vertices[:-1], setting.material, r"vertices: of shape \(641, 3\), but the triangles need \(642, 3\)"),
+        (setting.vertices, setting.material | {"specular": tensor(np.ones(7))}, r"attribute specular: of shape \(7,\)"),
+        (setting.vertices, setting.material | {"diffuse": tensor(np.ones((642, 5)))}, "attribute diffuse"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            bridge.render(setting.surface, setting.photographs, vertices, material)
+
+
+def test_pictures_in_chunks_are_those_in_one(monkeypatch):
+    """Bit for bit, however the pixels of several photographs are shared out."""
+    setting = Setting(OFF_CAMERA, shadows=True)
+    setting.surface.write(setting.vertices, setting.material)
+    one = [*bridge.draw(setting.surface, setting.photographs, spp=6, seed=3)]
+    one.append(bridge.maps(setting.surface, setting.photographs))
+    launched, genuine = [], bridge.render_photographs
+    monkeypatch.setattr(bridge, "render_photographs", lambda *a, **k: launched.append(k["pixels"]) or genuine(*a, **k))
+    monkeypatch.setattr(photographs, "LANES", 6 * 400 + 5)
+    rgb, coverage = bridge.draw(setting.surface, setting.photographs, spp=6, seed=3)
+    assert launched == [(0, 400), (400, 800), (800, 1200), (1200, 1600), (1600, 2 * WIDTH * HEIGHT)]
+    assert torch.equal(rgb, one[0]) and torch.equal(coverage, one[1]) and rgb.max() > 0
+    monkeypatch.setattr(photographs, "LANES", 400)
+    again = bridge.maps(setting.surface, setting.photographs)
+    assert all(np.array_equal(again[name], values) for name, values in one[2].items())
+
+
+def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
+    """It has a scene of its own, with all that is in the other, sensors included."""
+    setting = Setting(OFF_CAMERA, shadows=True, wall=True)
+    shape = setting.surface.shape
+    before, bsdf = np.array(shape.vertex_positions_buffer()), shape.bsdf()
+    ring = Ring([0.3, -0.2, 0.15], 0.8, scale=0.2)
+    surface = bridge.Surface(setting.scene, shape, ring)
+    surface.show(ring, *ring.domain.sample(2))
+    assert np.array_equal(np.array(shape.vertex_positions_buffer()), before) and shape.bsdf() is bsdf
+    assert [s.id() for s in surface.scene.shapes()] == [s.id() for s in setting.scene.shapes()]
+    assert len(surface.scene.sensors()) == len(setting.scene.sensors()) == 2
+    ours, theirs = (np.array(mi.render(scene, sensor=1, integrator=mi.load_dict({"type": "direct"}), spp=4))
+                    for scene in (surface.scene, setting.scene))  # fmt: skip
+    assert np.abs(ours - theirs).max() > 0.1 and ours.max() > 0.1  # another ball, lit by the same light

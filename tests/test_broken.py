@@ -11,8 +11,9 @@ import trimesh
 
 from mi_ring import fit
 from mi_ring.errors import InputError
+from mi_ring.fitting import session
 from mi_ring.output import results
-from mi_ring.system import command, files, machine
+from mi_ring.system import command, files
 
 
 def xml(pattern, new, count=1):
@@ -209,12 +210,28 @@ def test_a_folder_that_cannot_be_written(out, broken_capture, capsys):
     assert status == 2 and complaint.count("\n") == 1 and out in complaint and "--out" in complaint
 
 
+@pytest.fixture
+def full_disk(monkeypatch):
+    """A function that has a file of this name meet a full disk when it is written the n-th time, and any later time."""
+    genuine, written = files.partial_path, []
+
+    def meets(name, nth=1):
+        def partial(path):
+            place = genuine(path)
+            written.append(path.name)
+            if path.name == name and written.count(name) >= nth:
+                os.symlink("/dev/full", place)
+            return place
+
+        monkeypatch.setattr(files, "partial_path", partial)
+
+    return meets
+
+
 @pytest.mark.parametrize("file", ["config.json", "checkpoint.pt", "ring.pt", "mesh.ply", "report.html"])
-def test_a_full_disk(file, small_capture, tmp_path, capsys):
-    """Every write of `file` meets a full disk, by way of a link to /dev/full."""
+def test_a_full_disk(file, small_capture, tmp_path, capsys, full_disk):
     out = tmp_path / "out"
-    out.mkdir()
-    os.symlink("/dev/full", out / f".{file}.partial")
+    full_disk(file)
     quick = ["--iterations", 5, "--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2]
     status, complaint = run([small_capture, "--out", out, *quick], capsys)
     assert status == 2, complaint
@@ -229,21 +246,13 @@ def test_a_log_that_cannot_be_continued(tmp_path):
         results.log(tmp_path, {"iteration": 5})
 
 
-def test_after_a_full_disk_the_fit_goes_on(small_capture, tmp_path, monkeypatch, capsys):
+def test_after_a_full_disk_the_fit_goes_on(small_capture, tmp_path, monkeypatch, capsys, full_disk):
     out, quick = tmp_path / "out", ["--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2]
-    monkeypatch.setattr(machine, "CHECKPOINT_SECONDS", 0)
-    save, saved = files.write_state, []
-
-    def sometimes(state, path):
-        if len(saved) == 3:
-            os.symlink("/dev/full", path.with_name(f".{path.name}.partial"))
-        saved.append(path)
-        save(state, path)
-
-    monkeypatch.setattr(results, "save", sometimes)
+    monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
+    full_disk("checkpoint.pt", nth=4)
     status, complaint = run([small_capture, "--out", out, "--iterations", 6, *quick], capsys)
     assert status == 2 and "checkpoint.pt: cannot be written" in complaint.splitlines()[-1]
-    monkeypatch.setattr(results, "save", save)
+    monkeypatch.undo()
     status, _ = run([small_capture, "--out", out, "--iterations", 6, *quick, "--resume"], capsys)
     assert status == 0
     assert results.read_log(out)[-1]["iteration"] == 6

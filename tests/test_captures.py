@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from mi_ring import evaluate, fit, render
-from mi_ring.capture import capture, loading
+from mi_ring.capture import loading
 from mi_ring.metrics import evaluation, surfaces
 from mi_ring.system.command import run
 

@@ -84,7 +84,7 @@ def test_principal_points_off_by_half_a_pixel(broken_capture, tmp_path, capsys):
 @pytest.mark.parametrize("scale", [1, 4])
 @pytest.mark.parametrize(("shift", "words"), [(-0.5, "add 0.5 to"), (0.5, "subtract 0.5 from"), (0.0, None)])
 def test_half_a_pixel_either_way(shift, words, scale):
-    views = [s._replace(centre=s.centre + shift) for s in silhouettes(ball(4.0), 12, scale)]
+    views = [mask_agreement.with_camera(s, centre=s.camera.centre + shift) for s in silhouettes(ball(4.0), 12, scale)]
     found = mask_agreement.half_pixel(hull.Hull(views, "scene.xml"))
     assert words in found if words else found is None
 

@@ -155,11 +155,11 @@ def test_transforms_of_nerf(tmp_path):
     calibration = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
     for sensor, (R, t) in zip(scene.sensors, cameras()):
         np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
-    lights = np.array(scene.photographs.lights).reshape(-1, 8)
+    lights = scene.photographs.lights
     R, t = list(cameras())[2]
-    np.testing.assert_allclose(lights[:, :3], [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
-    np.testing.assert_allclose(lights[:, 4:7], [[4, 5, 6], [1, 1, 1], [7, 7, 7]], rtol=1e-6)
-    rgb, _, mask, masked = scene.observe([1])
+    np.testing.assert_allclose(lights.positions(), [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
+    np.testing.assert_allclose(lights.rgb(), [[4, 5, 6], [1, 1, 1], [7, 7, 7]], rtol=1e-6)
+    rgb, _, mask, masked, _ = scene.observe([1])
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
     assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
@@ -306,12 +306,12 @@ def test_colmap(colmap, tmp_path, model):
     offset = [0.3, -0.4, 0.1]
     scene = converted("colmap", colmap / model, tmp_path / "scan.xml", "--masks", colmap / "masks",
                       "--flash-offset", *offset, "--copy")  # fmt: skip
-    lights = np.array(scene.photographs.lights).reshape(-1, 8)
-    for sensor, light, (R, t) in zip(scene.sensors, lights, cameras()):
+    lights = scene.photographs.lights
+    for sensor, place, (R, t) in zip(scene.sensors, lights.positions(), cameras()):
         np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
-        np.testing.assert_allclose(light[:3], R.T @ (offset - t), rtol=1e-4)
+        np.testing.assert_allclose(place, R.T @ (offset - t), rtol=1e-4)
     # exposure time · ISO: 1/50 · 100, 1/100 · 400, 1/150 · 900; brought to the median
-    np.testing.assert_allclose(lights[:, 4], [0.5, 1.0, 1.5], rtol=1e-5)
+    np.testing.assert_allclose(lights.rgb()[:, 0], [0.5, 1.0, 1.5], rtol=1e-5)
     assert (tmp_path / "scan/images/sub_1.jpg").read_bytes() == (colmap / "images/sub/1.jpg").read_bytes()
     assert (scene.masks[2] == disc()[..., 0]).all()
 
@@ -319,9 +319,9 @@ def test_colmap(colmap, tmp_path, model):
 def test_colmap_without_masks_and_exif(colmap, tmp_path):
     scene = converted("colmap", colmap, tmp_path / "scan.xml", "--no-exif")
     assert scene.masks == [None] * 3
-    lights = np.array(scene.photographs.lights).reshape(-1, 8)
-    np.testing.assert_allclose(lights[:, 4:7], 1)
-    np.testing.assert_allclose(lights[:, :3], [-R.T @ t for R, t in cameras()], rtol=1e-4)
+    lights = scene.photographs.lights
+    np.testing.assert_allclose(lights.rgb(), 1)
+    np.testing.assert_allclose(lights.positions(), [-R.T @ t for R, t in cameras()], rtol=1e-4)
 
 
 # NeuS, IDR, WildLight
@@ -352,8 +352,8 @@ def test_wildlight(tmp_path):
     energies = {"light_energy_0": [2.0, 3.0, 4.0], "light_energy_1": [0.0, 0, 0], "light_energy_2": [1.0, 1.0, 1.0]}
     scene = converted("neus", neus(tmp_path / "wild", max_intensity=0.9, **energies), tmp_path / "wild.xml")
     assert [s.id() for s in scene.sensors] == ["000", "002"]
-    lights = np.array(scene.photographs.lights).reshape(-1, 8)
-    np.testing.assert_allclose(lights[:, 4:7], 36 * np.array([[2, 3, 4], [1, 1, 1]]), rtol=1e-6)
+    lights = scene.photographs.lights
+    np.testing.assert_allclose(lights.rgb(), 36 * np.array([[2, 3, 4], [1, 1, 1]]), rtol=1e-6)
     np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
     assert scene.sensors[0].saturation == pytest.approx(0.9)
 
@@ -552,5 +552,7 @@ def test_both_formats_of_a_capture_agree(shared, tmp_path, name):
     for a, b in zip(ours.sensors, theirs.sensors):
         np.testing.assert_allclose(np.array(a.to_world.matrix), np.array(b.to_world.matrix), rtol=1e-4, atol=1e-5)
         assert a.filename.resolve() == b.filename.resolve()
-    lights = [np.array(c.photographs.lights).reshape(-1, 8)[:, :7] for c in (ours, theirs)]
-    np.testing.assert_allclose(*lights, rtol=1e-4)
+    for a, b in zip(ours.photographs.lights, theirs.photographs.lights, strict=True):
+        assert a.kind == b.kind
+        np.testing.assert_allclose(a.vector, b.vector, rtol=1e-4)
+        np.testing.assert_allclose(a.rgb, b.rgb, rtol=1e-4)

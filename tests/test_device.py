@@ -11,7 +11,6 @@ from torch.nn import functional as F
 
 from mi_ring import fit
 from mi_ring.errors import InputError
-from mi_ring.fitting.config import Config
 from mi_ring.fitting.terms import mask_loss, rgb_loss, velocity_loss
 from mi_ring.nets.brdfnet import BRDFNet
 from mi_ring.nets.shapenet import ShapeNet
@@ -84,7 +83,7 @@ def test_fit_switches_to_the_variant_asked_for(small_capture, tmp_path):
 
 def test_determinism_is_refused_on_a_gpu():
     with pytest.raises(InputError, match="--deterministic: needs --variant llvm_ad_rgb"):
-        Config("scene.xml", deterministic=True, variant="cuda_ad_rgb")
+        fit.parse(["scene.xml", "--deterministic", "--variant", "cuda_ad_rgb"])
 
 
 @needs_gpu

@@ -25,6 +25,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.importers.formats import FORMATS
 from mi_ring.plugins import cooktorrance, flash, photograph, photometric, shapenet
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 
 ROOT = Path(__file__).parents[1]
 
@@ -122,7 +123,7 @@ def values(tmp_path):
     """Of each plugin a value for each parameter, none of them the default; what must not be together is apart."""
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
     ring = Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)
-    torch.save(ring.state(), tmp_path / "ring.pt")
+    torch.save(ring_state(ring), tmp_path / "ring.pt")
     moved = mi.ScalarTransform4f().translate([3, -1, 2])
     film = {"type": "hdrfilm", "width": 7, "height": 5}
     light = {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": [4, 5, 6]}}
@@ -210,7 +211,7 @@ def test_flags_are_those_of_traverse(name, values):
 
 @pytest.mark.parametrize("name", plugins())
 def test_snippets_load_and_say_the_same(name, tmp_path):
-    torch.save(Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5).state(), tmp_path / "ring.pt")
+    torch.save(ring_state(Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)), tmp_path / "ring.pt")
     blocks = {}
     for kind, block in re.findall(r"\.\. code-block:: (\w+)\n\n((?: {8}.*\n?|\n)+)", inspect.getdoc(plugins()[name])):
         blocks[kind] = inspect.cleandoc(block).replace("ring.pt", str(tmp_path / "ring.pt"))

@@ -17,6 +17,7 @@ from mi_ring.metrics import predictions, surfaces
 from mi_ring.output import ply
 from mi_ring.rendering import plain_mesh
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import run
 
 
@@ -175,9 +176,9 @@ def sphere_run(small_capture, tmp_path_factory):
     """The results folder of a fit that has not begun."""
     folder = tmp_path_factory.mktemp("run")
     ring = Ring(CENTER, 25.0, scale=0.5)
-    torch.save(ring.state(), folder / "ring.pt")
+    torch.save(ring_state(ring), folder / "ring.pt")
     ply.write_mesh(ring, 3, folder / "mesh.ply")
-    scene = scenefile.fitted_scene(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
+    scene = scenefile.fitted_scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')
     (folder / "scene.xml").write_bytes(scene)
     ellipsoid = trimesh.Trimesh(CENTER + icosphere(4).vertices * AXES, icosphere(4).faces)
     ellipsoid.export(folder / "truth.ply")

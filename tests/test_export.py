@@ -18,13 +18,13 @@ from scipy.ndimage import map_coordinates
 from test_bsdf import directions, twin
 
 from mi_ring import export
-from mi_ring.capture.capture import camera_of
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain
 from mi_ring.nets.brdfnet import Parameter
 from mi_ring.output import atlas, gltf, mitsuba_scene, results
-from mi_ring.rendering.lights import light_of
+from mi_ring.rendering.lights import Lights
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 
 CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
 RESOLUTION = 256
@@ -49,7 +49,7 @@ def ring():
 def run(ring, small_capture, tmp_path_factory):
     """A results folder with what export reads of it."""
     folder = tmp_path_factory.mktemp("run")
-    torch.save(ring.state({"subdivisions": 4}), folder / "ring.pt")
+    torch.save(ring_state(ring, {"subdivisions": 4}), folder / "ring.pt")
     (folder / "scene.xml").write_text(small_capture.read_text())
     return folder
 
@@ -379,16 +379,17 @@ np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
     sensor = mitsuba_scene.first_photograph(run)
-    matrix, (fx, fy), (cx, cy) = camera_of(sensor)
+    matrix, (fx, fy), (cx, cy), _ = sensor.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
-    x, y, z, _, *strength = np.ravel(light_of(sensor))[:7].tolist()
+    light = Lights.of([sensor])[0]
     scene = mi.load_dict({
         "type": "scene", "object": {"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 4,
                                     "bsdf": {"type": "cooktorrance"}},
         "sensor": {"type": "photograph", "filename": "none", "fx": float(fx), "fy": float(fx), "cx": float(cx),
                    "cy": float(cy * fx / fy), "to_world": mi.ScalarTransform4f(matrix),
                    "film": {"type": "hdrfilm", "width": 56, "height": stock.shape[0]},
-                   "light": {"type": "point", "position": [x, y, z], "intensity": {"type": "rgb", "value": strength}}},
+                   "light": {"type": "point", "position": light.vector.tolist(),
+                             "intensity": {"type": "rgb", "value": light.rgb.tolist()}}},
     })  # fmt: skip
     ours = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., :3]
     assert ours.mean() > 0.02 and np.abs(ours - stock).mean() < 0.01 * ours.mean() + 1e-4
@@ -398,10 +399,10 @@ def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
     """They are scaled to be within [0, 1], and the light is that much stronger."""
     bright = wild()
     bright.brdf_net.scale.fill_(20.0)
-    torch.save(bright.state({"subdivisions": 4}), tmp_path / "ring.pt")
+    torch.save(ring_state(bright, {"subdivisions": 4}), tmp_path / "ring.pt")
     (tmp_path / "scene.xml").write_text(small_capture.read_text())
     export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
-    intensity = np.ravel(light_of(mitsuba_scene.first_photograph(tmp_path)))[4:7]
+    intensity = Lights.of([mitsuba_scene.first_photograph(tmp_path)])[0].rgb
     stock = mi.load_file(str(tmp_path / "stock.xml"))
     boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
     assert boost.min() > 20
@@ -417,7 +418,7 @@ def test_obj_of_principled_keeps_metal_and_gloss(tmp_path):
            '<float name="specular" value="0.25"/></bsdf>'  # fmt: skip
     parameters = (Parameter("base_color", 3, 0.0, 1.0), Parameter("metallic", 1, 0.0, 1.0))
     ring = wild(bsdf=bsdf, parameters=parameters)
-    torch.save(ring.state(), tmp_path / "ring.pt")
+    torch.save(ring_state(ring), tmp_path / "ring.pt")
     export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.obj"), "--subdivisions", "3", "--resolution", "64"])
     assert "\nKs 0.02 0.02 0.02\n" in (tmp_path / "o.mtl").read_text()  # F₀ = 0.08 · 0.25
     metal = np.asarray(Image.open(tmp_path / "o_metallic.png")) / 255
@@ -477,7 +478,7 @@ def test_a_material_that_gltf_lacks_is_refused_before_the_work(tmp_path, monkeyp
     parameters = (Parameter("specular_reflectance", 3, 0.0, 1.0),)
     bsdf = '<bsdf type="conductor"><texture name="specular_reflectance" type="mesh_attribute"><string name="name" ' \
            'value="vertex_specular_reflectance"/></texture></bsdf>'  # fmt: skip
-    torch.save(wild(bsdf=bsdf, parameters=parameters).state(), tmp_path / "ring.pt")
+    torch.save(ring_state(wild(bsdf=bsdf, parameters=parameters)), tmp_path / "ring.pt")
     monkeypatch.setattr(atlas.xatlas, "Atlas", None)
     assert "conductor" in complaint(tmp_path / "ring.pt", tmp_path / "o.glb")
     export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.ply"), "--subdivisions", "2"])

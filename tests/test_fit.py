@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -18,12 +19,17 @@ from conftest import AXES, CENTER
 from PIL import Image
 
 from mi_ring import __main__, fit, render
-from mi_ring.capture import capture, loading
+from mi_ring.capture import capture
+from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.fitting import checkpoint, fit, optimizers, session, start
+from mi_ring.fitting import checkpoint, optimizers, session, start, terms
 from mi_ring.fitting.config import PRESETS, Config
+from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.muon import Muon
+from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.output import results
+from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
 from mi_ring.system import files, machine
@@ -55,22 +61,23 @@ def test_fit_writes_all_results_and_no_other_files(finished):
 
 def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
     log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
-    config = fit.parse(["scene.xml", "--iterations", "90"])
     for entry in log:
-        weights = config.weights_at((entry["iteration"] - 1) / 90)
+        done = (entry["iteration"] - 1) / 90
+        weights = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01 * 0.03**done}
+        assert entry["weights"] == pytest.approx(weights)
         assert entry["loss"] == pytest.approx(sum(w * entry[term] for term, w in weights.items()), rel=1e-4)
-        assert entry["learning_rate"] == pytest.approx(3e-3 * 0.1 ** ((entry["iteration"] - 1) / 90))
+        assert entry["learning_rate"] == pytest.approx(3e-3 * 0.1**done)
     assert log[-1]["iteration"] == 90
 
 
 def test_muon_has_the_hidden_weights_and_adam_all_the_others():
     ring = Ring([0, 0, 0], 1.0)
-    adam, muon = optimizers.optimizers_of(ring, Config("scene.xml"))
-    assert isinstance(adam, torch.optim.Adam) and isinstance(muon, torch.optim.Muon)
+    adam, muon = optimizers.optimizers_of(ring, Config(), torch.device("cpu"))
+    assert isinstance(adam, torch.optim.Adam) and isinstance(muon, Muon)
     ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))
     assert [tuple(p.shape) for p in ours] == 2 * [(256, 96), (256, 256), (256, 256)] + 2 * [(256, 256)]
     assert sorted(map(id, ours + theirs)) == sorted(map(id, ring.parameters()))
-    (alone,) = optimizers.optimizers_of(ring, Config("scene.xml", optimizer="adam"))
+    (alone,) = optimizers.optimizers_of(ring, Config(optimizer="adam"), torch.device("cpu"))
     assert len(alone.param_groups[0]["params"]) == len(list(ring.parameters()))
 
 
@@ -78,15 +85,15 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
     s, _ = Sphere().sample(3)
 
     def value(precision):
-        running = fit.Fit(machine.capture.load(small_capture), fit.parse([str(small_capture), "--precision", precision]))
+        running = Fit(load_capture(small_capture), fit.parse([str(small_capture), "--precision", precision]))
         running.ring.shape_net.output.weight.data.mul_(30)
-        return running.regulariser(s).item()
+        return terms.velocity(SimpleNamespace(fit=running, s=s)).item()
 
     assert value("bfloat16") == pytest.approx(value("float32"), rel=0.01)
 
 
 def test_steps_of_the_flow_are_part_of_the_result(finished):
-    assert load_fit(finished).shape_net.steps == Config("scene.xml").steps != 20
+    assert load_fit(finished).shape_net.steps == Config().steps != 20
 
 
 def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
@@ -162,9 +169,9 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
         assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
 
     interrupted = fit.parse([*arguments, "--out", str(tmp_path / "c")])
-    with machine.threads_of(interrupted):
-        first = fit.Fit(machine.capture.load(small_capture), interrupted)
-        results.prepare(tmp_path / "c", interrupted)
+    with machine.threads_of(1):
+        first = Fit(load_capture(small_capture), interrupted)
+        results.prepare(tmp_path / "c", small_capture, interrupted.settings())
         session.train(first, tmp_path / "c", lambda: first.iteration == 9)  # in the second stage
     assert fit.main([*arguments, "--out", str(tmp_path / "c"), "--resume"]) == 0
 
@@ -189,9 +196,9 @@ def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture)
     config = fit.parse([str(path), "--deterministic"])
     seen = set()
     for _ in range(3):
-        scene = machine.capture.load(path)
-        with machine.threads_of(config):
-            shapes = fit.Fit(scene, config).capture.scene.shapes()
+        scene = load_capture(path)
+        with machine.threads_of(1):
+            shapes = Fit(scene, config).capture.scene.shapes()
         none, own = (np.array(s.vertex_normals_buffer()) for s in shapes if type(s) is mi.Mesh)
         np.testing.assert_allclose(own, [0.6, 0, 0.8] * 3, rtol=1e-6)
         seen.add(none.tobytes())
@@ -214,8 +221,8 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
 
 
 def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_path, monkeypatch):
-    genuine = machine.losses.rgb_loss
-    monkeypatch.setattr(machine.losses, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
+    genuine = terms.rgb_loss
+    monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
     with pytest.raises(InputError, match="diverged at iteration 9"):
         fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "20", *QUICK])
     ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
@@ -226,10 +233,10 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
     def glare(surface, photographs, coverage, seed):
         return 1000 * coverage[..., None].expand(*coverage.shape, 3)
 
-    monkeypatch.setattr(machine.bridge, "interreflection", glare)
+    monkeypatch.setattr(bridge, "interreflection", glare)
     for options, bright in (([], True), (["--no-indirect"], False)):
-        first = fit.Fit(machine.capture.load(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
-        assert (first.step()["rgb"] > 100) == bright
+        first = Fit(load_capture(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
+        assert (first.step().terms["rgb"] > 100) == bright
 
 
 def test_interreflection_is_left_out_where_intensities_cannot_be_true(broken_capture, tmp_path, capsys):
@@ -242,11 +249,11 @@ def test_interreflection_is_left_out_where_intensities_cannot_be_true(broken_cap
 
 def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatch):
     path, edit = broken_capture
-    genuine, used = machine.bridge.render, []
-    monkeypatch.setattr(machine.bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
+    genuine, used = bridge.render, []
+    monkeypatch.setattr(bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
-        fit.Fit(machine.capture.load(path), fit.parse([str(path), *QUICK, *options])).step()
+        Fit(load_capture(path), fit.parse([str(path), *QUICK, *options])).step()
 
     step()
     step("--no-shadows")
@@ -311,19 +318,15 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-3)
 
 
-def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path):
+def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path, monkeypatch):
     config = fit.parse([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
-
-    def fresh():
-        return fit.Fit(loading.load_capture(small_capture), config)
-
-    before = fresh()
+    before = Fit(load_capture(small_capture), config)
     assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
     for _ in range(3):
         before.step()
-    files.write_state(before.state(), tmp_path / "checkpoint.pt")
-    after = fresh()
-    after.restore(checkpoint.read_checkpoint(config))
+    checkpoint.write_checkpoint(before, {}, tmp_path)
+    monkeypatch.setattr(start, "starting_surface", None)  # the domain is that of the checkpoint
+    after = Fit(load_capture(small_capture), config, state=checkpoint.read_checkpoint(tmp_path, config)["fit"])
     for level in (2, 3):
         (s, faces), (again, same) = before.ring.domain.sample(level), after.ring.domain.sample(level)
         assert torch.equal(s, again) and np.array_equal(faces, same)
@@ -341,9 +344,9 @@ def test_start_from_a_mesh(small_capture, tmp_path):
 
 
 def test_auto_takes_the_hull_only_where_it_has_handles(small_capture, monkeypatch):
-    scene = loading.load_capture(small_capture)
+    scene = load_capture(small_capture)
     assert type(start.starting_surface(scene, "auto")[0]) is Sphere
-    monkeypatch.setattr(machine, "genus", lambda mesh: 1)
+    monkeypatch.setattr(start, "genus", lambda mesh: 1)
     domain, center, radius = start.starting_surface(scene, "auto")
     assert type(domain) is Domain
     np.testing.assert_allclose(center, CENTER, atol=2)
@@ -355,20 +358,20 @@ def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(br
     path, _ = broken_capture
     mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/004.png"))
     with pytest.raises(InputError, match="nothing in it"):
-        start.starting_surface(loading.load_capture(path), "auto")
+        start.starting_surface(load_capture(path), "auto")
     bsdf = '<bsdf type="cooktorrance"/>'
     place = '<point name="center" x="400" y="-150" z="90"/><float name="radius" value="30"/>'
     path.write_text(path.read_text().replace(bsdf, bsdf + place))
-    domain, center, radius = start.starting_surface(loading.load_capture(path), "auto")
+    domain, center, radius = start.starting_surface(load_capture(path), "auto")
     assert type(domain) is Sphere and center.tolist() == CENTER.tolist() and radius == 30
     with pytest.raises(InputError, match="nothing in it"):
-        start.starting_surface(loading.load_capture(path), "hull")
+        start.starting_surface(load_capture(path), "hull")
 
 
 def test_a_domain_of_the_scene_does_not_normalise_another(broken_capture):
     path, _ = broken_capture
     torus_domain(path)
-    scene = loading.load_capture(path)
+    scene = load_capture(path)
     assert start.starting_surface(scene, "auto")[0] is scene.shape.domain[0]
     domain, _, radius = start.starting_surface(scene, "sphere")
     assert type(domain) is Sphere and radius == pytest.approx(scene.sphere()[1]) != scene.shape.domain[2]
@@ -427,19 +430,39 @@ def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_pa
 
 def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_capture, broken_capture, tmp_path):
     (broken_capture[0].parent / "images/007.png").unlink()  # nobody has looked for the photographs yet
-    with pytest.raises(InputError, match="checkpoint.pt: --resume: no such file"):
+    with pytest.raises(InputError, match="checkpoint.pt: no such file; run without --resume"):
         fit.main([str(broken_capture[0]), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="gone.xml: no such file"):
         fit.main([str(tmp_path / "gone.xml"), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="--batch: was 4 before, is 5 now"):
         fit.main([str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *QUICK, "--batch", "5"])
-    same = [str(broken_capture[0]), "--out", str(finished), "--resume", "--iterations", "90", *QUICK]
-    broken_capture[1]('id="003"', 'id="three"')
-    with pytest.raises(InputError, match="another scene file"):
-        fit.main(same)
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
-    with pytest.raises(InputError, match="checkpoint.pt: --resume: not a checkpoint"):
+    with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
+
+
+def test_resume_notices_files_that_changed(small_capture, broken_capture, tmp_path):
+    path, edit = broken_capture
+    trimesh.creation.icosphere(subdivisions=2, radius=30).apply_translation(CENTER).export(path.parent / "ball.ply")
+    edit('<bsdf type="cooktorrance"/>', '<string name="domain" value="ball.ply"/><bsdf type="cooktorrance"/>')
+    arguments = [str(path), "--out", str(tmp_path / "run"), "--iterations", "2", *QUICK]
+    assert fit.main(arguments) == 0
+    assert fit.main([*arguments, "--resume"]) == 0  # there is nothing left to do
+    for name in ("images/004.png", "masks/005.png", "ball.ply", path.name):
+        file = path.parent / name
+        before = file.read_bytes()
+        if name.endswith(".png"):
+            pixels = np.array(mi.Bitmap(str(file)))
+            pixels[17, 23] ^= 255
+            mi.Bitmap(pixels).write(str(file))
+        elif name.endswith(".ply"):
+            trimesh.load(file, process=False).apply_scale(1.001).export(file)
+        else:
+            file.write_bytes(before + b"\n")
+        with pytest.raises(InputError, match=f"--resume: {name} has changed since"):
+            fit.main([*arguments, "--resume"])
+        file.write_bytes(before)
+    assert fit.main([*arguments, "--resume"]) == 0
 
 
 def call(*arguments, module="fit"):
@@ -477,7 +500,7 @@ def test_on_one_core_an_exr_is_written_and_read(tmp_path):
 import os
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import mi_ring, numpy
-from mi_ring.results import write_image
+from mi_ring.images import write_image
 from pathlib import Path
 write_image(numpy.ones((5, 7, 3), numpy.float32), Path("one.exr"))
 import mitsuba as mi
@@ -529,7 +552,7 @@ def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
 def test_presets_are_valid_and_can_be_overridden(preset):
     config = fit.parse(["scene.xml", "--preset", preset, "--seed", "7"])
     assert config.preset == preset and config.seed == 7
-    stages = config.stages()
+    stages = stages_of(config)
     assert stages[0].first == 0 and stages[-1].last == config.iterations
     assert all(a.last == b.first for a, b in zip(stages, stages[1:]))
     for name, value in PRESETS[preset].items():
@@ -537,27 +560,26 @@ def test_presets_are_valid_and_can_be_overridden(preset):
 
 
 def test_starts_near_the_object_spend_less_on_the_coarse_stage():
-    config = Config("scene.xml", iterations=100, shares=(0.5, 0.3, 0.2))
-    assert [s.last - s.first for s in config.stages()] == [50, 30, 20]
-    assert [s.last - s.first for s in config.stages(near=True)] == [17, 43, 20]  # 16.7, and 30 + 0.4 · 33.3
-    config = Config("scene.xml", iterations=100, levels=(4,), widths=(128,), shares=(1,))
-    assert [s.last for s in config.stages(near=True)] == [100]
+    config = Config(iterations=100, shares=(0.5, 0.3, 0.2))
+    assert [s.last - s.first for s in stages_of(config)] == [50, 30, 20]
+    assert [s.last - s.first for s in stages_of(config, near=True)] == [17, 43, 20]  # 16.7, and 30 + 0.4 · 33.3
+    config = Config(iterations=100, levels=(4,), widths=(128,), shares=(1,))
+    assert [s.last for s in stages_of(config, near=True)] == [100]
 
 
 def test_paper_preset_is_the_papers():
     config = fit.parse(["scene.xml", "--preset", "paper"])
     assert config.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.01} and config.loss == "l2"
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
-    assert config.levels == (5, 6) and [s.last - s.first for s in config.stages()] == [2000, 4000]
+    assert config.levels == (5, 6) and [s.last - s.first for s in stages_of(config)] == [2000, 4000]
     assert config.precision == "float32" and config.steps == 20 and not config.shadows and not config.indirect
-    assert config.weights_at(0) == config.weights_at(1) == config.weights
+    assert config.velocity_decay == 1
 
 
 def test_regulariser_is_relaxed_and_nothing_else():
-    config = fit.parse(["scene.xml", "--velocity-decay", "0.04"])
-    halfway = config.weights_at(0.5)
-    assert halfway.pop("velocity") == pytest.approx(0.2 * config.weights["velocity"])
-    assert halfway == {name: weight for name, weight in config.weights.items() if name != "velocity"}
+    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04)), progress=0.5)
+    assert terms.default_terms["velocity"].schedule(it) == pytest.approx(0.2)
+    assert all(term.schedule is None for name, term in terms.default_terms.items() if name != "velocity")
 
 
 def test_help_names_every_option(capsys):
@@ -565,13 +587,13 @@ def test_help_names_every_option(capsys):
         fit.parse(["--help"])
     text = capsys.readouterr().out
     assert stop.value.code == 0
-    for name in Config.__dataclass_fields__:
+    for name in fit.FitConfig.__dataclass_fields__:
         assert name == "scene" or f"--{name.replace('_', '-')}" in text
 
 
 def test_program_lists_its_commands():
     done = subprocess.run([sys.executable, "-c", "import sys; sys.argv[1:] = ['--help']; "
-                           "from mi_ring import command; command.main()"], capture_output=True, text=True)  # fmt: skip
+                           "from mi_ring.__main__ import main; main()"], capture_output=True, text=True)  # fmt: skip
     assert done.returncode == 0
     assert all(name in done.stdout for name in __main__.COMMANDS)
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import directions
+from mi_ring.geometry.camera import Camera
 from mi_ring.geometry.hull import Hull, Silhouette, signed_distance
 from mi_ring.geometry.meshes import genus
 
@@ -25,10 +25,11 @@ def cameras(count, distance=20.0):
 def silhouettes(hit, count=24, scale=1):
     """Masks of a body: `hit(origin, directions)` says which rays meet it. `scale`: so many times as many pixels."""
     y, x = np.mgrid[: scale * H, : scale * W] + 0.5
-    pixels, camera = np.stack([x.ravel(), y.ravel()], 1), (scale * FOCAL, scale * CENTRE)
+    pixels, lens = np.stack([x.ravel(), y.ravel()], 1), (scale * FOCAL, scale * CENTRE, (scale * W, scale * H))
     for k, matrix in enumerate(cameras(count)):
-        mask = hit(matrix[:3, 3], directions(matrix, *camera, pixels)).reshape(x.shape)
-        yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), matrix, *camera, f"mask {k}")
+        camera = Camera(matrix, *lens)
+        mask = hit(camera.position, camera.directions(pixels)).reshape(x.shape)
+        yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), camera, f"mask {k}")
 
 
 def ball(radius, at=CENTER):
@@ -104,7 +105,7 @@ def test_only_the_largest_piece_is_the_object():
 def test_what_photographs_do_not_show_is_not_cut_off():
     """A camera so near that the ball is larger than its photograph says nothing of what is beyond the frame."""
     near = next(cameras(1, distance=6.0))
-    all_of_it = Silhouette(np.full((H, W), 255, np.uint8), near, FOCAL, CENTRE, "near")
+    all_of_it = Silhouette(np.full((H, W), 255, np.uint8), Camera(near, FOCAL, CENTRE, (W, H)), "near")
     views = list(silhouettes(ball(4.0)))
     alone = Hull(views, "scene.xml").ball()[1]
     assert Hull([*views, all_of_it], "scene.xml").ball()[1] == pytest.approx(alone, rel=0.02)
@@ -118,6 +119,6 @@ def test_mistakes():
         Hull(views[:1], "scene.xml")
     apart = list(silhouettes(ball(2.0)))
     for view in apart[::2]:
-        view.matrix[:3, 3] += 3
+        view.camera.to_world[:3, 3] += 3
     with pytest.raises(InputError, match="scene.xml: mask: no point in space is inside all masks"):
         Hull(apart, "scene.xml").ball()

@@ -94,3 +94,9 @@ def test_velocity_loss_without_laplacian_is_the_mean_square():
     assert terms.velocity_loss(lambda p: 2 * p, x, 0.0).item() == pytest.approx(
         (4 * x.square().sum(-1)).mean().item(), rel=1e-6
     )
+
+
+def test_pixels_that_say_nothing_have_no_part_in_the_mask_loss():
+    coverage, mask = torch.tensor([[[0.5, 1.0, 0.0]]]), torch.tensor([[[0.0, 0.0, 0.0]]])
+    valid = torch.tensor([[[True, False, True]]])
+    assert terms.mask_loss(coverage, mask, 0.1, valid).item() == pytest.approx(0.25 / 3)

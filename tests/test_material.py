@@ -15,6 +15,7 @@ from mi_ring.nets.brdfnet import Parameter
 from mi_ring.nets.shapenet import ShapeNet
 from mi_ring.ring.material import MaterialOptions, dress
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 
 PRINCIPLED = """<bsdf type="principled">
   <texture name="base_color" type="mesh_attribute"><string name="name" value="vertex_base_color"/></texture>
@@ -43,7 +44,7 @@ def mesh_domain(stretch=1.0):
 
 
 def save(ring, path):
-    torch.save(ring.state({"subdivisions": ring.subdivisions}), path)
+    torch.save(ring_state(ring, {"subdivisions": ring.subdivisions}), path)
     return path
 
 

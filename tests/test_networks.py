@@ -9,12 +9,12 @@ from scipy.integrate import solve_ivp
 from torch.nn import functional as F
 
 from mi_ring.geometry.domain import Sphere
-from mi_ring.nets import mlp
+from mi_ring.nets import chunks, mlp
 from mi_ring.nets.brdfnet import BRDFNet, Parameter
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.shapenet import SPEED, ShapeNet
 from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit
+from mi_ring.ring.saved import load_fit, ring_state
 
 
 def neurons(net):
@@ -84,7 +84,7 @@ def plain(net, x):
 
 @pytest.fixture(params=[1, 2])
 def threads(request, monkeypatch):
-    monkeypatch.setattr(mlp, "CHUNK", 16)
+    monkeypatch.setattr(chunks, "CHUNK", 16)
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
     yield request.param
@@ -241,7 +241,7 @@ def test_icosphere_has_the_documented_size_and_rotates(level):
 def test_state_survives_the_file(tmp_path):
     ring = Ring(center=[1.0, 2.0, 3.0], radius=4.0, scale=5.0, steps=7)
     torch.nn.init.normal_(ring.shape_net.output.weight)  # else no step would lead anywhere
-    torch.save(ring.state({"seed": 3}), tmp_path / "ring.pt")
+    torch.save(ring_state(ring, {"seed": 3}), tmp_path / "ring.pt")
     again = load_fit(tmp_path / "ring.pt")
     s = torch.randn(6, 3)
     assert torch.equal(again.surface(s), ring.surface(s))

@@ -9,12 +9,12 @@ import torch
 import trimesh
 
 from mi_ring import fit
-from mi_ring.capture import loading, reflectance
+from mi_ring.capture import reflectance
+from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.rendering import attributes, bridge
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
-from mi_ring.system import machine
 
 QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
 PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
@@ -36,8 +36,8 @@ def arguments(path, out):
 
 
 def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
-    loaded = loading.load_capture(scene[0])
-    (colour, rough), xml = reflectance.predicted(scene[0], loaded.shape, PREDICT)
+    loaded = load_capture(scene[0])
+    (colour, rough), xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
     assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
     assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
     assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
@@ -53,7 +53,7 @@ def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
     assert [p.name for p in ring.brdf_net.bsdf_parameters] == list(PREDICT)
     saved = trimesh.load(out / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
     assert any("base_color" in name for name in saved.dtype.names)
-    loaded = loading.load_capture(out / "scene.xml")
+    loaded = load_capture(out / "scene.xml")
     # As it stands in the file: the shape's own weights, without a ring given
     surface = bridge.Surface(loaded.scene, loaded.shape)
     predicted, _ = bridge.draw(surface, loaded.photograph(2), spp=256)
@@ -68,7 +68,7 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
     assert fit.main([*arguments(scene[0], out), "--no-indirect"]) == 0
     ring, pictures = load_fit(out), []
     for path in (out / "scene.xml", small_capture):
-        loaded = loading.load_capture(path)
+        loaded = load_capture(path)
         surface = bridge.Surface(loaded.scene, loaded.shape, ring)
         surface.show(ring, *ring.domain.sample(3))
         pictures.append(bridge.draw(surface, loaded.photograph(4), spp=64)[0])
@@ -78,9 +78,9 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
 
 @pytest.mark.parametrize("which", PREDICT)
 def test_gradients_of_attributes_equal_finite_differences(scene, which):
-    loaded = loading.load_capture(scene[0])
-    parameters, xml = reflectance.predicted(scene[0], loaded.shape, PREDICT)
-    ring = machine.Ring(*loaded.sphere(), 1.0, None, parameters, xml)
+    loaded = load_capture(scene[0])
+    parameters, xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
+    ring = Ring(*loaded.sphere(), 1.0, None, parameters, xml)
     surface = bridge.Surface(loaded.scene, loaded.shape, ring)
     s, faces = ring.domain.sample(3)
     surface.set_faces(faces)
@@ -117,14 +117,14 @@ def test_part_of_cooktorrance(broken_capture):
     """What the XML leaves to mesh attributes needs no starting value."""
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="specular" value="0.05"/></bsdf>')
-    shape = loading.load_capture(path).shape
-    parameters, xml = reflectance.predicted(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
+    shape = load_capture(path).shape
+    parameters, xml = reflectance.predicted_parameters(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
     assert "vertex_specular" not in str(attributes.load_bsdf(xml))
     # Without ranges: all but the constant.
-    assert [p.name for p in reflectance.predicted(path, shape, {})[0]] == ["diffuse", "roughness"]
+    assert [p.name for p in reflectance.predicted_parameters(path, shape, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
-        reflectance.predicted(path, shape, {"diffuse": (0, 1)})
+        reflectance.predicted_parameters(path, shape, {"diffuse": (0, 1)})
 
 
 WRONG = {
@@ -139,9 +139,9 @@ WRONG = {
 
 @pytest.mark.parametrize("ranges, message", WRONG.values(), ids=WRONG)
 def test_wrong_parameters_are_refused_in_one_line(scene, ranges, message):
-    loaded = loading.load_capture(scene[0])
+    loaded = load_capture(scene[0])
     with pytest.raises(InputError, match=message) as caught:
-        reflectance.predicted(scene[0], loaded.shape, ranges)
+        reflectance.predicted_parameters(scene[0], loaded.shape, ranges)
     assert "\n" not in str(caught.value)
 
 
@@ -163,9 +163,9 @@ def test_unfit_bsdfs_are_refused_in_one_line(broken_capture, xml):
     path, edit = broken_capture
     (path.parent / "other.xml").write_text('<scene version="3.0.0"/>')
     edit('<bsdf type="cooktorrance"/>', xml)
-    shape = loading.load_capture(path).shape
+    shape = load_capture(path).shape
     with pytest.raises(InputError, match=REFUSED[xml]) as caught:
-        reflectance.predicted(path, shape, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
+        reflectance.predicted_parameters(path, shape, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
     assert "\n" not in str(caught.value)
 
 

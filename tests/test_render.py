@@ -14,7 +14,7 @@ from conftest import SCENE, SENSOR
 from scipy.spatial.transform import Rotation
 
 from mi_ring import render
-from mi_ring.capture import capture, loading
+from mi_ring.capture import loading
 from mi_ring.errors import InputError
 from mi_ring.nets.shapenet import SPEED
 from mi_ring.output import views
@@ -23,6 +23,7 @@ from mi_ring.plugins.flash import Flash
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 from mi_ring.system import command
 
 CENTER, RADIUS, SHIFT = np.array([400.0, -150.0, 90.0]), 20.0, np.array([0.3, -0.5, 0.2])
@@ -50,7 +51,7 @@ def sphere(shift=SHIFT, **material):
 
 
 def save(ring, path):
-    torch.save(ring.state({"subdivisions": ring.subdivisions}), path)
+    torch.save(ring_state(ring, {"subdivisions": ring.subdivisions}), path)
     return path
 
 
@@ -286,7 +287,7 @@ def test_the_flow_begins_with_the_domain_and_ends_with_the_object(tmp_path, run)
         middle = CENTER + frame.time * RADIUS * SHIFT
         np.testing.assert_allclose(centre, project(frame.sensor, middle)[0], atol=0.7)
         sine = RADIUS / np.linalg.norm(EYES[0] - middle)
-        focal = capture.camera_of(frame.sensor)[1][0]
+        focal = frame.sensor.camera.focal[0]
         # Pixels that it touches count: half a pixel more all around. Off the middle the disc is an ellipse, barely.
         assert radius == pytest.approx(focal * sine / np.sqrt(1 - sine**2) + 0.5, abs=0.4)
         assert radius < 24

@@ -16,8 +16,9 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from mi_ring import fit, images
-from mi_ring.capture import loading
-from mi_ring.fitting import fit
+from mi_ring.capture.loading import load_capture
+from mi_ring.fitting import session
+from mi_ring.fitting.fit import Fit
 from mi_ring.output import report
 
 VIEWER = Path(report.__file__).parent / "viewer"
@@ -62,8 +63,8 @@ def glb(positions, normals, uv, faces, image, scale=1.0):
 @pytest.fixture(scope="module")
 def fitted(small_capture):
     """A quick fit and its log."""
-    fitted = fit.Fit(loading.load_capture(small_capture), fit.parse([str(small_capture), "--iterations", "50", *QUICK]))
-    log = [{"iteration": i + 1, **fitted.step()} for i in range(50)]
+    fitted = Fit(load_capture(small_capture), fit.parse([str(small_capture), "--iterations", "50", *QUICK]))
+    log = [session.log_entry(it) for it in fitted]
     fitted.surface.show(fitted.ring, *fitted.ring.domain.sample(3))
     return fitted, log
 
@@ -327,7 +328,7 @@ def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capt
     assert not report.fit_findings(good, 50, 50)
     path, edit = broken_capture
     edit('name="cx" value="30.5"', 'name="cx" value="32.5"', count=-1)
-    monkeypatch.setattr(fitted, "capture", loading.load_capture(path))
+    monkeypatch.setattr(fitted, "capture", load_capture(path))
     moved = [report.panel_of(fitted, k, names[k])[0] for k in range(12)]
     found = [found for found in report.fit_findings(moved, 50, 50) if "cx and cy" in found]
     assert len(found) == 1 and re.search(r"(1\.[5-9]|2\.[0-5]) px to the left and 0\.[0-2] px", found[0])
@@ -342,7 +343,7 @@ def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monk
     image[tuple(inside[: len(inside) // 4].T)] = 255
     Image.fromarray(image).save(path.parent / "images" / "003.png")
     fitted, _ = fitted
-    monkeypatch.setattr(fitted, "capture", loading.load_capture(path))
+    monkeypatch.setattr(fitted, "capture", load_capture(path))
     assert report.panel_of(fitted, 3, "003.png")[0].saturated == pytest.approx(0.25, abs=0.01)
 
 

@@ -1,5 +1,6 @@
 """`validate`: the comparison with Mitsuba's path tracer against closed forms, and that its p-values can be trusted."""
 
+import io
 import json
 
 import mitsuba as mi
@@ -16,6 +17,7 @@ from mi_ring.output import validation_sheet
 from mi_ring.plugins.cooktorrance import CookTorrance
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
 from mi_ring.system import files
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 35, 25, (30.0, 27.0), (16.2, 13.4)  # [px]
@@ -225,7 +227,7 @@ def test_pictures_of_several_launches_are_those_of_one(tmp_path, monkeypatch):
     scene, sensors = path_tracing.open_lit_scene(write(tmp_path, ELLIPSOID, *CONVEX))
     photographs = Photographs.of(sensors)
     one = path_tracing.render_both(scene, photographs, 0, sensors[0], 1, 4, 3, 0)
-    monkeypatch.setattr(statistics, "LANES", 5 * 4 * WIDTH * HEIGHT)  # 5 + 5 + 5 + 1
+    monkeypatch.setattr(path_tracing, "LANES", 5 * 4 * WIDTH * HEIGHT)  # 5 + 5 + 5 + 1
     many = path_tracing.render_both(scene, photographs, 0, sensors[0], 1, 4, 3, 1000)
     for a, b in zip(vars(one).values(), vars(many).values()):
         assert a.shape == b.shape == (16, HEIGHT, WIDTH, 3)
@@ -318,7 +320,7 @@ def test_folder_of_a_fit_and_its_default_out(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()
     torch.manual_seed(0)
-    files.write_state(Ring([0.3, -0.2, 0.4], 0.8, scale=0.2).state(), folder / "ring.pt")
+    files.write_state(ring_state(Ring([0.3, -0.2, 0.4], 0.8, scale=0.2)), folder / "ring.pt")
     ring = """<shape type="shapenet" id="object"><string name="weights" value="ring.pt"/>
       <bsdf type="cooktorrance"/></shape>"""
     write(folder, ring, *CONVEX, name="scene.xml")
@@ -362,7 +364,7 @@ def test_contact_sheet_shows_who_is_brighter_in_red_and_blue(tmp_path):
 def test_contact_sheet_of_many_photographs_is_about_square():
     line = Image.new("RGB", (792, 146))
     for count in (1, 2, 53, 200):
-        page = Image.open(statistics.io.BytesIO(validation_sheet.validation_sheet([line] * count)))
+        page = Image.open(io.BytesIO(validation_sheet.validation_sheet([line] * count)))
         assert page.width * page.height >= count * 792 * 146
     assert 0.5 < page.width / page.height < 2
 

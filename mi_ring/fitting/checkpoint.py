@@ -12,14 +12,15 @@ from mi_ring.ring.saved import read_state
 from mi_ring.system.files import write_state
 
 NAME = "checkpoint.pt"
+ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
     """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
     path = folder / NAME
-    state = read_state(path, "run without --resume to start anew")
+    state = read_state(path, "a checkpoint", ADVICE)
     if not {"settings", "files", "fit"} <= set(state):
-        raise InputError(f"{path}: --resume: not a checkpoint of this version of mi_ring; run without --resume")
+        raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
         if state["settings"].get(name) != value:
             raise InputError(f"{path}: --{name.replace('_', '-')}: was {state['settings'].get(name)} before, is {value} "

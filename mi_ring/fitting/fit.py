@@ -1,5 +1,6 @@
 """The loop of a fit: sample the domain, deform, render, weigh, step."""
 
+import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -212,13 +213,13 @@ class Fit:
 
     def state(self) -> dict:
         """What another `Fit` of the same capture needs to go on from here, for `torch.save`."""
-        return {
+        return copy.deepcopy({
             "ring": ring_state(self.ring, self.config.settings()),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "random": self.random.get_state(),
             "iteration": self.iteration,
             "seconds": self.seconds,
-        }
+        })
 
     def restore(self, state: dict) -> None:
         """Take up what a `state` says besides the ring."""

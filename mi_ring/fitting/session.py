@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.iteration import Iteration
 from mi_ring.output import results
 
 CHECKPOINT_SECONDS = 30.0
@@ -53,14 +54,21 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
             if it.number % LOG_EVERY == 0 or it.number == fit.iterations:
-                entry = {"iteration": it.number, "seconds": round(fit.seconds, 3), "loss": it.loss, **it.terms,
-                         "weights": it.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
-                         "stage": stage, "vertices": vertices[it.stage.level]}  # fmt: skip
-                results.log(folder, entry)
+                results.log(folder, log_entry(it))
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 write_checkpoint(fit, files, folder)
                 saved = time.monotonic()
     write_checkpoint(fit, files, folder)
+
+
+def log_entry(it: Iteration) -> dict:
+    """A line of log.jsonl. The terms of the loss, under their own names, are unweighted."""
+    fit = it.fit
+    return {
+        "iteration": it.number, "seconds": round(fit.seconds, 3), "loss": it.loss, **it.terms, "weights": it.weights,
+        "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": fit.stages.index(it.stage) + 1,
+        "vertices": len(it.vertices),
+    }  # fmt: skip
 
 
 def run_session(fit: Fit, folder: Path) -> bool:

@@ -15,7 +15,6 @@ from mi_ring.importers.reading import image_size
 from mi_ring.rendering.lights import Light
 from mi_ring.system import command
 
-SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes of an OpenGL camera, x right, y up, z back, in OpenCV's
 

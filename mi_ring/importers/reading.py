@@ -5,12 +5,13 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-import scipy.linalg
+import scipy.io
 from PIL import Image
 
 from mi_ring.errors import InputError
 from mi_ring.images import read_image
-from mi_ring.importers.frames import SUFFIXES
+
+SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 
 
 def pixels_of(path: Path) -> np.ndarray:

@@ -62,7 +62,7 @@ def pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if _pool is None or _pool[0] < threads:
             before = torch.get_num_threads()
-            executor = ThreadPoolExecutor(threads, "mi_ring", initializer=torch.set_num_threads, initargs=(1,))
+            executor = ThreadPoolExecutor(threads, "mi_ring", initializer=compute_alone)
             started = threading.Barrier(threads + 1)
             for _ in range(threads):
                 executor.submit(started.wait)
@@ -70,6 +70,12 @@ def pool(threads: int) -> ThreadPoolExecutor:
             torch.set_num_threads(before)  # torch takes what the last thread set for the number of all later ones
             _pool = threads, executor
         return _pool[1]
+
+
+def compute_alone() -> None:
+    """Have torch use one thread for what the current thread computes."""
+    torch.get_num_threads()  # the first time torch takes over the number of the process, which would undo the next line
+    torch.set_num_threads(1)
 
 
 def forget_pool() -> None:

@@ -10,7 +10,11 @@ def own_emitters(scene) -> list:
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """A scene of these objects. Meshes keep their names and are not merged."""
+    """A scene of these objects. They keep their ids, and meshes are not merged."""
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
-    scene = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
-    return mi.load_dict(scene, optimize=False, parallel=False)
+    ids = [part.id() for part in parts]
+    everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
+    scene = mi.load_dict(everything, optimize=False, parallel=False)
+    for part, name in zip(parts, ids):  # which Mitsuba has changed to the keys
+        part.set_id(name)
+    return scene

@@ -48,8 +48,8 @@ def migrated(state: dict) -> dict:
     }  # fmt: skip
 
 
-def read_state(path: Path, advice: str) -> dict:
-    """What `torch.save` wrote. Raises InputError if there is no such file, or if it is of another kind."""
+def read_state(path: Path, kind: str, advice: str) -> dict:
+    """What `torch.save` wrote. Raises InputError if there is no such file, or if it is not of this `kind`."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -57,9 +57,9 @@ def read_state(path: Path, advice: str) -> dict:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     except (RuntimeError, pickle.UnpicklingError, EOFError, zipfile.BadZipFile, ValueError) as error:
-        raise InputError(f"{path}: not written by mi_ring ({str(error).splitlines()[0]}); {advice}") from error
+        raise InputError(f"{path}: not {kind} ({str(error).splitlines()[0]}); {advice}") from error
     if not isinstance(state, dict):
-        raise InputError(f"{path}: not written by mi_ring (holds a {type(state).__name__}); {advice}")
+        raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")
     return state
 
 
@@ -71,7 +71,7 @@ def load_fit(path: str | Path) -> Ring:
     """
     path = Path(path)
     path = path / "ring.pt" if path.is_dir() else path
-    state = read_state(path, ADVICE)
+    state = read_state(path, "a saved fit", ADVICE)
     if "format" not in state or "networks" not in state:
         raise InputError(f"{path}: not a saved fit; {ADVICE}")
     version = state["format"]

@@ -63,7 +63,7 @@ def cores() -> int:
     """Of the processor, those that this process may use: by its affinity, and by the quota of its container."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return max(1, min(count, math.ceil(quota(Path("/sys/fs/cgroup")))))
+    return max(1, math.ceil(min(count, quota(Path("/sys/fs/cgroup")))))
 
 
 def quota(root: Path) -> float:

@@ -1,0 +1,138 @@
+"""The machine that all runs on: cores, threads, files, and how a command ends."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from mi_ring.errors import InputError
+from mi_ring.nets import chunks
+from mi_ring.system import command, files, machine
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def test_quota_of_a_container_by_version_1(tmp_path):
+    assert machine.quota(tmp_path) == float("inf")
+    write(tmp_path / "cpu/cpu.cfs_quota_us", "150000\n")
+    write(tmp_path / "cpu/cpu.cfs_period_us", "100000\n")
+    assert machine.quota(tmp_path) == 1.5
+    write(tmp_path / "cpu/cpu.cfs_quota_us", "-1\n")
+    assert machine.quota(tmp_path) == float("inf")
+
+
+def test_quota_of_a_container_by_version_2(tmp_path):
+    write(tmp_path / "cpu.max", "300000 100000\n")
+    assert machine.quota(tmp_path) == 3
+    write(tmp_path / "cpu.max", "max 100000\n")
+    assert machine.quota(tmp_path) == float("inf")
+    write(tmp_path / "cpu.max", "nonsense\n")
+    assert machine.quota(tmp_path) == float("inf")
+
+
+def test_cores_are_at_least_one_and_heed_the_quota(monkeypatch):
+    monkeypatch.setattr(machine, "quota", lambda root: 0.3)
+    assert machine.cores() == 1
+    monkeypatch.setattr(machine, "quota", lambda root: float("inf"))
+    if hasattr(os, "sched_getaffinity"):
+        assert machine.cores() == len(os.sched_getaffinity(0))
+        monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS and Windows
+    assert machine.cores() == os.cpu_count()
+
+
+@pytest.mark.parametrize("error", [TypeError, OSError, AttributeError])
+def test_where_there_is_no_glibc_memory_is_left_alone(error, monkeypatch):
+    def cdll(name):
+        raise error("no such library")
+
+    monkeypatch.setattr(machine.ctypes, "CDLL", cdll)
+    machine.keep_memory()
+
+
+def test_workers_are_kept_and_their_one_thread_does_not_spread():
+    """Torch takes what a thread sets for the number of all threads started later."""
+    torch.set_num_threads(2)
+    chunks._pool = None
+    names = set()
+    for _ in range(3):
+        names |= set(chunks.in_parallel(lambda k: threading.current_thread().name, range(8)))
+    assert len(names) <= 2 and all(name.startswith("mi_ring") for name in names)
+    assert chunks.in_parallel(lambda k: torch.get_num_threads(), [0, 1]) == [1, 1]
+    seen = []
+    thread = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert seen == [2] and torch.get_num_threads() == 2
+
+
+def test_a_second_fit_into_a_folder_is_refused_while_the_first_writes(tmp_path):
+    code = """
+import sys, pathlib
+from mi_ring.system.files import locked
+with locked(pathlib.Path(sys.argv[1])):
+    print("locked", flush=True)
+    sys.stdin.readline()
+"""
+    folder = tmp_path / "out" / "pot"
+    holder = subprocess.Popen([sys.executable, "-c", code, folder], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"locked\n"
+    with pytest.raises(InputError, match="pot: --out: another fit is writing there"), files.locked(folder):
+        pass
+    with files.locked(folder.with_name("other")):
+        pass
+    holder.kill()
+    holder.wait()
+    with files.locked(folder):  # a lock goes with its process, however that ends
+        pass
+    assert not list(folder.parent.iterdir())
+
+
+def test_names_of_files_that_grow_are_unlike(tmp_path):
+    names = {files.partial_path(tmp_path / "ring.pt") for _ in range(100)}
+    assert len(names) == 100 and {name.parent for name in names} == {tmp_path}
+
+
+def ends(main, *arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.fit", main, list(arguments))
+    return stop.value.code, capsys.readouterr().err
+
+
+def test_only_mistakes_of_the_user_are_one_line(capsys, tmp_path):
+    def mistaken(arguments):
+        raise InputError("pot.xml: no such file")
+
+    def gone(arguments):
+        open(tmp_path / "gone")
+
+    assert ends(mistaken, capsys=capsys) == (2, "mi_ring.fit: pot.xml: no such file\n")
+    assert ends(gone, capsys=capsys) == (2, f"mi_ring.fit: {tmp_path / 'gone'}: No such file or directory\n")
+    with pytest.raises(InputError):
+        command.run("mi_ring.fit", mistaken, ["--traceback"])
+    for error in (OSError("of ours, without number or file"), ValueError("of ours"), KeyError("of ours")):
+
+        def broken(arguments, error=error):
+            raise error
+
+        with pytest.raises(type(error)):
+            command.run("mi_ring.fit", broken, [])
+
+
+def test_traceback_is_no_argument_of_the_command(capsys):
+    assert ends(lambda arguments: 0 if arguments == ["a"] else 3, "a", "--traceback", capsys=capsys)[0] == 0
+
+
+def test_a_reader_that_goes_away_is_no_mistake():
+    """`mi-ring fit --help | head -1`."""
+    code = "import subprocess, sys; sys.exit(subprocess.run([sys.executable, '-m', 'mi_ring.fit', '--help']).returncode)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.read(1)
+    process.stdout.close()
+    assert b"Traceback" not in process.stderr.read()
+    process.wait()
