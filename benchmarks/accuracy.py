@@ -62,6 +62,9 @@ def processor() -> str:
 
 def watch() -> dict[str, float]:
     """Seconds by part of all fits of this process, from now on."""
+    from mi_ring.fitting.muon import Muon  # here, not in the parent: a process begins with its parent's peak memory
+    from mi_ring.nets import shapenet
+    from mi_ring.rendering import bridge
 
     # isort: split
     import torch
@@ -82,7 +85,7 @@ def watch() -> dict[str, float]:
     for part, cls in (("flow", shapenet._Flow), ("rendering", bridge._Render)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
     bridge.interreflection = timed("rendering", bridge.interreflection)
-    for cls in (torch.optim.Adam, torch.optim.Muon):
+    for cls in (torch.optim.Adam, Muon):
         cls.step = timed("optimiser", cls.step)
     return seconds
 
@@ -131,6 +134,10 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """
     started = time.perf_counter()
     seconds, parts = watch(), collections.Counter()
+    from mi_ring import fit
+    from mi_ring.metrics import surfaces
+    from mi_ring.rendering import plain_mesh
+    from mi_ring.system import machine
 
     # isort: split
     import numpy as np
@@ -142,18 +149,18 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
         def step(self):
             nonlocal running
             running, before = self, dict(seconds)
-            terms = super().step()
+            it = super().step()
             parts.update({part: seconds[part] - before[part] for part in seconds})
             if self.iteration * points // self.iterations > len(course):
                 course.append((self.seconds, copy.deepcopy(self.ring.state_dict())))
-            return terms
+            return it
 
     fit.Fit = Watched
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
         fit.main(arguments)
     wall = time.perf_counter() - started
     memory = peak_memory()
-    with machine.threads_of(running.config):
+    with machine.threads_of(0):
         speed = product_speed(4096, 4096, torch.float32)
 
     (mesh, true), ring = surfaces.load_true_mesh(truth / "mesh.ply"), running.ring

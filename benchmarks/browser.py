@@ -22,24 +22,21 @@ from accuracy import processor
 from playwright.sync_api import sync_playwright
 
 from mi_ring.capture import loading
-from mi_ring.capture.capture import camera_of
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import light_of
-from mi_ring.ring.ring import Ring
+from mi_ring.rendering.lights import Lights
 from mi_ring.ring.saved import load_fit
 
 
 def photograph(sensor) -> dict:
     """A photograph as the viewer's `draw` takes it. Raises ValueError if its light is no point."""
-    matrix, (fx, fy), (cx, cy) = camera_of(sensor)
-    x, y, z, distant, *intensity = np.ravel(light_of(sensor))[:7].tolist()
-    if distant:
+    matrix, (fx, fy), (cx, cy), (width, height) = sensor.camera
+    light = Lights.of([sensor])[0]
+    if light.kind == "directional":
         raise ValueError("the viewer has a point light, this photograph a distant one")
-    width, height = sensor.size
     return {
         "to_world": matrix.ravel().tolist(), "fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy),
-        "width": width, "height": height, "light": {"position": [x, y, z], "intensity": intensity},
+        "width": width, "height": height, "light": {"position": light.vector.tolist(), "intensity": light.rgb.tolist()},
     }  # fmt: skip
 
 

@@ -21,11 +21,7 @@ from pathlib import Path
 
 from accuracy import alone, peak_memory, processor, table, watch
 
-from mi_ring import fit
-from mi_ring.capture.loading import load_capture
-from mi_ring.fitting import fit
 from mi_ring.fitting.config import Config
-from mi_ring.system import machine
 
 VARIED = {
     "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (3, 10, 20), "spp": (4,),
@@ -54,16 +50,20 @@ def repeated(scene: Path, photographs: int, folder: Path) -> Path:
 def iterations(scene: Path, preset: str, settings: dict) -> dict:
     """Median seconds of an iteration and of its parts, seconds until the first, peak memory [GiB]."""
     seconds = watch()
+    from mi_ring import fit
+    from mi_ring.capture.loading import load_capture
+    from mi_ring.fitting.fit import Fit
+    from mi_ring.system import machine
 
     width = settings["width"]
     words = {"preset": preset, "domain": "sphere", "levels": settings["level"], "widths": width, "shares": 1,
              "batch": settings["batch"], "steps": settings["steps"], "spp": settings["spp"]}  # fmt: skip
-    config = fit.parse([str(scene), *(word for name, v in words.items() for word in (f"--{name}", str(v)))])
+    config = fit.parse_options([str(scene), *(word for name, v in words.items() for word in (f"--{name}", str(v)))])
     machine.keep_memory()
     started = time.perf_counter()
     photographs = load_capture(scene)
-    machine.set_threads(config)
-    running = fit.Fit(photographs, config)
+    machine.set_threads()
+    running = Fit(photographs, config)
     loading, times, parts = time.perf_counter() - started, [], []
     for k, sensor in enumerate(running.capture.sensors):  # as later in a fit, where what is decoded is remembered
         if width < sensor.size[0]:

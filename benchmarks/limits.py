@@ -15,8 +15,8 @@ from accuracy import median_seconds, processor, product_speed, table, there_and_
 
 from mi_ring import fit
 from mi_ring.capture import loading
-from mi_ring.fitting import fit
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.mlp import SLOPE
 from mi_ring.nets.shapenet import ShapeNet
@@ -76,7 +76,7 @@ def layer(level: int) -> str:
     return f"One hidden layer of {count:,} vertices in bfloat16:\n\n" + table(["part", "ms"], lines)
 
 
-def rendering(running: fit.Fit, level: int) -> str:
+def rendering(running: Fit, level: int) -> str:
     """The table of the renderer, of the start surface."""
     surface, size = running.surface, running.capture.sensors[0].size
     photographs = running.capture.photographs.select(running.capture.sizes[size][:8], size)
@@ -120,13 +120,13 @@ def main() -> None:
     parser.add_argument("--level", type=int, default=5)
     parser.add_argument("--steps", type=int, default=Config.steps)
     arguments = parser.parse_args()
-    scene, config = loading.load_capture(arguments.scene), fit.parse([str(arguments.scene)])
-    machine.set_threads(config)
+    scene, config = loading.load_capture(arguments.scene), fit.parse_options([str(arguments.scene)])
+    machine.set_threads()
     machine.keep_memory()
     print(f"{processor()}; {datetime.date.today()}; {torch.get_num_threads()} threads\n")
     print(flow(arguments.level, arguments.steps), end="\n\n")
     print(layer(arguments.level), end="\n\n")
-    print(rendering(fit.Fit(scene, config), arguments.level))
+    print(rendering(Fit(scene, config), arguments.level))
 
 
 if __name__ == "__main__":

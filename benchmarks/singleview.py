@@ -64,15 +64,18 @@ def write_scene(data, folder: Path) -> Path:
 
 def fit(file: Path, out: Path, options: list[str]) -> dict:
     """Fit one object in this process and compare its normals with the measured ones."""
+    from mi_ring import fit as command  # here, not in the parent: a process begins with its parent's peak memory
+    from mi_ring.capture.loading import load_capture
+    from mi_ring.metrics import surfaces
 
     with np.load(file) as archive:
         data = dict(archive)
     mi.set_variant("llvm_ad_rgb")
     scene = write_scene(data, out / "scene")
     with contextlib.redirect_stdout(sys.stderr):  # what goes to stdout is Markdown
-        fit.main([str(scene), "--out", str(out / "run"), *options])
+        command.main([str(scene), "--out", str(out / "run"), *options])
     _, surface = surfaces.load_true_mesh(out / "run" / "mesh.ply")
-    seen, _, normals, _ = surfaces.hits(surface, loading.load_capture(scene).photograph(0))
+    seen, _, normals, _ = surfaces.hits(surface, load_capture(scene).photograph(0))
     inside = ((data["mask"] > 0) & data["normal_gt"].any(-1)).ravel()  # along the cat's outline none are measured
     angles = np.full(len(inside), 90.0)  # where the surface is not: as wrong as can be
     cosine = (normals * AXES * data["normal_gt"].reshape(-1, 3)).sum(1)

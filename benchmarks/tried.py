@@ -11,7 +11,6 @@ import time
 
 from accuracy import alone, median_seconds, peak_memory, processor, table, there_and_back
 
-from mi_ring import fit
 from mi_ring.fitting.config import Config
 from mi_ring.geometry.domain import Sphere
 from mi_ring.images import blur
@@ -56,7 +55,7 @@ def euler_by_autograd(net):
 
 def flow_memory(by_hand: bool, level: int, steps: int) -> float:
     """GiB that forward and backward pass of the flow take."""
-    machine.set_threads(fit.parse(["scene.xml"]))
+    machine.set_threads()
     net, (s, _) = shapenet.ShapeNet(steps), Sphere().sample(level)
     there_and_back(net, s[:100], AUTOCAST)()  # what is needed for the first time only
     before = peak_memory()
@@ -77,7 +76,7 @@ def chunked(net, s, points):
 
 def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
-    machine.set_threads(fit.parse(["scene.xml"]))
+    machine.set_threads()
     torch.manual_seed(0)
     return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0], AUTOCAST))[0]
 
@@ -109,7 +108,7 @@ def main() -> None:
     arguments = parser.parse_args()
     returned = alone(with_returned_memory, arguments.level, arguments.steps)
     memory = [alone(flow_memory, by_hand, arguments.level, arguments.steps) for by_hand in (True, False)]
-    machine.set_threads(fit.parse(["scene.xml"]))
+    machine.set_threads()
     machine.keep_memory()
     torch.manual_seed(0)
     s = Sphere().sample(arguments.level)[0]

@@ -28,26 +28,25 @@ if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
     from mi_ring.fitting.iteration import Iteration
     from mi_ring.fitting.terms import Term, default_terms
-    from mi_ring.nets.brdfnet import ReflectanceMap
+    from mi_ring.nets.brdfnet import BRDFNet, ReflectanceMap
     from mi_ring.nets.mlp import plain_autograd
     from mi_ring.nets.registry import register_network
-    from mi_ring.nets.shapenet import Flow
+    from mi_ring.nets.shapenet import Flow, ShapeNet
     from mi_ring.ring.ring import Ring
     from mi_ring.ring.saved import load_fit
 
 #: The Python API: names and the modules that they are read from.
 _API = {
-    "Capture": "capture.capture", "load_capture": "capture.loading", "InputError": "errors", "Config": "fitting.config",
+    "InputError": "errors", "Capture": "capture.capture", "load_capture": "capture.loading", "Config": "fitting.config",
     "Fit": "fitting.fit", "Iteration": "fitting.iteration", "Term": "fitting.terms", "default_terms": "fitting.terms",
-    "Flow": "nets.shapenet", "ReflectanceMap": "nets.brdfnet", "register_network": "nets.registry",
-    "plain_autograd": "nets.mlp", "Ring": "ring.ring", "load_fit": "ring.saved",
+    "ShapeNet": "nets.shapenet", "Flow": "nets.shapenet", "BRDFNet": "nets.brdfnet", "ReflectanceMap": "nets.brdfnet",
+    "register_network": "nets.registry", "plain_autograd": "nets.mlp", "Ring": "ring.ring", "load_fit": "ring.saved",
 }  # fmt: skip
 
 __all__ = [
-    "Capture", "Config", "Fit", "Flow", "InputError", "Iteration", "ReflectanceMap", "Ring", "Term", "__version__",
-    "default_terms", "load_capture", "load_fit", "plain_autograd", "register_network",
+    "BRDFNet", "Capture", "Config", "Fit", "Flow", "InputError", "Iteration", "ReflectanceMap", "Ring", "ShapeNet",
+    "Term", "__version__", "default_terms", "load_capture", "load_fit", "plain_autograd", "register_network",
 ]  # fmt: skip
-
 
 def __getattr__(name: str):
     if name not in _API:

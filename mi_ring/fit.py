@@ -68,7 +68,7 @@ class FitConfig(Config, Task):
 
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
-    config = parse(arguments)
+    config = parse_options(arguments)
     require_file(config.scene, "the XML file of a scene")
     config = dataclasses.replace(config, variant=set_variant(config.variant))
     folder = config.folder
@@ -86,14 +86,14 @@ def main(arguments: Sequence[str]) -> int:
         results.fitted_scene(fit, folder)  # refuses what cannot be written later
         with locked(folder):
             options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-            results.prepare(folder, config.scene, options, config.resume)
+            results.prepare_folder(folder, config.scene, options, config.resume)
             interrupted = run_session(fit, folder)
     if interrupted:
         print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
     return 130 if interrupted else 0
 
 
-def parse(arguments: Sequence[str]) -> FitConfig:
+def parse_options(arguments: Sequence[str]) -> FitConfig:
     """The configuration: the preset's settings under those given on the command line."""
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     early.add_argument("--preset", nargs="?", default="default")

@@ -243,7 +243,7 @@ def test_a_full_disk(file, small_capture, tmp_path, capsys, full_disk):
 def test_a_log_that_cannot_be_continued(tmp_path):
     os.symlink("/dev/full", tmp_path / "log.jsonl")
     with pytest.raises(InputError, match="log.jsonl: cannot be written"):
-        results.log(tmp_path, {"iteration": 5})
+        results.add_to_log(tmp_path, {"iteration": 5})
 
 
 def test_after_a_full_disk_the_fit_goes_on(small_capture, tmp_path, monkeypatch, capsys, full_disk):

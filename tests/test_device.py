@@ -83,7 +83,7 @@ def test_fit_switches_to_the_variant_asked_for(small_capture, tmp_path):
 
 def test_determinism_is_refused_on_a_gpu():
     with pytest.raises(InputError, match="--deterministic: needs --variant llvm_ad_rgb"):
-        fit.parse(["scene.xml", "--deterministic", "--variant", "cuda_ad_rgb"])
+        fit.parse_options(["scene.xml", "--deterministic", "--variant", "cuda_ad_rgb"])
 
 
 @needs_gpu

@@ -85,7 +85,7 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
     s, _ = Sphere().sample(3)
 
     def value(precision):
-        running = Fit(load_capture(small_capture), fit.parse([str(small_capture), "--precision", precision]))
+        running = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--precision", precision]))
         running.ring.shape_net.output.weight.data.mul_(30)
         return terms.velocity(SimpleNamespace(fit=running, s=s)).item()
 
@@ -168,10 +168,10 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture
     for name in ("a", "b"):
         assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
 
-    interrupted = fit.parse([*arguments, "--out", str(tmp_path / "c")])
+    interrupted = fit.parse_options([*arguments, "--out", str(tmp_path / "c")])
     with machine.threads_of(1):
         first = Fit(load_capture(small_capture), interrupted)
-        results.prepare(tmp_path / "c", small_capture, interrupted.settings())
+        results.prepare_folder(tmp_path / "c", small_capture, interrupted.settings())
         session.train(first, tmp_path / "c", lambda: first.iteration == 9)  # in the second stage
     assert fit.main([*arguments, "--out", str(tmp_path / "c"), "--resume"]) == 0
 
@@ -193,7 +193,7 @@ def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture)
     triangle.export(path.parent / "own.ply", vertex_normal=True)
     others = "".join(f'<shape type="ply"><string name="filename" value="{n}.ply"/></shape>' for n in ("none", "own"))
     edit("</scene>", others + "</scene>")
-    config = fit.parse([str(path), "--deterministic"])
+    config = fit.parse_options([str(path), "--deterministic"])
     seen = set()
     for _ in range(3):
         scene = load_capture(path)
@@ -235,7 +235,7 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
 
     monkeypatch.setattr(bridge, "interreflection", glare)
     for options, bright in (([], True), (["--no-indirect"], False)):
-        first = Fit(load_capture(small_capture), fit.parse([str(small_capture), *QUICK, *options]))
+        first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *QUICK, *options]))
         assert (first.step().terms["rgb"] > 100) == bright
 
 
@@ -253,7 +253,7 @@ def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatc
     monkeypatch.setattr(bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
-        Fit(load_capture(path), fit.parse([str(path), *QUICK, *options])).step()
+        Fit(load_capture(path), fit.parse_options([str(path), *QUICK, *options])).step()
 
     step()
     step("--no-shadows")
@@ -319,7 +319,7 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
 
 
 def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path, monkeypatch):
-    config = fit.parse([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
+    config = fit.parse_options([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
     before = Fit(load_capture(small_capture), config)
     assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
     for _ in range(3):
@@ -537,7 +537,7 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
 )
 def test_an_unusable_option_is_one_line_that_names_it(options, words):
     with pytest.raises(InputError) as error:
-        fit.parse(["scene.xml", *options])
+        fit.parse_options(["scene.xml", *options])
     complaint = str(error.value)
     assert complaint.startswith(words[0]) and "\n" not in complaint and all(word in complaint for word in words)
 
@@ -550,7 +550,7 @@ def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid_and_can_be_overridden(preset):
-    config = fit.parse(["scene.xml", "--preset", preset, "--seed", "7"])
+    config = fit.parse_options(["scene.xml", "--preset", preset, "--seed", "7"])
     assert config.preset == preset and config.seed == 7
     stages = stages_of(config)
     assert stages[0].first == 0 and stages[-1].last == config.iterations
@@ -568,7 +568,7 @@ def test_starts_near_the_object_spend_less_on_the_coarse_stage():
 
 
 def test_paper_preset_is_the_papers():
-    config = fit.parse(["scene.xml", "--preset", "paper"])
+    config = fit.parse_options(["scene.xml", "--preset", "paper"])
     assert config.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.01} and config.loss == "l2"
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
     assert config.levels == (5, 6) and [s.last - s.first for s in stages_of(config)] == [2000, 4000]
@@ -584,7 +584,7 @@ def test_regulariser_is_relaxed_and_nothing_else():
 
 def test_help_names_every_option(capsys):
     with pytest.raises(SystemExit) as stop:
-        fit.parse(["--help"])
+        fit.parse_options(["--help"])
     text = capsys.readouterr().out
     assert stop.value.code == 0
     for name in fit.FitConfig.__dataclass_fields__:

@@ -18,14 +18,16 @@ FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 #: What takes the place of each notebook's own parameters. View 5 of these is photograph 020.
 SMALL = ["--iterations", "6", "--levels", "4", "--widths", "64", "--shares", "1", "--subdivisions", "4"]
+SMALL_SETTINGS = {"iterations": 6, "levels": (4,), "widths": (64,), "shares": (1.0,), "subdivisions": 4}
 QUICK = {
     "1_first_fit": {"options": SMALL, "view": 5, "spp": 4},
     "2_plugins": {"size": 40, "spp": 4},
     "3_read_a_run": {"view": 5, "spp": 4},
     "4_relight_and_swap": {
-        "settings": {"iterations": 4, "levels": (4,), "widths": (64,), "shares": (1.0,), "subdivisions": 4},
+        "settings": SMALL_SETTINGS,
         "size": 40, "spp": 4, "texels": 64, "turntable": 3,
     },
+    "5_own_parts": {"settings": SMALL_SETTINGS, "every": 3},
 }  # fmt: skip
 
 
@@ -117,7 +119,11 @@ def test_notebooks_run_in_order(tmp_path):
     exported = trimesh.load(run / "object.glb", force="mesh")
     assert np.allclose(exported.bounds, mesh.bounds, atol=0.01 * mesh.scale)
     assert exported.visual.material.baseColorTexture.size == (64, 64)
-    assert (run / "other.pt").is_file()
+    assert (run.parent / "other_glaze" / "ring.pt").is_file()
     assert (run / "turntable.mp4").read_bytes()[4:8] == b"ftyp"
+
+    fifth = execute(tmp_path, "5_own_parts")
+    assert pictures(fifth) == 1 and "silhouettes" in printed(fifth)
+    assert json.loads((run.parent / "own_parts" / "log.jsonl").read_text().splitlines()[-1])["silhouettes"] > 0
     assert {path.name for path in tmp_path.iterdir()} == {"notebooks", "scenes", "out"}
     assert {path.suffix for path in (tmp_path / "notebooks").iterdir()} == {".ipynb"}  # nothing is left beside them

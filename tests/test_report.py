@@ -17,7 +17,6 @@ from playwright.sync_api import sync_playwright
 
 from mi_ring import fit, images
 from mi_ring.capture.loading import load_capture
-from mi_ring.fitting import session
 from mi_ring.fitting.fit import Fit
 from mi_ring.output import report
 
@@ -62,11 +61,11 @@ def glb(positions, normals, uv, faces, image, scale=1.0):
 
 @pytest.fixture(scope="module")
 def fitted(small_capture):
-    """A quick fit and its log."""
-    fitted = Fit(load_capture(small_capture), fit.parse([str(small_capture), "--iterations", "50", *QUICK]))
-    log = [session.log_entry(it) for it in fitted]
+    """A quick fit."""
+    fitted = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--iterations", "50", *QUICK]))
+    assert len(list(fitted)) == 50
     fitted.surface.show(fitted.ring, *fitted.ring.domain.sample(3))
-    return fitted, log
+    return fitted
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +76,7 @@ def page_file(fitted, tmp_path_factory):
     file = tmp_path_factory.mktemp("report") / "report.html"
     faces = np.arange(len(corners)).reshape(-1, 3)
     box = glb(corners, normals, 0 * corners[:, :2], faces, np.tile(COLOUR.astype(np.uint8), (5, 7, 1)))
-    file.write_text(report.report_html(*fitted, box), "utf-8")
+    file.write_text(report.report_html(fitted, box), "utf-8")
     return file
 
 
@@ -126,7 +125,7 @@ def test_it_is_one_self_contained_file(page_file, fitted):
     assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
     assert page.count("<script") == page.count("</script>") == 4 and "<link" not in page
     assert all(f"{k:03}.png" in body for k in range(12))
-    without = report.report_html(*fitted)
+    without = report.report_html(fitted)
     assert without.count("<script") == 1 and "<canvas" not in without
 
 
@@ -225,7 +224,7 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     corners = corner + np.array([0 * u, u, u + v, v])
     file = tmp_path / "parallelogram.html"
     uv, faces = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
-    file.write_text(report.report_html(*fitted, glb(corners, [normal] * 4, uv, faces, image, 0.8)), "utf-8")
+    file.write_text(report.report_html(fitted, glb(corners, [normal] * 4, uv, faces, image, 0.8)), "utf-8")
 
     origin, light = corner + np.array([[4.0, 0.5, 16.0], [-3.0, 5.0, 11.0]])
     forward = corner + 0.4 * u + 0.6 * v - origin
@@ -322,7 +321,6 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
 
 
 def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capture, broken_capture, monkeypatch):
-    fitted, _ = fitted
     names = fitted.capture.names
     good = [report.panel_of(fitted, k, names[k])[0] for k in range(12)]
     assert not report.fit_findings(good, 50, 50)
@@ -342,7 +340,6 @@ def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monk
     inside = np.argwhere(mask)
     image[tuple(inside[: len(inside) // 4].T)] = 255
     Image.fromarray(image).save(path.parent / "images" / "003.png")
-    fitted, _ = fitted
     monkeypatch.setattr(fitted, "capture", load_capture(path))
     assert report.panel_of(fitted, 3, "003.png")[0].saturated == pytest.approx(0.25, abs=0.01)
 

@@ -27,6 +27,7 @@ from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device
 
+LOG_EVERY = 5  #: iterations between entries of the log
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -71,6 +72,7 @@ class Fit:
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
         self.iteration, self.seconds = 0, 0.0
+        self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
@@ -88,7 +90,7 @@ class Fit:
                              "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and math.pi * scale < 1
         if networks:
-            networks[1].predict(parameters, scale)
+            networks[1].set_parameters(parameters, scale)
         ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
                     networks)  # fmt: skip
         require_networks(ring)
@@ -117,6 +119,8 @@ class Fit:
         it.detach()
         self.iteration += 1
         self.seconds += time.perf_counter() - started
+        if it.number % LOG_EVERY == 0 or it.number == self.iterations:
+            self.log.append(it.entry())
         for callback in self.callbacks:
             callback(it)
         return it
@@ -219,6 +223,7 @@ class Fit:
             "random": self.random.get_state(),
             "iteration": self.iteration,
             "seconds": self.seconds,
+            "log": self.log,
         })
 
     def restore(self, state: dict) -> None:
@@ -226,7 +231,7 @@ class Fit:
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
-        self.iteration, self.seconds = state["iteration"], state["seconds"]
+        self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
 
 
 def require_networks(ring: Ring) -> None:

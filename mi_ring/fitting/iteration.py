@@ -42,6 +42,15 @@ class Iteration:
     terms: dict[str, float] = field(default_factory=dict)  #: unweighted, by name
     weights: dict[str, float] = field(default_factory=dict)  #: of the terms, in this iteration
 
+    def entry(self) -> dict:
+        """A line of the log. The terms of the loss, under their own names, are unweighted."""
+        fit = self.fit
+        return {
+            "iteration": self.number, "seconds": round(fit.seconds, 3), "loss": self.loss, **self.terms,
+            "weights": self.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
+            "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices),
+        }  # fmt: skip
+
     def detach(self) -> None:
         """Let go of the graph, when the backward pass is done."""
         self.vertices, self.predicted, self.coverage = (

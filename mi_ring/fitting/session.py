@@ -10,11 +10,9 @@ from tqdm import tqdm
 
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.iteration import Iteration
 from mi_ring.output import results
 
 CHECKPOINT_SECONDS = 30.0
-LOG_EVERY = 5
 FIXED_WORK = 3000  #: what an iteration costs besides its vertices, in vertices: for the time left
 
 
@@ -44,7 +42,7 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
         total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
-    results.start_log(folder, fit.iteration)
+    results.write_log(folder, fit.log)
     with bar:
         while fit.iteration < fit.iterations and not interrupted():
             it = fit.step()
@@ -53,22 +51,12 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
-            if it.number % LOG_EVERY == 0 or it.number == fit.iterations:
-                results.log(folder, log_entry(it))
+            if fit.log[-1:] and fit.log[-1]["iteration"] == it.number:
+                results.add_to_log(folder, fit.log[-1])
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 write_checkpoint(fit, files, folder)
                 saved = time.monotonic()
     write_checkpoint(fit, files, folder)
-
-
-def log_entry(it: Iteration) -> dict:
-    """A line of log.jsonl. The terms of the loss, under their own names, are unweighted."""
-    fit = it.fit
-    return {
-        "iteration": it.number, "seconds": round(fit.seconds, 3), "loss": it.loss, **it.terms, "weights": it.weights,
-        "learning_rate": fit.optimizers[0].param_groups[0]["lr"], "stage": fit.stages.index(it.stage) + 1,
-        "vertices": len(it.vertices),
-    }  # fmt: skip
 
 
 def run_session(fit: Fit, folder: Path) -> bool:

@@ -34,7 +34,7 @@ class ReflectanceMap(nn.Module):
     """The parameters of a BSDF as functions of the domain point, each within its range.
 
     What BRDF-Net is, and what a network of one's own in its place must be: a subclass with an `evaluate`, whose outputs
-    begin around 0. A fit says by `predict` which parameters are meant, and how bright.
+    begin around 0. A fit says by `set_parameters` which parameters are meant, and how bright.
     """
 
     bsdf_parameters: tuple[Parameter, ...]
@@ -43,9 +43,9 @@ class ReflectanceMap(nn.Module):
     def __init__(self, parameters: Sequence[Parameter] = COOK_TORRANCE, scale: float = 1.0):
         super().__init__()
         self.register_buffer("scale", torch.tensor(float(scale)))
-        self.predict(parameters, scale)
+        self.set_parameters(parameters, scale)
 
-    def predict(self, parameters: Sequence[Parameter], scale: float) -> None:
+    def set_parameters(self, parameters: Sequence[Parameter], scale: float) -> None:
         """Take these parameters for what the outputs mean, in their order, a colour as three."""
         self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.scale.fill_(scale)
@@ -86,7 +86,7 @@ class BRDFNet(MLP, ReflectanceMap):
 
     def __init__(self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE):
         super().__init__(depth=5, outputs=sum(Parameter(*p).channels for p in parameters))
-        self.predict(parameters, scale)
+        self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
         """What makes it anew; `scale` is among the weights."""

@@ -38,7 +38,7 @@ class PhotographPanel:
     pictures: dict[str, str]
 
 
-def report_html(fit, log: list[dict], glb: bytes | None = None) -> str:
+def report_html(fit, glb: bytes | None = None) -> str:
     """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer."""
     capture, ring = fit.capture, fit.ring
     rows, errors = [], []
@@ -62,7 +62,7 @@ def report_html(fit, log: list[dict], glb: bytes | None = None) -> str:
     files = resources.files("mi_ring.output")
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
-        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(log, fit), settings=fit.config.settings(),
+        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit), settings=fit.config.settings(),
         findings=fit_findings(rows, fit.iteration, fit.iterations), view=first_view(fit),
         glb=glb and base64.b64encode(glb).decode(), viewer=files.joinpath("viewer", "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
@@ -184,13 +184,13 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def loss_curve(log: list[dict], fit) -> str:
+def loss_curve(fit) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()
     for term in ("loss", *fit.terms):
         points = []
-        for entry in log:
+        for entry in fit.log:
             weight = 1.0 if term == "loss" else entry["weights"].get(term, 0.0)
             points.append((entry["iteration"], weight * entry.get(term, 0.0)))
         points = [(iteration, value) for iteration, value in points if value > 0]
@@ -202,7 +202,7 @@ def loss_curve(log: list[dict], fit) -> str:
             axes.axvline(stage.first, color="0.7", linewidth=1, linestyle=":")
     axes.set_xlabel("iteration (dotted: next stage)")
     axes.grid(alpha=0.3)
-    if log:
+    if fit.log:
         figure.legend(loc="outside right upper")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg")

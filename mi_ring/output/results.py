@@ -34,7 +34,7 @@ def default_folder(scene: Path) -> Path:
     return folder
 
 
-def prepare(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
+def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
     """Make the folder and write config.json: the options as used, the scene's file relative to the folder.
 
     A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
@@ -56,8 +56,8 @@ def prepare(folder: Path, scene: Path, options: dict, resume: bool = False) -> N
 def save_fit(folder: Path, fit) -> None:
     """All results of a `Fit`, finished or not, into a folder of its own."""
     with locked(folder):
-        prepare(folder, fit.capture.path, fit.config.settings())
-        start_log(folder, 0)
+        prepare_folder(folder, fit.capture.path, fit.config.settings())
+        write_log(folder, fit.log)
         write(folder, fit, fitted_scene(fit, folder))
 
 
@@ -66,14 +66,12 @@ def fitted_scene(fit, folder: Path) -> bytes:
     return fitted_scene_xml(fit.capture.path, folder, fit.ring.subdivisions, fit.ring.bsdf)
 
 
-def start_log(folder: Path, iteration: int) -> None:
-    """Make log.jsonl, or take those entries out that are after `iteration`: they will be written again."""
-    entries = read_log(folder) if iteration and (folder / "log.jsonl").exists() else []
-    text = "".join(json.dumps(entry) + "\n" for entry in entries if entry["iteration"] <= iteration)
-    write_file(folder / "log.jsonl", text)
+def write_log(folder: Path, entries: list[dict]) -> None:
+    """log.jsonl of so many entries."""
+    write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
-def log(folder: Path, entry: dict) -> None:
+def add_to_log(folder: Path, entry: dict) -> None:
     """One more line of log.jsonl."""
     path = folder / "log.jsonl"
     with writing(path), path.open("a") as file:
@@ -116,7 +114,7 @@ def write(folder: Path, fit, scene: bytes) -> None:
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)
-    write_file(folder / "report.html", report.report_html(fit, read_log(folder), viewed(fit.ring)))
+    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring)))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 

@@ -97,6 +97,12 @@ def share_of(file: Path) -> float:
         return math.inf
 
 
+def set_threads(count: int = 0) -> None:
+    """Have torch and Dr.Jit use so many threads, by default all `cores`."""
+    torch.set_num_threads(count or cores())
+    dr.set_thread_count(count or cores())
+
+
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
     """So many threads of torch and Dr.Jit, by default all `cores`, and those of before at the end.
@@ -105,8 +111,7 @@ def threads_of(count: int = 0) -> Iterator[None]:
     one, Mitsuba waits forever for an EXR.
     """
     before = torch.get_num_threads(), dr.thread_count()
-    torch.set_num_threads(count or cores())
-    dr.set_thread_count(count or cores())
+    set_threads(count)
     try:
         yield
     finally:
