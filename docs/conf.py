@@ -6,6 +6,7 @@ import importlib
 import inspect
 import io
 import os
+import pkgutil
 import sys
 import textwrap
 from pathlib import Path
@@ -15,11 +16,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 os.environ["COLUMNS"] = "100"  # of the commands' help
 
 from docutils import nodes
+from sphinx.ext.napoleon import Config, GoogleDocstring
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import make_refnode
 
-from mi_ring.command import COMMANDS, summary
-from mi_ring.formats import FORMATS
+import mi_ring
+from mi_ring.__main__ import COMMANDS, summary
+from mi_ring.importers.formats import FORMATS
 
 project, author = "mi_ring", "the authors of mi_ring"
 extensions = ["sphinx.ext.autodoc", "myst_parser", "sphinx_design"]
@@ -44,13 +47,16 @@ toc_object_entries = False
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 
+#: Where the names of the public API come from.
+PUBLIC = {name: f"mi_ring.{module}.{name}" for name, module in mi_ring._API.items()}
+
 #: Classes by the names of the plugins, whose pages are plugins/<name>.rst.
 PLUGINS = {
-    "photograph": "mi_ring.photograph.Photograph",
-    "flash": "mi_ring.photograph.Flash",
-    "shapenet": "mi_ring.mesh.ShapeNetMesh",
-    "cooktorrance": "mi_ring.bsdf.CookTorrance",
-    "photometric": "mi_ring.integrator.Photometric",
+    "photograph": "mi_ring.plugins.photograph.Photograph",
+    "flash": "mi_ring.plugins.flash.Flash",
+    "shapenet": "mi_ring.plugins.shapenet.ShapeNetMesh",
+    "cooktorrance": "mi_ring.plugins.cooktorrance.CookTorrance",
+    "photometric": "mi_ring.plugins.photometric.Photometric",
 }
 
 
@@ -86,7 +92,7 @@ class Commands(SphinxDirective):
 
 
 class Modules(SphinxDirective):
-    """`.. modules:: ring domain`: what these modules of the package offer, each under a heading."""
+    """`.. modules:: nets.shapenet errors`: what these modules of the package offer, each under a heading."""
 
     required_arguments, final_argument_whitespace = 1, True
 
@@ -94,7 +100,29 @@ class Modules(SphinxDirective):
         text = ""
         for name in self.arguments[0].split():
             text += f"{title(f'``mi_ring.{name}``', '~')}.. automodule:: mi_ring.{name}\n   :members:\n\n"
+            if public := [public for public, path in PUBLIC.items() if path.rpartition(".")[0] == f"mi_ring.{name}"]:
+                text += f"Of the public API, above: {', '.join(f'`mi_ring.{name}`' for name in public)}.\n\n"
         return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+class Room(SphinxDirective):
+    """`.. room:: nets`: what a room is, by its docstring, and all its modules."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        room = importlib.import_module(f"mi_ring.{name}")
+        self.env.note_dependency(inspect.getsourcefile(room))
+        self.env.note_reread()  # a module may have come
+        text = f"{inspect.getdoc(room).split('May import')[0]}\n\n.. modules:: {' '.join(modules_of(room))}\n"
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+def modules_of(package) -> list[str]:
+    """The names of the modules in a package and in its packages, without `mi_ring.`"""
+    found = pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    return sorted(module.name.partition(".")[2] for module in found if not module.ispkg)
 
 
 def title(text: str, line: str) -> str:
@@ -132,37 +160,46 @@ def signature(app, what, name, documented, options, arguments, returned):
 
 
 def skip(app, what, name, documented, skipped, options):
-    """Plugins have pages of their own."""
+    """Plugins have pages of their own, and the public API has a section of its own."""
+    if what == "module" and getattr(mi_ring, name, None) is documented and name in PUBLIC:
+        return True
     path = f"{getattr(documented, '__module__', '')}.{getattr(documented, '__qualname__', '')}"
     return True if path in PLUGINS.values() else None
 
 
 def clean(app, what, name, documented, options, lines):
-    """What a NamedTuple says of its fields by itself is of no use."""
+    """What a NamedTuple says of its fields by itself is of no use; functions may have sections as Google's do."""
     if lines and lines[0].startswith("Alias for field number"):
         lines.clear()
+    if what in ("function", "method"):
+        lines[:] = GoogleDocstring(lines, Config(), app, what, name, documented, options).lines()
 
 
-def link_plugins(app, env, node, content):
-    """The name of a plugin, in single backticks, is a link to its page."""
-    here, page = node["refdoc"], f"plugins/{node['reftarget']}"
-    if node["reftype"] == "obj" and node["reftarget"] in PLUGINS and here != page:
-        return make_refnode(app.builder, here, page, None, content)
+def link(app, env, node, content):
+    """The name of a plugin, in single backticks, is a link to its page; one of the public API to what is said there."""
+    here, target = node["refdoc"], node["reftarget"]
+    if node["reftype"] == "obj" and target in PLUGINS and here != f"plugins/{target}":
+        return make_refnode(app.builder, here, f"plugins/{target}", None, content)
+    name = target.rpartition(".")[2]
+    if target in (name, PUBLIC.get(name)) and name in PUBLIC:
+        return make_refnode(app.builder, here, "api", f"mi_ring.{name}", content)
     return None
 
 
 def setup(app):
     """What Sphinx calls."""
-    for module in (*COMMANDS, "config", "formats"):
-        for found in list(vars(importlib.import_module(f"mi_ring.{module}")).values()):
-            if dataclasses.is_dataclass(found):
+    for name in modules_of(mi_ring):
+        module = importlib.import_module(f"mi_ring.{name}")
+        for found in list(vars(module).values()):
+            if dataclasses.is_dataclass(found) and getattr(found, "__module__", "") == module.__name__:
                 plain(found)
                 plain(found.__init__)
     app.add_directive("plugin", Plugin)
     app.add_directive("commands", Commands)
     app.add_directive("modules", Modules)
+    app.add_directive("room", Room)
     app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-skip-member", skip)
     app.connect("autodoc-process-docstring", clean)
-    app.connect("missing-reference", link_plugins)
+    app.connect("missing-reference", link)
     return {"parallel_read_safe": True}

@@ -605,3 +605,20 @@ def test_writes_are_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         files.write_state({"iteration": 2}, path)
     assert torch.load(path) == {"iteration": 1}
+
+
+def test_scenes_of_the_same_name_do_not_share_a_folder_by_default(small_capture, broken_capture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    quick = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2"]
+    assert fit.main([str(small_capture), *quick]) == 0
+    assert fit.main([str(small_capture), *quick]) == 0  # the same scene: the first result is moved aside
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["small", "small.1"]
+    with pytest.raises(InputError, match="out/small: holds the results of another scene, .*small.xml; say with --out"):
+        fit.main([str(broken_capture[0]), *quick])
+    assert fit.main([str(broken_capture[0]), "--out", "out/mine", *quick]) == 0
+
+
+def test_two_fits_into_one_folder_are_refused(small_capture, tmp_path):
+    with files.locked(tmp_path / "run"), pytest.raises(InputError, match="run: --out: another fit is writing there"):
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK])
+    assert not (tmp_path / "run").exists()

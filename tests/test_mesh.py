@@ -8,9 +8,11 @@ import pytest
 import torch
 import trimesh
 
+import mi_ring
+from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain
 from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.ring.saved import load_fit, ring_state
 
 CENTER, RADIUS = [40.0, -15.0, 9.0], 12.5
 
@@ -243,3 +245,34 @@ def test_flash_can_be_left_out():
         mi.load_dict({"type": "scene", "o": shapenet(subdivisions=0, flash=on)}).emitters() for on in (True, False)
     ]
     assert [len(emitters) for emitters in kinds] == [1, 0]
+
+
+# Files of other versions.
+
+
+def test_a_ring_of_format_3_is_read(tmp_path):
+    """What mi_ring 0.1 wrote: steps and parameters by themselves, no names of networks."""
+    ring = ring_file(tmp_path / "ring.pt")
+    old = {key: value for key, value in ring_state(ring).items() if key in ("networks", "domain", "bsdf", "indirect")}
+    parameters = [tuple(p) for p in ring.brdf_net.bsdf_parameters]
+    old |= {"format": 3, "config": {"subdivisions": 4}, "parameters": parameters, "steps": 20}
+    torch.save(old, tmp_path / "old.pt")
+    again = load_fit(tmp_path / "old.pt")
+    assert again.subdivisions == 4 and again.shape_net.steps == 20
+    s, _ = ring.domain.sample(2)
+    with torch.no_grad():
+        torch.testing.assert_close(again.surface(s), ring.surface(s))
+        torch.testing.assert_close(again.brdf_net(s), ring.brdf_net(s))
+
+
+def test_files_of_versions_that_are_not_read_are_named(tmp_path):
+    ring = ring_file(tmp_path / "ring.pt")
+    for state, words in (
+        (ring_state(ring) | {"format": 99, "mi_ring": "7.1"}, "format version 99, of mi_ring 7.1; this one"),
+        ({"format": 1, "networks": {}}, "format version 1, of mi_ring 0.1 or older"),
+        ({"something": 1}, "not a saved fit"),
+    ):
+        torch.save(state, tmp_path / "other.pt")
+        with pytest.raises(InputError, match=words):
+            load_fit(tmp_path / "other.pt")
+    assert ring_state(ring)["mi_ring"] == mi_ring.__version__

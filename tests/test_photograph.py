@@ -342,3 +342,31 @@ def test_gradients_pass_through_the_camera_ray():
         at = {"cx": mi.Float(CX), "fx": mi.Float(FX)}
         high, low = pixel_x(**at | {name: at[name] + step}), pixel_x(**at | {name: at[name] - step})
         assert dr.grad(given)[0] == pytest.approx((high - low)[0] / (2 * step), rel=1e-3)
+
+
+LOOKED_UP = """
+import sys, mi_ring, mitsuba as mi
+from pathlib import Path
+from mi_ring.capture import loading
+from mi_ring.metrics import path_tracing
+from mi_ring.rendering import shading
+from mi_ring import validate, render
+mi.set_variant("scalar_rgb")
+mi.set_variant("llvm_ad_rgb")
+scene, sensors = path_tracing.open_lit_scene(Path(sys.argv[1]))
+assert len(sensors) == 1 and not shading.lamps(scene)
+assert sum(isinstance(e, path_tracing.flash.Flash) for e in scene.emitters()) == 1
+assert loading.load_capture(sys.argv[1], images=False).sensors
+"""
+
+
+def test_after_a_switch_of_variant_photographs_and_flashes_are_known(tmp_path):
+    """Their classes belong to one variant: whoever asks for them looks them up anew."""
+    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0">
+      <integrator type="photometric"/><shape type="shapenet" id="object"><bsdf type="diffuse"/></shape>
+      <sensor type="photograph" id="0"><string name="filename" value="a.png"/><float name="fx" value="9"/>
+        <float name="fy" value="9"/><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="7"/><integer name="height" value="5"/></film></sensor>
+    </scene>""")
+    done = subprocess.run([sys.executable, "-c", LOOKED_UP, tmp_path / "scene.xml"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

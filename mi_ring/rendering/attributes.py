@@ -43,7 +43,7 @@ def attributes_of(bsdf) -> set[str]:
     """The mesh attributes that a BSDF reads. Raises SceneError if that cannot be told."""
     found = {name for _, texture in textures_of(bsdf) if (name := attribute_of(texture))}
     if not found and "MeshAttribute[" in str(bsdf):
-        raise SceneError(f"bsdf: {bsdf.class_name()} reads mesh attributes that it does not expose; it cannot be used")
+        raise SceneError("bsdf: reads mesh attributes, but does not expose which; it cannot be used")
     return found
 
 
