@@ -111,7 +111,6 @@ class Scene:
             dr.backward(total)  # together: the first one would cut the graph from the positions to the normals
         return np.array(dr.grad(arrays[0])).reshape(-1, 3)
 
-
     def mean(self, spp=256, seed=1):
         """Mean radiance of the pictures."""
         if self.photographs is not None:

@@ -48,7 +48,8 @@ __all__ = [
     "Term", "__version__", "default_terms", "load_capture", "load_fit", "plain_autograd", "register_network",
 ]  # fmt: skip
 
-def __getattr__(name: str):
+
+def __getattr__(name: str) -> object:
     if name not in _API:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_API[name]}"), name)
@@ -79,7 +80,7 @@ def _prepare_mitsuba() -> None:
         dr.set_thread_count(max(2, dr.thread_count()))
         mi.detail.add_variant_callback(register)
         if mi.variant() is not None:
-            register(None, mi.variant())
+            register(None, str(mi.variant()))
         elif not problem:
             mi.set_variant("llvm_ad_rgb")
     if problem:  # other variants do without: whoever needs it is told again

@@ -29,7 +29,7 @@ def test_attributes_of_our_own_bsdf():
 
 
 def test_names_that_look_like_more_than_a_name():
-    bsdf = mi.load_dict({"type": "diffuse", "reflectance": attribute('vertex_a = [name = 3]')})
+    bsdf = mi.load_dict({"type": "diffuse", "reflectance": attribute("vertex_a = [name = 3]")})
     assert attributes.attributes_of(bsdf) == {"vertex_a = [name = 3]"}
 
 

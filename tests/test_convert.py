@@ -38,9 +38,7 @@ def by_hand(R, t, calibration=K):
 
 def in_scene(sensor):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    x, depth = pinhole.project(
-        sensor.to_world.matrix, sensor.focal, sensor.centre, mi.Point3f(POINTS.T.astype("f4"))
-    )
+    x, depth = pinhole.project(sensor.to_world.matrix, sensor.focal, sensor.centre, mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T
 
@@ -548,7 +546,10 @@ def test_truncated_files(diligent, colmap, tmp_path):
 def test_both_formats_of_a_capture_agree(shared, tmp_path, name):
     """The captures come as scene.xml and as transforms.json."""
     folder = shared / "data/captures" / name
-    ours, theirs = converted("transforms", folder, tmp_path / "a.xml"), loading.load_capture(folder / "scene.xml", images=False)
+    ours, theirs = (
+        converted("transforms", folder, tmp_path / "a.xml"),
+        loading.load_capture(folder / "scene.xml", images=False),
+    )
     for a, b in zip(ours.sensors, theirs.sensors):
         np.testing.assert_allclose(np.array(a.to_world.matrix), np.array(b.to_world.matrix), rtol=1e-4, atol=1e-5)
         assert a.filename.resolve() == b.filename.resolve()

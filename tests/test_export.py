@@ -133,6 +133,7 @@ def gltf_brdf(c, m, roughness, weight, color, n, i, o, v):
 
 def uncorrelated(alpha, ni, no):
     """Smith's G as a product, divided by 4 (n·i)(n·o): that of `cooktorrance`."""
+
     def g(cosine):
         return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2))
 
@@ -141,6 +142,7 @@ def uncorrelated(alpha, ni, no):
 
 def correlated(alpha, ni, no):
     """glTF's, of appendix B.3.2."""
+
     def part(a, b):
         return a * np.sqrt(b**2 * (1 - alpha**2) + alpha**2)
 

@@ -319,7 +319,9 @@ def test_start_from_the_visual_hull(small_capture, tmp_path):
 
 
 def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path, monkeypatch):
-    config = fit.parse_options([str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK])
+    config = fit.parse_options(
+        [str(small_capture), "--out", str(tmp_path), "--domain", "hull", "--iterations", "6", *QUICK]
+    )
     before = Fit(load_capture(small_capture), config)
     assert before.iterations == 5  # of six: 3.6 of the first stage become 1.2, 2.4 of the second 3.4
     for _ in range(3):

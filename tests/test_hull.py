@@ -46,7 +46,7 @@ def ring(major, minor):
     def hit(origin, rays):
         t = np.linspace(12, 28, 400)
         p = origin - CENTER + rays[:, None] * t[:, None]
-        return ((np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) < minor).any(1))
+        return (np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) < minor).any(1)
 
     return hit
 

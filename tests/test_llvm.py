@@ -62,11 +62,14 @@ def test_versions_are_read_from_file_names(world):
     assert majors == {1, 14, 15, 16, 17, 18, 19}  # libLLVM.so.1 counts as version 1, which is never usable
 
 
-@pytest.mark.parametrize(("majors", "expected"), [
-    ((14, 15, 16, 17, 18, 19, None), r"libLLVM(-19\.so|\.so\.19\.1)"),
-    ((14, 18, 17), r"libLLVM\.so\.18\.1"),
-    ((15, 17), r"libLLVM-17\.so\.1"),
-])
+@pytest.mark.parametrize(
+    ("majors", "expected"),
+    [
+        ((14, 15, 16, 17, 18, 19, None), r"libLLVM(-19\.so|\.so\.19\.1)"),
+        ((14, 18, 17), r"libLLVM\.so\.18\.1"),
+        ((15, 17), r"libLLVM-17\.so\.1"),
+    ],
+)
 def test_takes_the_newest(world, majors, expected):
     put(world / "system", *majors)
     assert re.fullmatch(expected, prepared())
@@ -132,12 +135,15 @@ def test_accepts(drjit_loaded, version):
     llvm.require_usable()
 
 
-@pytest.mark.parametrize(("version", "found"), [
-    ((16, 0, 6), "loaded LLVM 16.0.6"),
-    ((15, 0, 6), "loaded LLVM 15.0.6"),
-    ((14, 0, 6), "loaded LLVM 14.0.6"),
-    ((-1, -1, -1), "found none"),
-])
+@pytest.mark.parametrize(
+    ("version", "found"),
+    [
+        ((16, 0, 6), "loaded LLVM 16.0.6"),
+        ((15, 0, 6), "loaded LLVM 15.0.6"),
+        ((14, 0, 6), "loaded LLVM 14.0.6"),
+        ((-1, -1, -1), "found none"),
+    ],
+)
 def test_refuses(world, drjit_loaded, version, found):
     put(world / "system", 15)
     drjit_loaded(*version)
@@ -166,8 +172,13 @@ def test_refusal_of_the_users_choice(world, drjit_loaded, monkeypatch):
 
 def test_import_names_a_missing_file(tmp_path):
     missing = str(tmp_path / "libLLVM.so.19.1")
-    process = subprocess.run([sys.executable, "-c", "import mi_ring"], check=False, capture_output=True, text=True,
-                             env=os.environ | {llvm.VARIABLE: missing})
+    process = subprocess.run(
+        [sys.executable, "-c", "import mi_ring"],
+        check=False,
+        capture_output=True,
+        text=True,
+        env=os.environ | {llvm.VARIABLE: missing},
+    )
     assert process.returncode == 1
     assert f"{missing}, which does not exist" in process.stderr
     last = process.stderr.strip().splitlines()[-1]
@@ -176,8 +187,10 @@ def test_import_names_a_missing_file(tmp_path):
 
 def test_a_kernel_that_older_versions_abort_on():
     """In a process of its own, which may die."""
-    code = ("import mi_ring, mitsuba as mi, drjit as dr; mi.set_variant('llvm_ad_rgb');"
-            "print(dr.minimum(mi.Float([1, 3]), 2))")
+    code = (
+        "import mi_ring, mitsuba as mi, drjit as dr; mi.set_variant('llvm_ad_rgb');"
+        "print(dr.minimum(mi.Float([1, 3]), 2))"
+    )
     process = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert process.stdout.strip() == "[1, 2]"
 

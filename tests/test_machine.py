@@ -109,7 +109,7 @@ def test_only_mistakes_of_the_user_are_one_line(capsys, tmp_path):
         raise InputError("pot.xml: no such file")
 
     def gone(arguments):
-        open(tmp_path / "gone")
+        (tmp_path / "gone").read_text()
 
     assert ends(mistaken, capsys=capsys) == (2, "mi_ring.fit: pot.xml: no such file\n")
     assert ends(gone, capsys=capsys) == (2, f"mi_ring.fit: {tmp_path / 'gone'}: No such file or directory\n")
@@ -130,7 +130,9 @@ def test_traceback_is_no_argument_of_the_command(capsys):
 
 def test_a_reader_that_goes_away_is_no_mistake():
     """`mi-ring fit --help | head -1`."""
-    code = "import subprocess, sys; sys.exit(subprocess.run([sys.executable, '-m', 'mi_ring.fit', '--help']).returncode)"
+    code = (
+        "import subprocess, sys; sys.exit(subprocess.run([sys.executable, '-m', 'mi_ring.fit', '--help']).returncode)"
+    )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.read(1)
     process.stdout.close()

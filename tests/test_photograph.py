@@ -155,8 +155,19 @@ def point(position, intensity=1.0):
         ({"encoding": "gamma"}, '"gamma", must be "srgb" or "linear"'),
         ({"one": point([0, 0, 1]), "two": point([0, 1, 0])}, "2 nested emitters"),
     ],
-    ids=["scale", "mirror", "NaN", "typo", "no fx", "fx in words", "saturation in words", "to_world in words",
-         "no filename", "encoding", "two lights"],
+    ids=[
+        "scale",
+        "mirror",
+        "NaN",
+        "typo",
+        "no fx",
+        "fx in words",
+        "saturation in words",
+        "to_world in words",
+        "no filename",
+        "encoding",
+        "two lights",
+    ],
 )
 def test_refuses(changed, message):
     with pytest.raises(Exception, match=message):
@@ -365,7 +376,8 @@ def test_after_a_switch_of_variant_photographs_and_flashes_are_known(tmp_path):
     (tmp_path / "scene.xml").write_text("""<scene version="3.0.0">
       <integrator type="photometric"/><shape type="shapenet" id="object"><bsdf type="diffuse"/></shape>
       <sensor type="photograph" id="0"><string name="filename" value="a.png"/><float name="fx" value="9"/>
-        <float name="fy" value="9"/><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+        <float name="fy" value="9"/>
+        <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
         <film type="hdrfilm"><integer name="width" value="7"/><integer name="height" value="5"/></film></sensor>
     </scene>""")
     done = subprocess.run([sys.executable, "-c", LOOKED_UP, tmp_path / "scene.xml"], capture_output=True, text=True)

@@ -272,7 +272,10 @@ def rows(n=9, **changes):
 def test_of_a_good_fit_there_is_nothing_to_say():
     assert report.fit_findings(rows(), 400, 400) == []
     assert report.fit_findings(rows(psnr=29.0, iou=0.91, saturated=0.249, shift=(0.9, 0.1)), 400, 400) == []
-    nothing = [report.PhotographPanel("a.png", 30.0, None, 0.0, None, {}), report.PhotographPanel("b.png", 12.0, None, 0.0, None, {})]
+    nothing = [
+        report.PhotographPanel("a.png", 30.0, None, 0.0, None, {}),
+        report.PhotographPanel("b.png", 12.0, None, 0.0, None, {}),
+    ]
     assert report.fit_findings(nothing, 400, 400) == []  # which of two is wrong cannot be told
 
 

@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -32,6 +32,10 @@ class Observation(NamedTuple):
     masked: Tensor  #: (n,) bool: which have a mask
     valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None if all do. Others are black and clipped
 
+    def to(self, device: torch.device) -> "Observation":
+        """The same on a device."""
+        return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
+
 
 @dataclass
 class Capture:
@@ -42,7 +46,7 @@ class Capture:
 
     path: Path
     scene: mi.Scene
-    shape: mi.Mesh  #: the `shapenet`
+    shape: Any  #: the `shapenet`
     sensors: list  #: the photographs
     photographs: Photographs  #: their cameras and lights
     shadows: bool
@@ -52,9 +56,10 @@ class Capture:
     valid: list[np.ndarray | None] = field(default_factory=list)  #: (H, W) uint8, 0 where the photograph shows nothing
     threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were not
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         sizes = [sensor.size for sensor in self.sensors]
-        self._decoded, self._remembered = {}, 0  # (scale, result of `decoded`) by photograph, and their pixels
+        self._decoded: dict[int, tuple] = {}  # (scale, result of `decoded`) by photograph
+        self._remembered = 0  # their pixels
         #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
         self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
 
@@ -79,14 +84,14 @@ class Capture:
         """Photograph `k` alone, to be rendered `scale` times smaller."""
         return self.photographs.select([k], self.sensors[k].size, scale)
 
-    def observe(self, index: Sequence[int], scale: int = 1) -> Observation:
+    def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
         rgb, clipped, mask, valid = zip(*(self.decoded(k, scale) for k in index))
         masked = torch.tensor([self.masks[k] is not None for k in index])
         if all(v is None for v in valid):
             return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, None)
-        valid = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
-        return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, torch.stack(valid))
+        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
+        return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, torch.stack(shown))
 
     def decoded(self, k: int, scale: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """One photograph of `observe`. If smaller than the file and if it fits, it is remembered, at its last scale."""
@@ -96,10 +101,11 @@ class Capture:
                 return result
             self._remembered -= self._decoded.pop(k)[1][2].numel()
         linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
-        mask = np.zeros(linear.shape[:2], np.uint8) if self.masks[k] is None else self.masks[k]
+        mask, own = self.masks[k], self.valid[k]
+        mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
         valid = None
-        if self.valid[k] is not None:
-            shown = self.valid[k] > 127
+        if own is not None:
+            shown = own > 127
             linear = np.where(shown[..., None], linear, 0)
             saturated = saturated | ~shown[..., None]  # nothing is known: the scene is at least this black
             valid = box_filter(torch.from_numpy(shown).float()[..., None], scale)[..., 0] == 1
@@ -142,11 +148,12 @@ class Capture:
 
     def silhouettes(self) -> list[Silhouette]:
         """The masks with their cameras, one for all photographs that share both."""
-        once = {}
+        once: dict[tuple, Silhouette] = {}
         for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
             if mask is not None:
-                once.setdefault((id(mask), sensor.camera.to_world.tobytes()), k)
-        return [Silhouette(self.masks[k], self.sensors[k].camera, self.outline(k), self.valid[k]) for k in once.values()]
+                silhouette = Silhouette(mask, sensor.camera, self.outline(k), self.valid[k])
+                once.setdefault((id(mask), sensor.camera.to_world.tobytes()), silhouette)
+        return list(once.values())
 
     @functools.cached_property
     def hull(self) -> Hull | None:

@@ -1,6 +1,7 @@
 """Photographs and masks from files: encoded pixels, and the linear radiance that they mean."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarr
     return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
 
 
-def read_pixels(path: Path, field: str, sensor, scene: Path) -> np.ndarray:
+def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
     """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32, all the bits that the file has.
 
     Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
@@ -32,16 +33,15 @@ def read_pixels(path: Path, field: str, sensor, scene: Path) -> np.ndarray:
         pixels = read_image(path)
     except Exception as error:
         raise InputError(f"{path}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
-    expected, found = sensor.size, pixels.shape[1::-1]
-    if found != expected:
-        found, expected = ("{} x {}".format(*size) for size in (found, expected))
+    if pixels.shape[1::-1] != sensor.size:
+        found, expected = ("{} x {}".format(*size) for size in (pixels.shape[1::-1], sensor.size))
         raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
     if not np.isfinite(pixels).all():
         raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
     return pixels
 
 
-def read_photograph(sensor, scene: Path) -> np.ndarray:
+def read_photograph(sensor: Any, scene: Path) -> np.ndarray:
     """Encoded pixels (H, W, 3) of a photograph; one without colours is grey, and what is transparent is black."""
     pixels = read_pixels(sensor.filename, "filename", sensor, scene)
     if sensor.encoding == "linear" and pixels.dtype == np.uint8:
@@ -57,12 +57,12 @@ def read_photograph(sensor, scene: Path) -> np.ndarray:
     return ((radiance if linear else linear_to_srgb(radiance)) * full + 0.5).astype(pixels.dtype)
 
 
-def is_linear(sensor, pixels: np.ndarray) -> bool:
+def is_linear(sensor: Any, pixels: np.ndarray) -> bool:
     """Is this image linear radiance? As its photograph says, else 8-bit files are not and others are."""
     return sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
 
 
-def read_mask(sensor, file: Path | None, field: str, scene: Path) -> np.ndarray | None:
+def read_mask(sensor: Any, file: Path | None, field: str, scene: Path) -> np.ndarray | None:
     """Mask (H, W) uint8 from a file that a photograph names in a `field`, None if it names none.
 
     Of a photograph that is its own mask it is the alpha channel.

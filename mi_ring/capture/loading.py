@@ -65,7 +65,7 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     try:
         path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)
-    except UnicodeError as error:
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not UTF-8 at byte {error.start} ({error.reason}); convert it") from error
     except RuntimeError as error:
         raise InputError(f"{path}: {reason(error)}") from error

@@ -3,6 +3,7 @@
 import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
 from mi_ring.rendering.attributes import attributes_of, constants, load_bsdf
 
 
-def predicted_parameters(scene: Path, shape, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
+def predicted_parameters(
+    scene: Path, shape: Any, ranges: dict[str, tuple[float, float]]
+) -> tuple[tuple[Parameter, ...], str]:
     """The parameters of the shapenet's BSDF that BRDF-Net is to predict, and the BSDF that reads them, as XML.
 
     `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where

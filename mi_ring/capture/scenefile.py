@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
@@ -80,13 +81,13 @@ def add_film(sensor: Element, width: int, height: int) -> None:
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
 
 
-def load_element(element: Element):
+def load_element(element: Element) -> mi.Object:
     """The object of Mitsuba's that an element stands for."""
     element.set("version", "3.0.0")
     return mi.load_string(ElementTree.tostring(element, "unicode"))
 
 
-def numbers(values) -> str:
+def numbers(values: ArrayLike) -> str:
     """As XML has them."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 

@@ -23,8 +23,9 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
         if state["settings"].get(name) != value:
-            raise InputError(f"{path}: --{name.replace('_', '-')}: was {state['settings'].get(name)} before, is {value} "
-                             "now; give the same settings to resume, or start anew without --resume")  # fmt: skip
+            before = state["settings"].get(name)
+            raise InputError(f"{path}: --{name.replace('_', '-')}: was {before} before, is {value} now; give the same "
+                             "settings to resume, or start anew without --resume")  # fmt: skip
     return state
 
 

@@ -72,13 +72,14 @@ class Config:
     decay: float = 0.1
     """The learning rates fall exponentially to this share."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer GPUs)."""
+    """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer
+    GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
     deterministic: bool = False
     """The same result bit for bit on the same machine, on one thread."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         def require(condition: bool, name: str, what: str) -> None:
             if not condition:
                 raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")

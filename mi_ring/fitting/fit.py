@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import recompute_normals
@@ -21,6 +21,8 @@ from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import require_view_from_outside, starting_surface
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.geometry.domain import Sphere
+from mi_ring.nets.brdfnet import ReflectanceMap
+from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
@@ -48,11 +50,12 @@ class Fit:
     """
 
     def __init__(
-        self, capture: Capture, config: Config | None = None, networks: tuple[nn.Module, nn.Module] | None = None,
+        self, capture: Capture, config: Config | None = None, networks: tuple[Flow, ReflectanceMap] | None = None,
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
         state: dict | None = None,
-    ):  # fmt: skip
-        self.capture, self.config = capture, config or Config()
+    ) -> None:  # fmt: skip
+        self.capture = capture
+        self.config: Config = config or Config()
         given = default_terms if terms is None else terms
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
         self.callbacks = list(callbacks)
@@ -77,7 +80,7 @@ class Fit:
         if state:
             self.restore(state)
 
-    def new_ring(self, networks: tuple[nn.Module, nn.Module] | None) -> Ring:
+    def new_ring(self, networks: tuple[Flow, ReflectanceMap] | None) -> Ring:
         """The networks before the first iteration, on the surface that the fit starts from."""
         capture, config = self.capture, self.config
         domain, center, radius = starting_surface(capture, config.domain)
@@ -136,9 +139,7 @@ class Fit:
 
         index, size = self.choose()
         scale = -(-size[0] // stage.width)
-        observed, clipped, mask, masked, valid = (
-            None if t is None else t.to(self.device) for t in self.capture.observe(index, scale)
-        )
+        seen = self.capture.observe(index, scale).to(self.device)
         photographs = self.capture.photographs.select(index, size, scale)
         self.surface.set_faces(faces)
         predicted, coverage = bridge.render(
@@ -149,7 +150,7 @@ class Fit:
             predicted = predicted + bridge.interreflection(self.surface, photographs, coverage, self.new_seed())
         return Iteration(
             self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
-            observed, clipped, mask, masked, valid, predicted, coverage,
+            *seen, predicted, coverage,
         )  # fmt: skip
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
@@ -217,14 +218,15 @@ class Fit:
 
     def state(self) -> dict:
         """What another `Fit` of the same capture needs to go on from here, for `torch.save`."""
-        return copy.deepcopy({
+        state = {
             "ring": ring_state(self.ring, self.config.settings()),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "random": self.random.get_state(),
             "iteration": self.iteration,
             "seconds": self.seconds,
             "log": self.log,
-        })
+        }
+        return copy.deepcopy(state)  # which the next iteration would change
 
     def restore(self, state: dict) -> None:
         """Take up what a `state` says besides the ring."""

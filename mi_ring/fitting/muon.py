@@ -16,12 +16,12 @@ class Muon(torch.optim.Optimizer):
     PyTorch's own does so in bfloat16, which most processors emulate: there it takes 20 times as long as in float32.
     """
 
-    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype, momentum: float = 0.95):
+    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype, momentum: float = 0.95) -> None:
         super().__init__(params, {"lr": lr, "momentum": momentum})
         self.dtype = dtype
 
     @torch.no_grad()
-    def step(self, closure=None):
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step. A tall matrix takes a longer one, by the root of how much taller it is."""
         for group in self.param_groups:
             for p in group["params"]:

@@ -1,5 +1,7 @@
 """The optimisers of both networks: Muon for hidden weights, Adam for the rest."""
 
+from typing import Any
+
 import torch
 from torch import nn
 
@@ -13,8 +15,9 @@ def optimizers_of(networks: nn.Module, config: Config, device: torch.device) -> 
 
     Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear ones.
     """
-    lists = [part.hidden for part in networks.modules() if isinstance(getattr(part, "hidden", None), nn.ModuleList)]
-    hidden = [layer.weight for layers in lists for layer in layers] if config.optimizer == "muon" else []
+    lists = [getattr(part, "hidden", None) for part in networks.modules()]
+    hidden: list[Any] = [layer.weight for layers in lists if isinstance(layers, nn.ModuleList) for layer in layers]
+    hidden = hidden if config.optimizer == "muon" else []
     rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
     result: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=config.learning_rate)]
     if hidden:

@@ -3,7 +3,7 @@
 import contextlib
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,11 +17,11 @@ FIXED_WORK = 3000  #: what an iteration costs besides its vertices, in vertices:
 
 
 @contextlib.contextmanager
-def interruptible():
+def interruptible() -> Iterator[Callable[[], bool]]:
     """Yields a function that tells whether Ctrl-C was pressed. A second Ctrl-C ends the program at once."""
-    pressed = []
+    pressed: list[int] = []
 
-    def press(number, frame):
+    def press(number: int, frame: object) -> None:
         pressed.append(number)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")

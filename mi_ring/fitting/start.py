@@ -1,5 +1,7 @@
 """Where a fit starts: the surface that is deformed, and the sphere that normalises it."""
 
+from pathlib import Path
+
 import numpy as np
 
 from mi_ring.capture.capture import Capture
@@ -8,7 +10,7 @@ from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
 
 
-def starting_surface(capture: Capture, choice) -> tuple[Domain, np.ndarray, float]:
+def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
     """The domain of a fit and the sphere that normalises it: what `--domain` asks for, else what the scene says."""
     shape = capture.shape
     if isinstance(choice, tuple):
@@ -37,14 +39,14 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
     ahead = [((surface - camera.position) @ camera.forward).max() for camera in cameras]
     if min(ahead) < 0:
         sensor = capture.sensors[int(np.argmin(ahead))]
-        raise InputError(f'{capture.path}: photograph "{sensor.id()}", to_world: its camera looks away from the surface '
-                         "that the fit starts from; see python -m mi_ring.check")  # fmt: skip
+        raise InputError(f'{capture.path}: photograph "{sensor.id()}", to_world: its camera looks away from the '
+                         "surface that the fit starts from; see python -m mi_ring.check")  # fmt: skip
     places = {"to_world: its camera": np.stack([camera.position for camera in cameras]),
               "emitter: its light": np.where(lights.is_finite()[:, None], lights.positions(), np.inf)}  # fmt: skip
     for what, points in places.items():
         if (inside := domain.contains((points - center) / radius)).any():
             sensor = capture.sensors[int(inside.argmax())]
             raise InputError(
-                f'{capture.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, of '
-                f"radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
+                f'{capture.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, '
+                f"of radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
             )

@@ -44,7 +44,9 @@ def mask_loss(coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None
     return blur(difference, sigma).square().mean()
 
 
-def velocity_loss(velocity, x: Tensor, laplacian_scale: float, step: float = 0.02) -> Tensor:
+def velocity_loss(
+    velocity: Callable[[Tensor], Tensor], x: Tensor, laplacian_scale: float, step: float = 0.02
+) -> Tensor:
     """L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) of the flow's paths, α = `laplacian_scale`.
 
     The Laplacian over ℝ³ is the seven-point stencil of width `step`, small against the period of the highest frequency.

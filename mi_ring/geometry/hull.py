@@ -65,7 +65,7 @@ class Hull:
     that may be wrong about a point.
     """
 
-    def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02):
+    def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02) -> None:
         self.silhouettes = thinned(silhouettes, MOST, WIDTH)
         self.what, self.wrong = what, wrong
         self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
@@ -127,13 +127,13 @@ class Hull:
             rays = rays[random.integers(len(rays), size=pixels)]
             origin = silhouette.camera.position
             middle = origin + rays * (rays @ (self.center - origin))[:, None]
-            middle, rays = (torch.as_tensor(a, dtype=torch.float32) for a in (middle, rays))
-            deepest = self.depth((middle[:, None] + along * rays[:, None]).reshape(-1, 3)).reshape(pixels, samples)
+            near, ahead = (torch.as_tensor(a, dtype=torch.float32) for a in (middle, rays))
+            deepest = self.depth((near[:, None] + along * ahead[:, None]).reshape(-1, 3)).reshape(pixels, samples)
             pixel = np.linalg.norm(self.center - origin) / silhouette.camera.focal.mean()
             result.append((-deepest.amax(1).numpy() / pixel).clip(0))
         return np.array(result)
 
-    def grid(self, low, high, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
+    def grid(self, low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
         """Points (N, 3) and the shape of the grid that they form."""
         axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
         return torch.cartesian_prod(*axes), tuple(map(len, axes))
@@ -164,10 +164,10 @@ class Hull:
         fine = (high - low).max() / resolution
         points, shape = self.grid(low, high, fine)
         index = (points.numpy() - (self.center - self.reach)).T / spacing
-        field = torch.from_numpy(scipy.ndimage.map_coordinates(coarse, index, order=1, mode="nearest"))
-        near = field.abs() < 2 * spacing  # elsewhere nothing but the sign matters
-        field[near] = self.depth(points[near])
-        field = field.reshape(shape).numpy().clip(-3 * fine, 3 * fine)
+        depth = torch.from_numpy(scipy.ndimage.map_coordinates(coarse, index, order=1, mode="nearest"))
+        near = depth.abs() < 2 * spacing  # elsewhere nothing but the sign matters
+        depth[near] = self.depth(points[near])
+        field = depth.reshape(shape).numpy().clip(-3 * fine, 3 * fine)
         field = np.pad(scipy.ndimage.gaussian_filter(field, 1.0), 1, constant_values=-fine)  # closed at the border, too
         self.require(int((field > 0).sum()))
         vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")

@@ -1,6 +1,7 @@
 """Meshes from files, and what is asked of a closed surface."""
 
 from pathlib import Path
+from typing import Any
 
 import trimesh
 
@@ -11,7 +12,7 @@ def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
     require_file(path, "the file of a mesh", field)
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:
         raise InputError(f"{path}: {field}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices

@@ -40,7 +40,7 @@ class ReflectanceMap(nn.Module):
     bsdf_parameters: tuple[Parameter, ...]
     scale: Tensor  #: order of magnitude of ρ in the scene's units of light
 
-    def __init__(self, parameters: Sequence[Parameter] = COOK_TORRANCE, scale: float = 1.0):
+    def __init__(self, parameters: Sequence[Parameter] = COOK_TORRANCE, scale: float = 1.0) -> None:
         super().__init__()
         self.register_buffer("scale", torch.tensor(float(scale)))
         self.set_parameters(parameters, scale)
@@ -84,7 +84,7 @@ class BRDFNet(MLP, ReflectanceMap):
     Or the parameters of another BSDF.
     """
 
-    def __init__(self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE):
+    def __init__(self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE) -> None:
         super().__init__(depth=5, outputs=sum(Parameter(*p).channels for p in parameters))
         self.set_parameters(parameters, scale)
 

@@ -2,7 +2,9 @@
 
 import os
 import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +15,7 @@ _pool: tuple[int, ThreadPoolExecutor] | None = None  # one for the whole process
 _lock = threading.Lock()
 
 
-def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
+def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor) -> Tensor:
     """Values at points (n, 3) by `forward`, which returns those of a chunk and what the way back needs of it.
 
     Chunks are computed one per thread, and are as many for each; a GPU computes all points at once.
@@ -28,7 +30,7 @@ def forward_in_chunks(ctx, forward, x: Tensor) -> Tensor:
     return torch.cat(values)
 
 
-def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
+def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
     """Gradients of the points and of the parameters of `ctx.layers`, by `backward(gradient, kept, sums)` of each chunk.
 
     Raises RuntimeError if the parameters were changed since, and the second time.
@@ -39,7 +41,7 @@ def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Te
                            "but mi_ring.nets.mlp.plain_autograd() does")  # fmt: skip
 
     @torch.no_grad()
-    def run(gradient, kept):
+    def run(gradient: Tensor, kept: Any) -> tuple[Tensor, list[Tensor]]:
         sums = ctx.layers.zeros()
         return backward(gradient, kept, sums), sums
 
@@ -48,7 +50,7 @@ def backward_in_chunks(ctx, backward, gradient: Tensor) -> tuple[Tensor, list[Te
     return torch.cat(gradients), [sum(parts) for parts in zip(*sums)]
 
 
-def in_parallel(function, *arguments) -> list:
+def in_parallel(function: Callable, *arguments: Sequence) -> list:
     """`map` over as many threads as torch is set to use, each computing alone."""
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads == 1:

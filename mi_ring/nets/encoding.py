@@ -11,7 +11,7 @@ class PosEnc(nn.Module):
     Order of the features: all cosines, then all sines; within each, frequency-major (ω₁x, ω₁y, ω₁z, ω₂x, …).
     """
 
-    def __init__(self, frequencies: int = 16):
+    def __init__(self, frequencies: int = 16) -> None:
         super().__init__()
         self.frequencies = frequencies
         self.width = 6 * frequencies

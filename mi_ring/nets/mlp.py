@@ -2,6 +2,8 @@
 
 import contextlib
 import contextvars
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +20,8 @@ SLOPE = 0.01  #: of the leaky ReLU
 
 
 @contextlib.contextmanager
-def plain_autograd():
-    """Within it the networks are PyTorch's own operations: slower, more memory, but differentiable as often as one likes.
+def plain_autograd() -> Iterator[None]:
+    """Within it the networks are PyTorch's own operations: slower, but differentiable as often as one likes.
 
     For Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
     """
@@ -33,7 +35,7 @@ def plain_autograd():
 class MLP(nn.Module):
     """`outputs` functions of a point: its encoding, `depth` hidden layers of leaky ReLUs, a linear layer."""
 
-    def __init__(self, depth: int, outputs: int):
+    def __init__(self, depth: int, outputs: int) -> None:
         super().__init__()
         self.encoding = PosEnc()
         sizes = [self.encoding.width] + [WIDTH] * depth
@@ -67,7 +69,7 @@ class MLP(nn.Module):
 class Layers:
     """An MLP's weights and biases in the precision of the products: values by `forward`, gradients by `backward`."""
 
-    def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters):
+    def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters: Sequence[Tensor]) -> None:
         self.encoding, self.dtype = encoding, dtype
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
@@ -101,11 +103,11 @@ class _Evaluate(torch.autograd.Function):
     """An MLP at points (n, 3). Only encoding and activations are kept, in the precision of the products."""
 
     @staticmethod
-    def forward(ctx, x, encoding, dtype, keep, *parameters):
+    def forward(ctx: Any, x: Tensor, encoding: PosEnc, dtype: torch.dtype, keep: bool, *parameters: Tensor) -> Tensor:
         ctx.layers = layers = Layers(encoding, dtype, parameters)
         ctx.save_for_backward(*parameters)
 
-        def forward(x):
+        def forward(x: Tensor) -> tuple[Tensor, list[Tensor] | None]:
             activations, output = layers.forward(x, keep)
             return output, activations if keep else None
 
@@ -113,6 +115,6 @@ class _Evaluate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: Tensor) -> tuple:
         gradient, sums = backward_in_chunks(ctx, ctx.layers.backward, gradient)
         return gradient, None, None, None, *sums

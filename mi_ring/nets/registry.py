@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from typing import Any
 
 from torch import nn
 
@@ -42,7 +43,7 @@ def architecture_of(network: nn.Module) -> dict:
                      "the class")  # fmt: skip
 
 
-def build(architecture: dict) -> nn.Module:
+def build(architecture: dict) -> Any:
     """A network of this architecture, with random weights. Raises InputError if its name is not registered."""
     name = architecture["name"]
     if name not in _networks:

@@ -1,10 +1,13 @@
 """Shape-Net: a recurrent ResNet that integrates a flow and carries the domain onto the object (paper, section 3)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from mi_ring.nets.chunks import backward_in_chunks, forward_in_chunks
+from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import MLP, Layers, _plain
 from mi_ring.nets.registry import register_network
 
@@ -46,7 +49,7 @@ class ShapeNet(MLP, Flow):
     and starts at almost 0, so that the start surface equals the domain.
     """
 
-    def __init__(self, steps: int = 20):
+    def __init__(self, steps: int = 20) -> None:
         super().__init__(depth=3, outputs=3)
         self.steps = steps
         with torch.no_grad():
@@ -76,12 +79,15 @@ class _Flow(torch.autograd.Function):
     """Euler steps as long as `scale` at most. Of each the activations and the direction are kept, nothing else."""
 
     @staticmethod
-    def forward(ctx, x, scale, steps, encoding, dtype, keep, *parameters):
+    def forward(
+        ctx: Any, x: Tensor, scale: float, steps: int, encoding: PosEnc, dtype: torch.dtype, keep: bool,
+        *parameters: Tensor,
+    ) -> Tensor:  # fmt: skip
         ctx.layers = layers = Layers(encoding, dtype, parameters)
         ctx.scale = scale
         ctx.save_for_backward(*parameters)
 
-        def flow(x):
+        def flow(x: Tensor) -> tuple[Tensor, list]:
             kept = []
             for _ in range(steps):
                 activations, output = layers.forward(x, keep)
@@ -95,8 +101,8 @@ class _Flow(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gradient):
-        def backward(g, kept, sums):
+    def backward(ctx: Any, gradient: Tensor) -> tuple:
+        def backward(g: Tensor, kept: list, sums: list[Tensor]) -> Tensor:
             for activations, direction in reversed(kept):
                 g = g + ctx.layers.backward(ctx.scale * g * (1 - direction * direction), activations, sums)
             return g

@@ -66,7 +66,9 @@ class Surface:
         for name, value in attributes.items():
             channels = 1 if value.ndim == 1 else value.shape[-1]
             if value.numel() != needed * channels or channels not in (1, 3):
-                raise ValueError(f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)")
+                raise ValueError(
+                    f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)"
+                )
         tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
         arrays = {name: to_drjit(t) for name, t in tensors.items()}
         if gradients:

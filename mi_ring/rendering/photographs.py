@@ -52,12 +52,12 @@ class Photographs:
             lights=Lights.attached(sensor),
         )
 
-    def select(self, index: Sequence[int], size: tuple[int, int], scale: int = 1) -> "Photographs":
+    def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
         """Photographs `index`, all (width, height) = `size`, rendered `scale` times smaller."""
         width, height = size
         return replace(
-            self, intrinsics=self.intrinsics / dr.opaque(mi.Float, scale), index=mi.UInt32(np.asarray(index, np.uint32)),
-            size=(width // scale, height // scale),
+            self, intrinsics=self.intrinsics / dr.opaque(mi.Float, scale),
+            index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale),
         )  # fmt: skip
 
     def __len__(self) -> int:

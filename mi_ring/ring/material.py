@@ -1,13 +1,16 @@
 """Fitted materials: exchanged between objects, and edited."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor, nn
+from numpy.typing import ArrayLike
+from torch import Tensor
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Sphere
+from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
 
@@ -39,7 +42,8 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
                              "sphere or mesh FILE")  # fmt: skip
         ring.brdf_net, ring.bsdf = other.brdf_net, other.bsdf
         ring.indirect = ring.indirect and other.indirect
-    gains, offsets = {}, {}
+    gains: dict[str, ArrayLike] = {}
+    offsets: dict[str, float] = {}
     if options.specular_scale != 1:
         at_least_0("--specular-scale", options.specular_scale)
         gains = dict.fromkeys(named(ring, "--specular-scale", SPECULAR), options.specular_scale)
@@ -55,13 +59,13 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
         ring.brdf_net = Edited(ring.brdf_net, gains, offsets)
 
 
-def at_least_0(option: str, value) -> None:
+def at_least_0(option: str, value: ArrayLike) -> None:
     """Raise InputError for a factor, or one of several, that is negative or not finite."""
     if not (np.isfinite(value).all() and np.min(value) >= 0):
-        raise InputError(f"{option}: is {value}, must be 0 or more")
+        raise InputError(f"{option}: is {value!r}, must be 0 or more")
 
 
-def named(ring: Ring, option: str, names) -> list[str]:
+def named(ring: Ring, option: str, names: Sequence[str]) -> list[str]:
     """Which of these parameters the material has. Raises InputError if none."""
     parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
     found = [name for name in parameters if name in names]
@@ -82,13 +86,12 @@ def about(ring: Ring) -> str:
     return "a sphere" if isinstance(ring.domain, Sphere) else f"a mesh of {len(ring.domain.points):,} vertices"
 
 
-class Edited(nn.Module):
+class Edited(ReflectanceMap):
     """A BRDF-Net with gains and offsets, by the names of its parameters, kept within the parameters' ranges."""
 
-    def __init__(self, net, gains: dict, offsets: dict):
-        super().__init__()
+    def __init__(self, net: ReflectanceMap, gains: dict, offsets: dict) -> None:
+        super().__init__(net.bsdf_parameters, float(net.scale))
         self.net, self.gains, self.offsets = net, gains, offsets
-        self.bsdf_parameters, self.scale = net.bsdf_parameters, net.scale
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         values = self.net(s)

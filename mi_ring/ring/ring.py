@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mi_ring.geometry.domain import Domain, Sphere
-from mi_ring.nets.brdfnet import COOK_TORRANCE, BRDFNet, Parameter
-from mi_ring.nets.shapenet import ShapeNet
+from mi_ring.nets.brdfnet import COOK_TORRANCE, BRDFNet, Parameter, ReflectanceMap
+from mi_ring.nets.shapenet import Flow, ShapeNet
 
 
 class Ring(nn.Module):
@@ -20,12 +21,17 @@ class Ring(nn.Module):
     `mi_ring.nets.brdfnet.ReflectanceMap` say.
     """
 
+    shape_net: Flow
+    brdf_net: ReflectanceMap
+    center: Tensor
+    radius: Tensor
+
     def __init__(
-        self, center: Sequence[float] | Tensor, radius: float, scale: float = 1.0, domain: Domain | None = None,
-        parameters: Sequence[Parameter] = COOK_TORRANCE, bsdf: str = '<bsdf type="cooktorrance"/>',
+        self, center: Sequence[float] | np.ndarray | Tensor, radius: float, scale: float = 1.0,
+        domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE, bsdf: str = '<bsdf type="cooktorrance"/>',
         indirect: bool = False, steps: int = 20, subdivisions: int = 6,
-        networks: tuple[nn.Module, nn.Module] | None = None,
-    ):  # fmt: skip
+        networks: tuple[Flow, ReflectanceMap] | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
         self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions

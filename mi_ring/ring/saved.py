@@ -83,4 +83,6 @@ def load_fit(path: str | Path) -> Ring:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (KeyError, TypeError, RuntimeError) as error:
-        raise InputError(f"{path}: damaged, or of other networks than it says ({str(error).splitlines()[0]})") from error
+        raise InputError(
+            f"{path}: damaged, or of other networks than it says ({str(error).splitlines()[0]})"
+        ) from error

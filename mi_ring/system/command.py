@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -14,9 +15,9 @@ from mi_ring.errors import InputError
 
 
 def parse(
-    config_type: type, arguments: Sequence[str], program: str, default=tyro.MISSING_NONPROP,
+    config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
     description: str | None = None,
-):  # fmt: skip
+) -> Any:  # fmt: skip
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood.
 
     The help begins with `description`, by default the docstring of the dataclass.
@@ -45,7 +46,7 @@ def complaint_in(box: str) -> str:
 
     Of the advice, which options are spelled alike is kept.
     """
-    parts = [[]]
+    parts: list[list[str]] = [[]]
     for line in (line.strip("│ ") for line in box.splitlines() if line.startswith("│")):
         if set(line) == {"─"}:
             parts.append([])

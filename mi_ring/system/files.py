@@ -6,6 +6,7 @@ import io
 import os
 import secrets
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import filelock
@@ -15,7 +16,7 @@ from mi_ring.errors import InputError
 
 
 @contextlib.contextmanager
-def writing(what: Path | str):
+def writing(what: Path | str) -> Iterator[None]:
     """Turns what the system has against writing a file, a full disk for instance, into an InputError."""
     try:
         yield
@@ -55,7 +56,7 @@ def write_state(state: dict, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path):
+def locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a folder. Raises InputError if one does already.
 
     The lock is beside the folder, which may be moved meanwhile, and goes with the process.
@@ -67,7 +68,9 @@ def locked(folder: Path):
         try:
             lock.acquire()
         except filelock.Timeout:
-            raise InputError(f"{folder}: --out: another fit is writing there; wait for it, or give another folder") from None
+            raise InputError(
+                f"{folder}: --out: another fit is writing there; wait for it, or give another folder"
+            ) from None
     try:
         yield
     finally:

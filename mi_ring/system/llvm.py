@@ -4,9 +4,9 @@ Dr.Jit chooses its library once, while it is imported, and takes what it meets f
 abort the whole process at the first kernel; Debian 12 installs 14. So `mi_ring` chooses before Dr.Jit does (`prepare`)
 and says what is wrong with the result (`missing`).
 
-`python mi_ring/system/llvm.py` (part of `make setup`) makes sure that there is something to choose: where the machine has no
-usable LLVM, it unpacks Debian or Ubuntu packages beside the Python environment, without root and without installing
-them. It needs nothing but Python.
+`python mi_ring/system/llvm.py` (part of `make setup`) makes sure that there is something to choose: where the machine
+has no usable LLVM, it unpacks Debian or Ubuntu packages beside the Python environment, without root and without
+installing them. It needs nothing but Python.
 """
 
 import ctypes
@@ -29,8 +29,10 @@ PRIVATE = Path(sys.prefix) / "llvm"  # the copy that belongs to this environment
 DEBIAN_VERSIONS = (19, 18, 17, *range(20, 30))
 
 # Full names only: libLLVMSPIRVLib.so.19.1 and the libLLVM-18-rust-*.so of a compiler are other libraries.
-_NAME = re.compile(r".*/(?:libLLVM-(\d+)[\d.]*\.so[\d.]*|libLLVM\.so\.(\d+)[\d.]*"
-                   r"|llvm[@\d]*/(\d+)[^/]*/lib/libLLVM\.dylib)")  # Homebrew
+_NAME = re.compile(
+    r".*/(?:libLLVM-(\d+)[\d.]*\.so[\d.]*|libLLVM\.so\.(\d+)[\d.]*"
+    r"|llvm[@\d]*/(\d+)[^/]*/lib/libLLVM\.dylib)"
+)  # Homebrew
 
 _too_late = False  # Dr.Jit was there before us
 
@@ -72,18 +74,25 @@ def missing() -> str | None:
 
     usable = [path for major, path in known if major >= OLDEST]
     if usable and _too_late:
-        remedy = f"Dr.Jit was imported before mi_ring could choose {usable[0]}: " \
-                 "restart Python and import mi_ring before mitsuba."
+        remedy = (
+            f"Dr.Jit was imported before mi_ring could choose {usable[0]}: "
+            "restart Python and import mi_ring before mitsuba."
+        )
     elif usable and chosen and os.path.realpath(chosen) not in usable:
         remedy = f"Unset {VARIABLE}: mi_ring then takes {usable[0]}."
     else:
         remedy = _remedy("libllvm19", f", or set {VARIABLE} to the path of a newer libLLVM") + " Then restart Python."
-    return (f"mi_ring needs LLVM {OLDEST} or newer, but Dr.Jit {found}. LLVM 15 and 16 are refused because "
-            f"they abort the whole process at the first kernel; Dr.Jit itself refuses older ones. {remedy}")
+    return (
+        f"mi_ring needs LLVM {OLDEST} or newer, but Dr.Jit {found}. LLVM 15 and 16 are refused because "
+        f"they abort the whole process at the first kernel; Dr.Jit itself refuses older ones. {remedy}"
+    )
 
 
 def _remedy(package: str, more: str = "") -> str:
-    advice = {"darwin": "Run `brew install llvm`", "win32": "Install LLVM from https://llvm.org, with LLVM-C.dll in PATH"}
+    advice = {
+        "darwin": "Run `brew install llvm`",
+        "win32": "Install LLVM from https://llvm.org, with LLVM-C.dll in PATH",
+    }
     if sys.platform in advice:
         return f"{advice[sys.platform]}{more}."
     script = f"{sys.executable} {os.path.abspath(__file__)}"
@@ -109,9 +118,17 @@ def libraries(folders: list[str] | None = None) -> list[tuple[int, str]]:
 def _system_folders() -> list[str]:
     """Folders (glob patterns) in which systems keep libLLVM."""
     arch = sysconfig.get_config_var("MULTIARCH") or f"{platform.machine()}-linux-gnu"
-    folders = [f"/usr/lib/{arch}", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib64/llvm*/lib",
-               "/usr/lib", "/usr/local/lib",
-               "/opt/homebrew/Cellar/llvm*/*/lib", "/usr/local/Cellar/llvm*/*/lib", f"{glob.escape(sys.prefix)}/lib"]
+    folders = [
+        f"/usr/lib/{arch}",
+        "/usr/lib/llvm-*/lib",
+        "/usr/lib64",
+        "/usr/lib64/llvm*/lib",
+        "/usr/lib",
+        "/usr/local/lib",
+        "/opt/homebrew/Cellar/llvm*/*/lib",
+        "/usr/local/Cellar/llvm*/*/lib",
+        f"{glob.escape(sys.prefix)}/lib",
+    ]
     if ldconfig := shutil.which("ldconfig", path="/sbin:/usr/sbin"):  # not in every user's PATH
         cache = subprocess.run([ldconfig, "-p"], check=False, capture_output=True, text=True).stdout
         folders += {os.path.dirname(path) for path in re.findall(r"=> (/.*/libLLVM[^/]*)$", cache, re.MULTILINE)}
@@ -186,21 +203,36 @@ def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
         RuntimeError: The system has no apt, or apt failed.
     """
     if not shutil.which("apt-get"):
-        raise RuntimeError(f"no LLVM of version {OLDEST} or newer, and no apt-get to fetch one: install it (Fedora: "
-                           f"`dnf install llvm-libs libatomic`, macOS: `brew install llvm`) or set {VARIABLE}")
+        raise RuntimeError(
+            f"no LLVM of version {OLDEST} or newer, and no apt-get to fetch one: install it (Fedora: "
+            f"`dnf install llvm-libs libatomic`, macOS: `brew install llvm`) or set {VARIABLE}"
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".unpack-", dir=target.parent) as name:
         folder = Path(name).resolve()
         for part in ("state/lists/partial", "cache/archives/partial", "debs", "tree"):
             (folder / part).mkdir(parents=True)
         # Without the sandbox user: it could not write here, and apt would say so at length.
-        apt = ["apt-get", "-qq", "-o", f"Dir::State={folder}/state", "-o", "Dir::State::status=/var/lib/dpkg/status",
-               "-o", f"Dir::Cache={folder}/cache", "-o", "APT::Sandbox::User=root", "-o", "Acquire::Languages=none"]
+        apt = [
+            "apt-get",
+            "-qq",
+            "-o",
+            f"Dir::State={folder}/state",
+            "-o",
+            "Dir::State::status=/var/lib/dpkg/status",
+            "-o",
+            f"Dir::Cache={folder}/cache",
+            "-o",
+            "APT::Sandbox::User=root",
+            "-o",
+            "Acquire::Languages=none",
+        ]
         # An unreachable third-party source fails here and does not matter; an unreachable archive fails below.
         subprocess.run([*apt, "update"], check=False)
         for wanted in alternatives:
-            plan = subprocess.run([*apt, "install", "-s", "--no-install-recommends", *wanted],
-                                  check=False, capture_output=True, text=True)
+            plan = subprocess.run(
+                [*apt, "install", "-s", "--no-install-recommends", *wanted], check=False, capture_output=True, text=True
+            )
             # "Inst name (version ...)" is new; "Inst name [old] (version ...)" would shadow what runs here: never that.
             if packages := re.findall(r"^Inst (\S+) \(", plan.stdout, re.MULTILINE):
                 break

@@ -16,7 +16,7 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 
 def device() -> torch.device:
     """Where torch must keep its tensors: where the current variant of Mitsuba computes. Nothing is copied then."""
-    return torch.device("cuda" if mi.variant().startswith("cuda") else "cpu")
+    return torch.device("cuda" if str(mi.variant()).startswith("cuda") else "cpu")
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
