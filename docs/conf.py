@@ -101,7 +101,8 @@ class Modules(SphinxDirective):
         for name in self.arguments[0].split():
             text += f"{title(f'``mi_ring.{name}``', '~')}.. automodule:: mi_ring.{name}\n   :members:\n\n"
             if public := [public for public, path in PUBLIC.items() if path.rpartition(".")[0] == f"mi_ring.{name}"]:
-                text += f"Of the public API, above: {', '.join(f'`mi_ring.{name}`' for name in public)}.\n\n"
+                names = ", ".join(f"`mi_ring.{name}`" for name in public)
+                text += f"The public API, at the top of this page, has from here: {names}.\n\n"
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
