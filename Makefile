@@ -18,17 +18,16 @@ help:
 	@echo 'make test [ARGS=...]         run pytest'
 	@echo 'make tools                   install what some tests need: Chromium (as root), the validator of glTF (with npm)'
 	@echo 'make viewer                  bundle the viewer of the report anew (needs Node.js)'
-	@echo 'make lint                    run ruff'
+	@echo 'make lint                    run ruff and mypy'
 	@echo 'make docs                    build the documentation: build/docs/index.html'
 	@echo 'make clean                   remove caches; $(VENV) stays'
 
 setup: $(VENV)/.setup-done
 
-# editable_mode=compat: a checkout called mi_ring would otherwise hide the package from scripts in the folder above it.
 $(VENV)/.setup-done: pyproject.toml Makefile mi_ring/system/llvm.py | $(VENV)/bin/pip
 	$(VENV)/bin/python -I mi_ring/system/llvm.py
 	$(RUN) pip install $(TORCH)
-	$(RUN) pip install --config-settings editable_mode=compat -e '.[test]'
+	$(RUN) pip install -e '.[test]'
 	@touch $@
 
 # Debian and Ubuntu keep ensurepip in the package python3-venv. Without it, the wheel in python3-pip-whl is pip enough to
@@ -66,6 +65,8 @@ viewer:
 
 lint: setup
 	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy
 
 docs: setup
 	$(RUN) sphinx -W --keep-going -q docs build/docs

@@ -2,7 +2,8 @@
 
 `import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current
 variant of Mitsuba and for every one switched to later, and the emitter `flash` through which other integrators see a
-photograph's light. It selects `llvm_ad_rgb` if no variant is selected yet.
+photograph's light. It selects `llvm_ad_rgb` if no variant is selected yet; where there is no LLVM, `scalar_rgb`, and
+warns: that is enough to look at a fit, slowly, and not enough to make one.
 
 What it offers beyond that is read when first asked for:
 
@@ -81,9 +82,9 @@ def _prepare_mitsuba() -> None:
         mi.detail.add_variant_callback(register)
         if mi.variant() is not None:
             register(None, str(mi.variant()))
-        elif not problem:
-            mi.set_variant("llvm_ad_rgb")
-    if problem:  # other variants do without: whoever needs it is told again
+        else:
+            mi.set_variant("scalar_rgb" if problem else "llvm_ad_rgb")
+    if problem:
         warnings.warn(problem, stacklevel=3)
 
 

@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 from mi_ring.system.command import run
+from mi_ring.version import __version__
 
 #: Modules of the package; the first line of each says what the command does and ends in how it is called.
-COMMANDS = ("convert", "check", "fit", "render", "export", "evaluate", "validate")
+COMMANDS = ("example", "convert", "check", "fit", "render", "export", "evaluate", "validate", "doctor")
 
 
 def summary(name: str) -> tuple[str, str]:
@@ -23,17 +24,23 @@ def overview() -> str:
     lines = ["usage: mi-ring COMMAND …", ""]
     for usage, sentence in map(summary, COMMANDS):
         lines += [f"  {usage}", f"      {sentence}"]
-    return "\n".join([*lines, "", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same."])
+    lines += ["", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same.",
+              "mi-ring COMMAND … --traceback shows where an error comes from; mi-ring --version the version."]  # fmt: skip
+    return "\n".join(lines)
 
 
 def main() -> None:
     """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name in ("-h", "--help"):
-        print(overview())
+    if name in ("-h", "--help", "--version"):
+        print(__version__ if name == "--version" else overview())
         sys.exit(0)
     if name not in COMMANDS:
         what = f"is {name}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
         print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
         sys.exit(2)
     run(f"mi-ring {name}", importlib.import_module(f"mi_ring.{name}").main, sys.argv[2:])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,14 +1,13 @@
 """Bring photographs in from other tools: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
 
 import shutil
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from typing import Annotated, Union
 
 import tyro
 from tqdm import tqdm
 
-from mi_ring.capture.scenefile import photograph_element
+from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.formats import FORMATS
 from mi_ring.importers.frames import require_frames
@@ -31,10 +30,7 @@ def main(arguments: Sequence[str]) -> None:
     names = [frame.name or frame.image.stem for frame in frames]
     if len({*names, "object"}) <= len(names):
         names = [f"{k:0{len(str(len(frames)))}}_{name}" for k, name in enumerate(names)]
-    root = ElementTree.Element("scene", version="3.0.0")
-    ElementTree.SubElement(root, "integrator", type="photometric")
-    shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
-    ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
+    root = scene_element([])
     if source.scene.suffix != ".xml" or source.scene.exists():
         what = "exists already; give another name" if source.scene.exists() else "must end in .xml"
         raise InputError(f"{source.scene}: SCENE.xml: {what}")
@@ -48,8 +44,7 @@ def main(arguments: Sequence[str]) -> None:
                                                frame.saturation, files.valid))  # fmt: skip
             if truth := getattr(source, "truth", None):
                 writer.write("truth/mesh.ply", lambda file: shutil.copyfile(truth, file))
-            ElementTree.indent(root)
-            writer.finish(ElementTree.tostring(root, "utf-8"))
+            writer.finish(scene_bytes(root))
         finally:
             writer.close()
     except OSError as error:

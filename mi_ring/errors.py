@@ -1,6 +1,5 @@
 """The one error that a user can cause, and the commonest cause of it."""
 
-
 from pathlib import Path
 
 

@@ -46,7 +46,7 @@ class Task:
 class FitConfig(Config, Task):
     """Reconstruct an object: photographs in, a watertight mesh with a spatially varying material out."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         if self.threads < 0:
             raise InputError(f"--threads: is {self.threads}, must be 0 or more")
@@ -99,7 +99,7 @@ def parse_options(arguments: Sequence[str]) -> FitConfig:
     early.add_argument("--preset", nargs="?", default="default")
     preset = early.parse_known_args(arguments)[0].preset
     default = FitConfig(scene=tyro.MISSING, **PRESETS.get(preset, {}))
-    return command.parse(FitConfig, arguments, "mi_ring.fit", default)
+    return command.parse(FitConfig, arguments, "mi_ring.fit", default, needs_llvm=False)
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ class ValidateConfig:
     seed: int = 0
     """Of all samples."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("width", "spp"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: is {getattr(self, name)}, must be at least 1")

@@ -109,8 +109,8 @@ def test_sets_nothing_after_drjit(world):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux needs libatomic")
 def test_names_a_missing_libatomic(world, monkeypatch):
     monkeypatch.setattr(llvm, "loads", lambda path: "atomic" not in str(path))
-    with pytest.raises(ImportError, match="apt install libatomic1"):
-        prepared()
+    prepared()
+    assert "apt install libatomic1" in llvm.missing()
 
 
 def test_preload_finds_an_order(tmp_path, monkeypatch):
@@ -132,7 +132,7 @@ def test_preload_finds_an_order(tmp_path, monkeypatch):
 @pytest.mark.parametrize("version", [(17, 0, 0), (19, 1, 7), (22, 1, 0)])
 def test_accepts(drjit_loaded, version):
     drjit_loaded(*version)
-    llvm.require_usable()
+    assert llvm.missing() is None
 
 
 @pytest.mark.parametrize(
@@ -147,42 +147,32 @@ def test_accepts(drjit_loaded, version):
 def test_refuses(world, drjit_loaded, version, found):
     put(world / "system", 15)
     drjit_loaded(*version)
-    with pytest.raises(ImportError) as error:
-        llvm.require_usable()
+    complaint = llvm.missing()
     for part in (found, "libLLVM-15.so", "LLVM 17 or newer", "abort", "make setup", "apt install lib", llvm.VARIABLE):
-        assert part in str(error.value)
+        assert part in complaint
 
 
 def test_refusal_asks_for_the_right_order(world, drjit_loaded, monkeypatch):
     put(world / "system", 15, 19)
     drjit_loaded(15, 0, 6)
     monkeypatch.setattr(llvm, "_too_late", True)
-    with pytest.raises(ImportError, match="import mi_ring before mitsuba"):
-        llvm.require_usable()
+    assert "import mi_ring before mitsuba" in llvm.missing()
 
 
 def test_refusal_of_the_users_choice(world, drjit_loaded, monkeypatch):
     put(world / "system", 19)
     drjit_loaded(15, 0, 6)
     monkeypatch.setenv(llvm.VARIABLE, put(world / "mine", 15) + "/libLLVM-15.so")
-    with pytest.raises(ImportError, match=f"Unset {llvm.VARIABLE}") as error:
-        llvm.require_usable()
-    assert "does not exist" not in str(error.value)
+    assert f"Unset {llvm.VARIABLE}" in llvm.missing() and "does not exist" not in llvm.missing()
 
 
-def test_import_names_a_missing_file(tmp_path):
+def test_without_llvm_other_variants_go_on_and_the_import_says_what_is_missing(tmp_path):
     missing = str(tmp_path / "libLLVM.so.19.1")
-    process = subprocess.run(
-        [sys.executable, "-c", "import mi_ring"],
-        check=False,
-        capture_output=True,
-        text=True,
-        env=os.environ | {llvm.VARIABLE: missing},
-    )
-    assert process.returncode == 1
-    assert f"{missing}, which does not exist" in process.stderr
-    last = process.stderr.strip().splitlines()[-1]
-    assert last.startswith("ImportError: mi_ring needs LLVM 17 or newer")
+    code = "import mi_ring, mitsuba as mi; mi.set_variant('scalar_rgb'); print(mi.load_dict({'type': 'cooktorrance'}))"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
+                             env=os.environ | {llvm.VARIABLE: missing})  # fmt: skip
+    assert process.returncode == 0 and "CookTorrance" in process.stdout
+    assert f"{missing}, which does not exist" in process.stderr and "mi_ring needs LLVM 17 or newer" in process.stderr
 
 
 def test_a_kernel_that_older_versions_abort_on():

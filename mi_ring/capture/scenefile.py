@@ -3,6 +3,7 @@
 import math
 import os
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
 from pathlib import Path
 
 import mitsuba as mi
@@ -33,6 +34,22 @@ def photograph_element(
     if light:
         element.append(emitter_element(light))
     return element
+
+
+def scene_element(photographs: Iterable[Element]) -> Element:
+    """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`."""
+    root = ElementTree.Element("scene", version="3.0.0")
+    ElementTree.SubElement(root, "integrator", type="photometric")
+    shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
+    ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
+    root.extend(photographs)
+    return root
+
+
+def scene_bytes(root: Element) -> bytes:
+    """A scene as the content of its file."""
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, "utf-8")
 
 
 def emitter_element(light: Light) -> Element:
@@ -113,8 +130,7 @@ def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -
     shape.append(ElementTree.fromstring(bsdf))
     ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
     ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")
-    ElementTree.indent(tree)
-    return ElementTree.tostring(tree.getroot(), "utf-8")
+    return scene_bytes(tree.getroot())
 
 
 def bsdf_element(root: Element, scene: Path) -> tuple[Element, Element]:

@@ -1,19 +1,25 @@
 """Domains: the canonical surfaces that Shape-Net's flow starts from and on which BRDF-Net is defined."""
 
+from types import ModuleType
+
 import numpy as np
 import torch
 import trimesh
-from gpytoolbox import remesh_botsch, squared_distance
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+from mi_ring.system.optional import need
 
 FINEST = 6  #: level up to which domains are remeshed; beyond it triangles are cut in four
 PLACES = 16  #: for each vertex to be at
 MOST_SAMPLES = 2**22  #: of the surface, among which they are found: at levels 7 and 8 some vertices have fewer places
 
 
-def closed_domain(mesh: trimesh.Trimesh, center=None, radius: float | None = None) -> tuple["Domain", np.ndarray, float]:
+def closed_domain(
+    mesh: trimesh.Trimesh, center: ArrayLike | None = None, radius: float | None = None
+) -> tuple["Domain", np.ndarray, float]:
     """The domain that a closed mesh is, with the normalising sphere: by default its middle and its mean radius."""
     if mesh.volume < 0:
         mesh.invert()
@@ -22,13 +28,18 @@ def closed_domain(mesh: trimesh.Trimesh, center=None, radius: float | None = Non
     return Domain((mesh.vertices - center) / radius, mesh.faces), center, radius
 
 
+def gpytoolbox() -> ModuleType:
+    """The package, when it is needed: it takes a second. Raises InputError where it is not installed."""
+    return need("gpytoolbox", "a start from the visual hull or a mesh")
+
+
 class Domain:
     """A closed surface in the normalised frame, given as a mesh, points (V, 3) and faces (F, 3), of any triangles.
 
     Its samplings are other meshes of the same surface, of near-uniform triangles.
     """
 
-    def __init__(self, points, faces):
+    def __init__(self, points: ArrayLike, faces: ArrayLike) -> None:
         self.points = np.asarray(points, np.float32)
         self.faces = np.asarray(faces, np.int64)
         self.levels: dict[int, tuple[Tensor, np.ndarray]] = {}
@@ -50,27 +61,26 @@ class Domain:
         """Which of the points (N, 3) are inside, (N,) bool."""
         inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
-            from gpytoolbox import fast_winding_number  # here, for it takes a second
-
             mesh = self.points.astype(float), self.faces.astype(np.int32)
-            inside[inside] = fast_winding_number(points[inside], *mesh) > 0.5
+            inside[inside] = gpytoolbox().fast_winding_number(points[inside], *mesh) > 0.5
         return inside
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """The points of the surface that are nearest to these (N, 3)."""
 
         faces = self.faces.astype(np.int32)
-        _, face, weights = squared_distance(points.astype(float), self.points.astype(float), faces, use_cpp=True)
+        mesh = self.points.astype(float), faces
+        _, face, weights = gpytoolbox().squared_distance(points.astype(float), *mesh, use_cpp=True)
         return (self.points[self.faces[face]] * weights[..., None]).sum(1)
 
-    def triangulate(self, level: int):
+    def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """The surface in about 20 · 4^level triangles."""
         if level > FINEST:
             return trimesh.remesh.subdivide(*self.sample(level - 1))
 
         mesh = trimesh.Trimesh(self.points, self.faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
-        points, faces = remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+        points, faces = gpytoolbox().remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
         remeshed = trimesh.Trimesh(points, faces)
         if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
             return points, faces
@@ -114,7 +124,7 @@ class Domain:
 class Sphere(Domain):
     """The unit sphere, sampled as an icosphere: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         icosahedron = trimesh.creation.icosahedron()
         super().__init__(icosahedron.vertices, icosahedron.faces)
 
@@ -124,7 +134,7 @@ class Sphere(Domain):
     def project(self, points: np.ndarray) -> np.ndarray:
         return points / np.linalg.norm(points, axis=1, keepdims=True)
 
-    def triangulate(self, level: int):
+    def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.creation.icosphere(subdivisions=level)
         return mesh.vertices, mesh.faces
 

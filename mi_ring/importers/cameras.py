@@ -18,7 +18,7 @@ class Lens:
     size: tuple[int, int]  #: (width, height) [px]
     params: tuple[float, ...]  #: in COLMAP's order
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (np.isfinite(self.size).all() and min(self.size) >= 1):
             raise InputError(f"camera: is for photographs of {self.size[0]} x {self.size[1]} pixels; must be 1 or more")
         object.__setattr__(self, "size", tuple(map(int, self.size)))

@@ -21,7 +21,7 @@ from mi_ring.system.files import write_file
 class Writer:
     """Files of a scene: gathered in a folder of their own, moved to their places when all are there."""
 
-    def __init__(self, scene: Path):
+    def __init__(self, scene: Path) -> None:
         self.scene = scene
         #: What belongs to x/pot.xml is in x/pot/, what belongs to x/scene.xml is in x/.
         self.folder = scene.parent if scene.stem == "scene" else scene.with_suffix("")

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
-from gpytoolbox import squared_distance
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
@@ -14,6 +13,7 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
 THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
@@ -101,7 +101,8 @@ def distances(start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray) 
 
     points, _ = trimesh.sample.sample_surface(start, POINTS, seed=0)
     mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)
-    return np.sqrt(squared_distance(points - middle, *mesh, use_cpp=True)[0])
+    squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
+    return np.sqrt(squared)
 
 
 def self_intersections(mesh: trimesh.Trimesh) -> int:

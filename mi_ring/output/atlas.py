@@ -7,11 +7,11 @@ import numpy as np
 import scipy.ndimage
 import torch
 import trimesh
-import xatlas
 from tqdm import tqdm
 
 from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.ring.ring import Ring
+from mi_ring.system.optional import need
 
 CUT = 5  #: level at which surfaces are cut open, at most: the time grows with the square of the triangles
 PADDING = 4  #: between charts [texels]
@@ -34,6 +34,7 @@ class Atlas(NamedTuple):
 def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
     """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
     s, faces = ring.domain.sample(min(subdivisions, CUT))
+    xatlas = need("xatlas", "textures")
     options = xatlas.PackOptions()
     options.resolution, options.padding, options.bilinear = resolution, PADDING, True
     charts = xatlas.Atlas()

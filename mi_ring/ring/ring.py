@@ -28,8 +28,8 @@ class Ring(nn.Module):
 
     def __init__(
         self, center: Sequence[float] | np.ndarray | Tensor, radius: float, scale: float = 1.0,
-        domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE, bsdf: str = '<bsdf type="cooktorrance"/>',
-        indirect: bool = False, steps: int = 20, subdivisions: int = 6,
+        domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE,
+        bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
         networks: tuple[Flow, ReflectanceMap] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()

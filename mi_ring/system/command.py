@@ -12,26 +12,31 @@ from typing import Any
 import tyro
 
 from mi_ring.errors import InputError
+from mi_ring.system import llvm
 
 
 def parse(
     config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
-    description: str | None = None,
+    description: str | None = None, needs_llvm: bool = True,
 ) -> Any:  # fmt: skip
     """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood.
 
-    The help begins with `description`, by default the docstring of the dataclass.
+    The help begins with `description`, by default the docstring of the dataclass. If the command `needs_llvm` and there
+    is none, that is an InputError, too; its help needs none.
     """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
+            config = tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
     except SystemExit as stop:
         if not stop.code:
             raise
         raise InputError(complaint_in(box.getvalue())) from None
+    if needs_llvm and (problem := llvm.missing()):
+        raise InputError(problem)
+    return config
 
 
 def require_utf8(name: str) -> None:

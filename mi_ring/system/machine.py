@@ -11,6 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
+from mi_ring.errors import InputError
+from mi_ring.system import llvm
+
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 
 
@@ -39,7 +42,10 @@ def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.Ab
 
 
 def set_variant(variant: str) -> str:
-    """Switch Mitsuba to a variant and return its name: that of the processor, where there is no GPU to use."""
+    """Switch Mitsuba to a variant and return its name: that of the processor, where there is no GPU to use.
+
+    Raises InputError if that needs an LLVM which is not there.
+    """
     reason = None
     if variant.startswith("cuda"):
         if not torch.cuda.is_available():
@@ -55,6 +61,8 @@ def set_variant(variant: str) -> str:
     if reason:
         print(f"--variant {variant}: no GPU to use ({reason}); going on with llvm_ad_rgb, on the processor")
         variant = "llvm_ad_rgb"
+    if variant.startswith("llvm") and (problem := llvm.missing()):
+        raise InputError(problem)
     mi.set_variant(variant)
     return variant
 

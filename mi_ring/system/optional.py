@@ -13,5 +13,5 @@ def need(package: str, what: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
-        raise InputError(f"{what}: needs the package {package}, which is not installed here; try `pip install {package}` "
+        raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install {package}` "
                          "(for some systems, Linux on ARM for one, there is none ready-made)") from error  # fmt: skip

@@ -1,0 +1,81 @@
+"""Say what this machine lacks for mi_ring, and how to get it: `python -m mi_ring.doctor`."""
+
+import importlib.metadata
+import importlib.util
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mi_ring.system import command, llvm
+from mi_ring.version import __version__
+
+#: Packages that not every machine has ready-made, and what they are needed for.
+OPTIONAL = {
+    "gpytoolbox": "starts from the visual hull or a mesh, and mi_ring.evaluate",
+    "pycolmap": "COLMAP's models, and lens distortion in mi_ring.convert",
+    "xatlas": "GLB and OBJ, and the object in the report",
+}
+
+
+@dataclass(frozen=True)
+class DoctorConfig:
+    """Say what this machine lacks for mi_ring, and how to get it. The exit status is 1 if a fit cannot run."""
+
+
+class Finding(NamedTuple):
+    """A line of what the doctor says."""
+
+    mark: str  #: ok, MISSING (a fit cannot run) or without (something else cannot)
+    what: str
+    text: str
+
+
+def findings() -> Iterator[Finding]:
+    """What there is and what there is not."""
+    yield Finding("ok", "mi_ring", __version__)
+    yield Finding("ok", "Python", f"{platform.python_version()} on {platform.platform()}")
+    for package in ("torch", "drjit", "mitsuba"):
+        there = importlib.util.find_spec(package)
+        text = importlib.metadata.version(package) if there else f"pip install {package}"
+        yield Finding("ok" if there else "MISSING", package, text)
+    problem = llvm.missing()
+    yield Finding("MISSING" if problem else "ok", "LLVM", problem or "for the variant llvm_ad_rgb: there")
+    for package, use in OPTIONAL.items():
+        if importlib.util.find_spec(package):
+            yield Finding("ok", package, importlib.metadata.version(package))
+        else:
+            yield Finding("without", package, f"for {use}: pip install {package}, where it is ready-made")
+    if llvm.has_atomic():  # else Dr.Jit cannot be imported
+        yield from computing()
+
+
+def computing() -> Iterator[Finding]:
+    """What the machine computes with."""
+    import drjit as dr
+    import torch
+
+    from mi_ring.system.machine import cores, has_fast_bfloat16
+
+    precision = "bfloat16" if has_fast_bfloat16(torch.device("cpu")) else "float32"
+    yield Finding("ok", "processor", f"{cores()} cores; the networks compute in {precision}")
+    if torch.cuda.is_available() and dr.has_backend(dr.JitBackend.CUDA):
+        yield Finding("ok", "GPU", f"{torch.cuda.get_device_name()}: --variant cuda_ad_rgb")
+    else:
+        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: an NVIDIA one, and a PyTorch built for CUDA")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command. Returns its exit status: 1 if a fit cannot run."""
+    command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False)
+    found = list(findings())
+    for mark, what, text in found:
+        print(f"{mark:8} {what:11} {text}")
+    missing = [what for mark, what, _ in found if mark == "MISSING"]
+    print(f"A fit cannot run: {', '.join(missing)} missing" if missing else "A fit can run.")
+    return int(bool(missing))
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.doctor", main, sys.argv[1:])

@@ -1,0 +1,49 @@
+"""Write a small capture to try everything with, of a pot: `python -m mi_ring.example DIR`."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mi_ring.capture.example import write_example
+from mi_ring.errors import InputError
+from mi_ring.system import command
+from mi_ring.system.files import writing
+
+
+@dataclass(frozen=True)
+class ExampleConfig:
+    """Write a small capture: flash photographs of a pot, their masks and scene file, and the true mesh."""
+
+    folder: Positional[Annotated[Path, arg(metavar="DIR")]]
+    """Folder to write; it must not be there yet, or be empty."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    folder = command.parse(ExampleConfig, arguments, "mi_ring.example").folder
+    with writing(folder):
+        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+            raise InputError(f"{folder}: DIR: is there already; give another name")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        write_example(growing)
+        with writing(folder):
+            growing.chmod(0o755)
+            if folder.exists():
+                folder.rmdir()
+            os.replace(growing, folder)
+    finally:
+        shutil.rmtree(growing, ignore_errors=True)
+    print(f"{folder}/scene.xml, and the true surface in {folder}/truth/mesh.ply\n"
+          f"Now: mi-ring fit {folder}/scene.xml --preset fast")  # fmt: skip
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.example", main)

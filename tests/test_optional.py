@@ -1,0 +1,52 @@
+"""Packages that cannot be installed everywhere: without them there is one clear line, and what does without goes on."""
+
+import subprocess
+import sys
+
+import pytest
+
+CODE = """
+import sys
+sys.modules[{missing!r}] = None  # as if it were not installed
+import mi_ring
+from mi_ring import {command}
+{command}.main(sys.argv[1:])
+"""
+
+
+def without(missing, command, *arguments, cwd):
+    code = CODE.format(missing=missing, command=command)
+    done = subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, cwd=cwd)
+    return done.returncode, done.stderr.strip().splitlines()[-1] if done.stderr.strip() else ""
+
+
+QUICK = ["--iterations", 1, "--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2]
+
+
+def test_a_fit_from_a_sphere_needs_none_of_them(small_capture, tmp_path):
+    for package in ("gpytoolbox", "xatlas", "pycolmap"):
+        out = tmp_path / package
+        status, complaint = without(
+            package, "fit", small_capture, "--out", out, "--domain", "sphere", *QUICK, cwd=tmp_path
+        )
+        assert status == 0, complaint
+        assert (out / "report.html").is_file() and (out / "mesh.ply").is_file()
+
+
+@pytest.mark.parametrize(("package", "command", "arguments"), [
+    ("gpytoolbox", "fit", ["{capture}", "--domain", "hull", *QUICK]),
+    ("xatlas", "export", ["{run}", "pot.glb"]),
+    ("pycolmap", "convert", ["colmap", "{colmap}", "scan.xml"]),
+])  # fmt: skip
+def test_what_needs_one_says_so(package, command, arguments, small_capture, tmp_path):
+    model = tmp_path / "model"
+    model.mkdir()
+    for name in ("cameras", "images", "points3D"):
+        (model / f"{name}.txt").write_text("")
+    names = {"capture": small_capture, "colmap": model, "run": tmp_path / "run"}
+    if command == "export":
+        assert without("pycolmap", "fit", small_capture, "--out", tmp_path / "run", *QUICK, cwd=tmp_path)[0] == 0
+    arguments = [a.format(**names) if isinstance(a, str) else a for a in arguments]
+    status, complaint = without(package, command, *arguments, cwd=tmp_path)
+    assert status == 1 and "InputError" in complaint
+    assert f"needs the package {package}, which is not installed; try `pip install {package}`" in complaint
