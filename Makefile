@@ -7,7 +7,9 @@ TORCH  ?= torch==2.13.0
 SCENE  ?= scenes/pot2.xml
 ARGS   ?=
 
-RUN = $(VENV)/bin/python -m
+BIN = $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+PIP = $(BIN)/pip$(if $(filter Windows_NT,$(OS)),.exe)
+RUN = $(BIN)/python -m
 NPM_CI = cd mi_ring/output/viewer && npm ci --ignore-scripts --no-audit --no-fund
 
 .PHONY: help setup fit test tools viewer lint docs clean
@@ -24,15 +26,15 @@ help:
 
 setup: $(VENV)/.setup-done
 
-$(VENV)/.setup-done: pyproject.toml Makefile mi_ring/system/llvm.py | $(VENV)/bin/pip
-	$(VENV)/bin/python -I mi_ring/system/llvm.py
+$(VENV)/.setup-done: pyproject.toml Makefile mi_ring/system/llvm.py | $(PIP)
+	$(BIN)/python -I mi_ring/system/llvm.py
 	$(RUN) pip install $(TORCH)
 	$(RUN) pip install -e '.[test]'
 	@touch $@
 
 # Debian and Ubuntu keep ensurepip in the package python3-venv. Without it, the wheel in python3-pip-whl is pip enough to
 # install pip; it looks for certificates where a slim container has none, so give it those it came with.
-$(VENV)/bin/pip:
+$(PIP):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
 	  || { echo 'make setup: Python 3.10 or newer is needed, for example PYTHON=python3.12' >&2; exit 1; }
 	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv $(VENV); else set -e; \
@@ -41,7 +43,7 @@ $(VENV)/bin/pip:
 	  ls $$wheels/pip-*.whl >/dev/null 2>&1 || { $(PYTHON) -I mi_ring/system/llvm.py $$deb python3-pip-whl; wheels=$$deb$$wheels; }; \
 	  test -e $$certificates || { certificates=$$deb/certificates; cat $$deb/usr/share/ca-certificates/*/*.crt >$$certificates; }; \
 	  wheel=$$(ls $$wheels/pip-*.whl); \
-	  PIP_CERT=$${PIP_CERT:-$$certificates} $(VENV)/bin/python $$wheel/pip install --upgrade pip; \
+	  PIP_CERT=$${PIP_CERT:-$$certificates} $(BIN)/python $$wheel/pip install --upgrade pip; \
 	  rm -rf $$deb; fi
 
 fit: setup

@@ -1,8 +1,8 @@
 """The README's picture: how a sphere becomes the object, and what a fit with the default settings finds.
 
-    python -m mi_ring.fit scenes/pot2.xml
-    python -m mi_ring.fit scenes/pot2.xml --domain sphere --out out/pot2_sphere
-    python docs/make_picture.py out/pot2_sphere out/pot2 docs/pot2.png [--photograph 7]
+python -m mi_ring.fit scenes/pot2.xml
+python -m mi_ring.fit scenes/pot2.xml --domain sphere --out out/pot2_sphere
+python docs/make_picture.py out/pot2_sphere out/pot2 docs/pot2.png [--photograph 7]
 """
 
 import argparse

@@ -15,7 +15,8 @@ COMMANDS = ("example", "convert", "check", "fit", "render", "export", "evaluate"
 def summary(name: str) -> tuple[str, str]:
     """How a command is called, and what it does, by the first line of its module, which is not imported."""
     source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
-    sentence, _, call = ast.get_docstring(ast.parse(source)).split("\n")[0].partition("`python -m mi_ring.")
+    docstring = ast.get_docstring(ast.parse(source)) or ""
+    sentence, _, call = docstring.split("\n")[0].partition("`python -m mi_ring.")
     return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")
 
 
@@ -24,9 +25,10 @@ def overview() -> str:
     lines = ["usage: mi-ring COMMAND …", ""]
     for usage, sentence in map(summary, COMMANDS):
         lines += [f"  {usage}", f"      {sentence}"]
-    lines += ["", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same.",
-              "mi-ring COMMAND … --traceback shows where an error comes from; mi-ring --version the version."]  # fmt: skip
-    return "\n".join(lines)
+    return "\n".join([
+        *lines, "", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same.",
+        "mi-ring COMMAND … --traceback shows where an error comes from; mi-ring --version the version.",
+    ])  # fmt: skip
 
 
 def main() -> None:

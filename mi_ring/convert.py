@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from typing import Annotated, Union
+from typing import Annotated, Any, Union
 
 import tyro
 from tqdm import tqdm
@@ -17,7 +17,9 @@ from mi_ring.system import command
 DESCRIPTION = """Write a scene file for photographs in the format of another tool.
 
 Lens distortion is undone; units and frame stay as they are. mi_ring.convert FORMAT --help tells more."""
-Formats = Union[tuple(Annotated[source, tyro.conf.subcommand(name)] for name, source in FORMATS.items())]  # noqa: UP007
+Formats: Any = Union[  # noqa: UP007
+    tuple(Annotated[source, tyro.conf.subcommand(name)] for name, source in FORMATS.items())
+]
 
 
 def main(arguments: Sequence[str]) -> None:

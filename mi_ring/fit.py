@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -70,7 +70,8 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
     config = parse_options(arguments)
     require_file(config.scene, "the XML file of a scene")
-    config = dataclasses.replace(config, variant=set_variant(config.variant))
+    variant: Any = set_variant(config.variant)
+    config = dataclasses.replace(config, variant=variant)
     folder = config.folder
     state = read_checkpoint(folder, config) if config.resume else None
     keep_memory()

@@ -13,12 +13,12 @@ from torch.nn import functional as F
 from mi_ring.system.files import write_file
 
 
-def srgb_to_linear(v):
+def srgb_to_linear(v: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1, on numpy arrays."""
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def linear_to_srgb(v):
+def linear_to_srgb(v: np.ndarray) -> np.ndarray:
     """The inverse of `srgb_to_linear`, clipped to [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
@@ -51,7 +51,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
-    def kernel(n):  # as a matrix: two products are ten times faster than two convolutions
+    def kernel(n: int) -> Tensor:  # as a matrix: two products are ten times faster than two convolutions
         distance = (torch.arange(n)[:, None] - torch.arange(n)).to(images)
         return torch.where(distance.abs() <= radius, torch.exp(-0.5 * (distance / sigma) ** 2) / total, 0)
 

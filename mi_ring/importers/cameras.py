@@ -1,7 +1,9 @@
 """Cameras of other tools: lenses in COLMAP's terms, and poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -25,7 +27,7 @@ class Lens:
         object.__setattr__(self, "params", tuple(map(float, self.params)))
 
     @cached_property
-    def colmap(self):
+    def colmap(self) -> Any:
         """As a `pycolmap.Camera`, which knows the models. Raises InputError where pycolmap is not installed."""
         pycolmap = need("pycolmap", f"camera model {self.model}")
         return pycolmap.Camera(model=self.model, width=self.size[0], height=self.size[1], params=list(self.params))
@@ -34,14 +36,14 @@ class Lens:
     def focal(self) -> tuple[float, float]:
         """[px]"""
         if self.model == "PINHOLE":
-            return self.params[:2]
+            return self.params[0], self.params[1]
         return self.colmap.focal_length_x, self.colmap.focal_length_y
 
     @property
     def centre(self) -> tuple[float, float]:
         """Principal point [px]; the first pixel's centre is (0.5, 0.5)."""
         if self.model == "PINHOLE":
-            return self.params[2:]
+            return self.params[2], self.params[3]
         return self.colmap.principal_point_x, self.colmap.principal_point_y
 
     @property
@@ -54,7 +56,7 @@ class Lens:
         return np.allclose(self.colmap.img_from_cam(rays), straight, atol=1e-6)
 
 
-def pinhole(K: np.ndarray, size, shift: float, what: str) -> Lens:
+def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
     """Of a calibration matrix; `shift` [px] is what its principal point lacks to have pixels' centres at 0.5."""
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
@@ -62,7 +64,7 @@ def pinhole(K: np.ndarray, size, shift: float, what: str) -> Lens:
     if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
         raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here; is "
                          "the matrix transposed?")  # fmt: skip
-    return Lens("PINHOLE", size, (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
+    return Lens("PINHOLE", (size[0], size[1]), (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
 
 
 def inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -61,11 +62,12 @@ class Colmap(Source):
                 names = (f"{image.name}.png", str(Path(image.name).with_suffix(".png")))
                 frame.mask = first_file([self.masks / n for n in names], "mask")
             frames.append(frame)
-        exposures = self.exif and [exif_exposure(frame.image) for frame in frames]
+        exposures = [exif_exposure(frame.image) for frame in frames] if self.exif else []
+        known = np.array([exposure for exposure in exposures if exposure is not None])
         scale = np.ones(len(frames))
-        if exposures and all(exposures):
-            scale = exposures / np.median(exposures)
-        elif exposures and any(exposures):
+        if len(known) == len(frames):
+            scale = known / np.median(known)
+        elif len(known):
             k = exposures.index(None)
             raise InputError(f"{frames[k].image}: EXIF: no exposure time, ISO or aperture, but other photographs have "
                              "them; add them, or give --no-exif if all have the same exposure")  # fmt: skip
@@ -95,7 +97,7 @@ def exif_exposure(path: Path) -> float | None:
     return exposure
 
 
-def read_exif(path: Path):
+def read_exif(path: Path) -> dict[int, Any]:
     """The part of the EXIF data that is about the exposure."""
     with Image.open(path) as image:
         return image.getexif().get_ifd(ExifTags.IFD.Exif)

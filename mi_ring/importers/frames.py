@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
@@ -44,7 +45,7 @@ class Frame:
         """The camera that takes it once lens distortion is undone."""
         return Camera(self.pose @ MITSUBA, np.array(self.lens.focal), np.array(self.lens.centre), self.lens.size)
 
-    def at_camera(self, rgb, offset=(0, 0, 0)) -> Light:
+    def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
         """A point light beside this frame's camera, `offset` in the camera's axes [scene units]."""
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
@@ -79,8 +80,8 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
         if np.linalg.det(rotation) < 0:
             raise InputError(f"{what}: its rotation is left-handed, a mirror; check the order and signs of its axes")
         if not np.isfinite(frame.lens.params).all() or min(frame.lens.focal) <= 0:
-            raise InputError(f"{what}: its parameters are {', '.join(f'{p:g}' for p in frame.lens.params)}; must be finite, with "
-                             "focal lengths above 0")  # fmt: skip
+            raise InputError(f"{what}: its parameters are {', '.join(f'{p:g}' for p in frame.lens.params)}; must be "
+                             "finite, with focal lengths above 0")  # fmt: skip
         if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
             raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
                              "must be finite and not negative")  # fmt: skip

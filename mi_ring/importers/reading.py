@@ -1,7 +1,9 @@
 """Reads what is asked of foreign files; anything else is one clear error."""
 
 import json
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -12,6 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.images import read_image
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
+Content = TypeVar("Content")
 
 
 def pixels_of(path: Path) -> np.ndarray:
@@ -22,9 +25,10 @@ def pixels_of(path: Path) -> np.ndarray:
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) [px] of an image file. Raises InputError if it cannot be read."""
 
-    def size(file):
+    def size(file: Path) -> tuple[int, int]:
         if path.suffix.lower() == ".exr":
-            return tuple(mi.Bitmap(str(file)).size())
+            width, height = mi.Bitmap(str(file)).size()
+            return width, height
         with Image.open(file) as image:
             return image.size
 
@@ -36,7 +40,7 @@ def has_alpha(path: Path) -> bool:
     if path.suffix.lower() == ".exr":
         return pixels_of(path).shape[2] in (2, 4)
 
-    def alpha(file):
+    def alpha(file: Path) -> bool:
         with Image.open(file) as image:
             return image.mode in ("LA", "RGBA")
 
@@ -76,7 +80,7 @@ def numbered(folder: Path) -> dict[int, Path]:
     return dict(enumerate(files))
 
 
-def chosen(wanted, there_are, option: str, where: Path) -> list[int]:
+def chosen(wanted: Collection[int], there_are: Collection[int], option: str, where: Path) -> list[int]:
     """Those wanted, or all. Raises InputError if one does not exist."""
     for number in wanted:
         if number not in there_are:
@@ -84,7 +88,7 @@ def chosen(wanted, there_are, option: str, where: Path) -> list[int]:
     return sorted(wanted or there_are)
 
 
-def matrix(values, shape: tuple[int, ...], what: str) -> np.ndarray:
+def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Finite numbers of this shape. Raises InputError for anything else."""
     try:
         array = np.array(values, float)
@@ -99,12 +103,12 @@ def matrix(values, shape: tuple[int, ...], what: str) -> np.ndarray:
     return array
 
 
-def entry(arrays, key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
+def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
     """An array of a .mat or .npz file."""
     return matrix(arrays.get(key), shape, f"{path}: {key}")
 
 
-def read_as(path: Path, what: str, read):
+def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
     """`read(path)`. Raises InputError if there is no such file or if it is not what it should be."""
     try:
         return read(existing(path, what))
@@ -119,17 +123,17 @@ def load_mat(path: Path) -> dict:
     return read_as(path, "MATLAB file", scipy.io.loadmat)
 
 
-def load_npz(path: Path):
+def load_npz(path: Path) -> Any:
     """A dictionary of arrays, or the one array of a .npy file."""
 
-    def arrays(file):
+    def arrays(file: Path) -> dict[str, np.ndarray] | np.ndarray:
         content = np.load(file)
         return content if isinstance(content, np.ndarray) else dict(content)
 
     return read_as(path, "NumPy file", arrays)
 
 
-def load_json(path: Path):
+def load_json(path: Path) -> Any:
     """What a JSON file holds."""
     return read_as(path, "JSON", lambda file: json.loads(file.read_text()))
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,18 +60,19 @@ class Transforms(Source):
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
     """The camera of one frame of transforms.json: `given` are the file's fields and above them the frame's own."""
 
-    def number(*names, default=None):
+    def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)
         if not isinstance(value, int | float):
             raise InputError(f"{where}.{names[0]}: is {'missing' if value is None else value}; must be a number")
         return float(value)
 
-    def angle(name):
+    def angle(name: str) -> float:
         if not 0 < (value := number(name)) < math.pi:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    width, height = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)
+    size: Any = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)
+    width, height = size
     if given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")
     else:
@@ -85,11 +87,11 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
     k1, k2, k3, k4, p1, p2 = (number(name, default=0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = given.get("camera_model") or "OPENCV"
     if model == "OPENCV_FISHEYE" or given.get("is_fisheye"):
-        return Lens("OPENCV_FISHEYE", (width, height), (fx, fy, cx, cy, k1, k2, k3, k4))
+        return Lens("OPENCV_FISHEYE", size, (fx, fy, cx, cy, k1, k2, k3, k4))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"):
         raise InputError(f"{where}.camera_model: is {model}; must be OPENCV, OPENCV_FISHEYE or PINHOLE")
     if k4:
         raise InputError(f"{where}.k4: is {k4}; OPENCV has no such term of distortion, must be 0")
     if not any((k1, k2, k3, p1, p2)):
-        return Lens("PINHOLE", (width, height), (fx, fy, cx, cy))
-    return Lens("FULL_OPENCV", (width, height), (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))
+        return Lens("PINHOLE", size, (fx, fy, cx, cy))
+    return Lens("FULL_OPENCV", size, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))

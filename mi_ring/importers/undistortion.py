@@ -38,7 +38,7 @@ def undistort(pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: fl
     """
     places = distorted(lens)
     size = np.array(pixels.shape[:2])[:, None, None]
-    valid = ((places >= -0.5) & (places <= size - 0.5)).all(0)  # a pixel is as wide as 1
+    valid = np.all((places >= -0.5) & (places <= size - 0.5), 0)  # a pixel is as wide as 1
     full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
 
     def resampled(channel: np.ndarray) -> np.ndarray:

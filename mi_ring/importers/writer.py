@@ -4,6 +4,7 @@ import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ class Writer:
         self.files: list[Path] = []
         self.shared: dict = {}  # where masks are, by file and lens
 
-    def write(self, file: str, write) -> Path:
+    def write(self, file: str, write: Callable[[Path], object]) -> Path:
         """Have `write(path)` write a file and return where it is going to be."""
         path = self.staging / file
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,7 +86,7 @@ def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
             return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
         return path
 
-    def shared(folder: str, key, path: Path, pixels) -> str:
+    def shared(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> str:
         """Of several photographs: written once."""
         if (folder, key) not in writer.shared:
             writer.shared[folder, key] = placed(folder, path, pixels())
@@ -100,23 +101,25 @@ def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
             pixels = None  # the file will do
     valid = None
     if not straight:
+        assert pixels is not None  # they were read above
         srgb = encoding == "srgb" or (encoding is None and pixels.dtype == np.uint8)
         pixels, shown = undistort(pixels, frame.lens, srgb, 1.0 if frame.saturation is None else frame.saturation)
         if not shown.all():
-            image = np.where(shown, 255, 0).astype(np.uint8)[..., None]
-            valid = shared("valid", frame.lens, Path(), lambda: image)
+            white = np.where(shown, 255, 0).astype(np.uint8)[..., None]
+            valid = shared("valid", frame.lens, Path(), lambda: white)
     image = writer.relative(placed("images", frame.image, pixels))
-    if frame.mask is None:
+    file = frame.mask
+    if file is None:
         return Files(image, None, valid)
-    if frame.mask == frame.image:
+    if file == frame.image:
         return Files(image, image, valid)
 
     def mask() -> np.ndarray | None:
         if straight and not frame.fill_mask:
             return None
-        mask = pixels_of(frame.mask)
+        mask = pixels_of(file)
         if frame.fill_mask:
             mask = 255 * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None].astype(np.uint8)
         return mask if straight else undistort(mask, frame.lens).pixels
 
-    return Files(image, shared("masks", (frame.mask, frame.lens), frame.mask, mask), valid)
+    return Files(image, shared("masks", (file, frame.lens), file, mask), valid)

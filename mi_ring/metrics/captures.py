@@ -1,5 +1,6 @@
 """What there is to say of each photograph of a capture, and what is to be mended."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,9 @@ HEADS = (
 )
 
 
-def measure(capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]) -> list[PhotographQuality]:
+def measure(
+    capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
+) -> list[PhotographQuality]:
     """The rows of all photographs."""
     lights, rows = capture.photographs.lights, []
     of_each = zip(capture.sensors, capture.names, lights.toward(center), lights.distances(center),
@@ -52,7 +55,7 @@ def measure(capture: Capture, center: np.ndarray, radius: float, agreement: dict
             light=float(away / radius),
             angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
             object=float(inside.mean()) if masked else None,
-            clipped=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
+            clipped=float(np.any(saturated, -1)[inside].mean()) if inside.any() else 0.0,
             dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
             background=None if around is None else around / max(level, 1e-9),
             brightness=level / max(received, 1e-30), agreement=agreement.get(capture.outline(k)),
@@ -68,7 +71,7 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
         return None
     away = np.linalg.norm(cameras[point] - center, axis=1)
 
-    def beside(scale):  # distance from light to camera, for that from camera to object
+    def beside(scale: float) -> float:  # distance from light to camera, for that from camera to object
         return float(np.median(np.linalg.norm(scale * lights[point] - cameras[point], axis=1) / away))
 
     scale = min((0.001, 0.01, 0.1, 1, 10, 100, 1000), key=beside)
@@ -90,11 +93,11 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
 
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
     """What is to be mended, each in one line."""
-    found = []
+    found: list[str] = []
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # those of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
-        if not strays and max(sensor.size[0] for sensor in capture.sensors) <= WIDTH:
+        if not strays and capture.hull and max(sensor.size[0] for sensor in capture.sensors) <= WIDTH:
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
@@ -123,7 +126,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
     """The rows as text."""
     typical = np.median([row.brightness for row in rows])
 
-    def cells(row):
+    def cells(row: PhotographQuality) -> Iterator[str]:
         yield row.name
         yield f"{row.distance:.2f}"
         yield "distant" if np.isinf(row.light) else f"{row.light:.2f}"
@@ -140,7 +143,8 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 def drop_empty(capture: Capture) -> list[str]:
     """Forget masks with nothing in them and return the names of their photographs."""
-    empty = [k for k, mask in enumerate(capture.masks) if mask is not None and not (shrink_mask(mask, WIDTH)[0] > 127).any()]
+    given = [(k, mask) for k, mask in enumerate(capture.masks) if mask is not None]
+    empty = [k for k, mask in given if not (shrink_mask(mask, WIDTH)[0] > 127).any()]
     for k in empty:
         capture.masks[k] = None
     return [capture.names[k] for k in empty]

@@ -1,6 +1,7 @@
 """All numbers of a fit against the truth."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def evaluation_table(numbers: dict[str, float]) -> str:
     return "\n".join(lines)
 
 
-def rounded(value):
+def rounded(value: Any) -> Any:
     """Four digits after the point, all that mean anything, of all numbers in lists and dictionaries."""
     if isinstance(value, dict):
         return {key: rounded(v) for key, v in value.items()}

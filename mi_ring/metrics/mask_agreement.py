@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     silhouettes = [small_silhouette(silhouette) for silhouette in capture.silhouettes()]
     pixels = max(16, 12800 // len(silhouettes))
 
-    def shares(hull):
+    def shares(hull: Hull) -> np.ndarray:
         return (hull.shortfall(silhouettes, pixels) < 1).mean(1)
 
     agree, why = shares(capture.hull), None
@@ -40,7 +41,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
 
 
-def with_camera(silhouette: Silhouette, **changed) -> Silhouette:
+def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
     """A silhouette whose camera differs in these fields."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
@@ -93,7 +94,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
             ]
     as_it_is = share_agreed(guesses.pop(""))
     scores = {name: share_agreed(guess) for name, guess in guesses.items()}
-    best = max(scores, key=scores.get)
+    best = max(scores, key=scores.__getitem__)
     if scores[best] < max(CONFORMS, as_it_is + 0.05):
         return None
     return f"{best} (the masks then agree to {scores[best]:.0%})"
@@ -105,11 +106,11 @@ def half_pixel(hull: Hull) -> str | None:
     Of photographs that are shrunk for the hull it cannot be told, and matters little.
     """
     gaps, hull, some = {}, copy.copy(hull), evenly(len(hull.silhouettes), 32)
-    silhouettes, hull.distances = ([values[k] for k in some] for values in (hull.silhouettes, hull.distances))
+    silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):
         hull.silhouettes = [with_camera(s, centre=s.camera.centre + shift) for s in silhouettes]
         gaps[shift] = float(np.mean(hull.shortfall(pixels=50, samples=96, outline=True).clip(max=2)))
-    best = min(gaps, key=gaps.get)
+    best = min(gaps, key=gaps.__getitem__)
     if gaps[0.0] > 0.01 and gaps[best] < 0.5 * gaps[0.0]:
         do = "add 0.5 to" if best > 0 else "subtract 0.5 from"
         return f"principal points seem off by half a pixel: {do} cx and cy (the first pixel's centre is 0.5, 0.5)"

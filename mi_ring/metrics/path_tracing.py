@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -58,7 +59,9 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
     return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *own_emitters(scene)])
 
 
-def render_both(scene, photographs, k, sensor, scale, spp, depth, seed) -> Pictures:
+def render_both(
+    scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
+) -> Pictures:
     """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 times, each with `spp` samples per pixel of its own.
 
     `photometric` and `path` have different samples, but both along rays of ours: the film's filter has no part in it.
@@ -84,7 +87,9 @@ def render_both(scene, photographs, k, sensor, scale, spp, depth, seed) -> Pictu
     ))  # fmt: skip
 
 
-def render_path(scene, photographs, sensor, spp, seed, depth):
+def render_path(
+    scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
+) -> list[mi.Float]:
     """Like `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)

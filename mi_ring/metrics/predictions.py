@@ -20,13 +20,14 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     """
     surface = bridge.Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
-    squares, views = [], []
+    squares = []
+    views: list[dict] = []
     for k, name in enumerate(capture.names):
         rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
         predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
         observed = linear_to_srgb(capture.observe([k])[0][0].numpy())
         squares.append(np.mean((predicted - observed) ** 2))
-        views.append({"name": name} | decibels(squares[-1]) | ssim(predicted, observed))
+        views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed)})
     similar = [view["ssim"] for view in views if "ssim" in view]
     return decibels(np.mean(squares)) | ({"ssim": float(np.mean(similar))} if similar else {}), views
 

@@ -67,7 +67,7 @@ def blocks(x: np.ndarray) -> np.ndarray:
     return x[:, row, column, (row + column) % 3]
 
 
-def sidak(p: Sequence[float]) -> float:
+def sidak(p: Sequence[float] | np.ndarray) -> float:
     """Probability that the least of so many independent p-values is as small as this (Šidák 1967)."""
     return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
 
@@ -103,8 +103,7 @@ def all_as_one(rows: list[Comparison]) -> Comparison:
     column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
     weight = column["radiance"] / (column["radiance"].sum() or 1.0)
     shares = {name: float((weight * values).sum()) for name, values in column.items()}
-    return Comparison(**shares | {
-        "name": "all",
+    return Comparison(name="all", **shares | {
         "radiance": float(column["radiance"].mean()),
         "psnr": float(-10 * np.log10(np.mean(10 ** (-column["psnr"] / 10)))),
         "unexplained_noise": float(np.sqrt(((weight * column["unexplained_noise"]) ** 2).sum())),
@@ -125,7 +124,7 @@ def probability(p: float) -> str:
 
 def comparison_table(rows: list[Comparison]) -> str:
     """The numbers as text, one line each; shares are of the radiance of `path`."""
-    cells = [("", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
+    cells: list[tuple[str, ...]] = [("", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
               "unexplained %", "p direct", "p path")]  # fmt: skip
     cells += [(
         r.name, f"{r.radiance:.4g}", f"{100 * r.difference:+.2f}", f"{100 * r.absolute_difference:.2f}",

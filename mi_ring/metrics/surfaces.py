@@ -41,7 +41,7 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
     where = (mi.Point2f(pixel % width, pixel // width) + 0.5 - centre) * mi.Point2f(1 / np.array(focal))
     rays = mi.Ray3f(*camera_ray(to_world, mi.Point2f(1), mi.Point2f(0), where))
     si = scene.ray_intersect(rays)
-    back = si.is_valid() & (dr.dot(si.n, rays.d) > 0)
+    back = si.is_valid() & (dr.dot(mi.Vector3f(si.n), rays.d) > 0)
     return np.array(si.is_valid()), np.array(si.t), np.array(si.sh_frame.n).T, np.array(back)
 
 
@@ -123,7 +123,7 @@ def self_intersections(mesh: trimesh.Trimesh) -> int:
     while len(lanes):
         start = origin[lanes] + along[lanes] * reached[lanes, None]
         ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*along[lanes].T.astype(np.float32)))
-        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))
+        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))  # type: ignore[assignment]
         hit = scene.ray_intersect_preliminary(ray)
         valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))
         lanes, t, triangle = lanes[valid], t[valid], triangle[valid]

@@ -1,5 +1,6 @@
 """Texture atlases: a fitted surface cut open and flattened, and its networks baked into images."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -33,15 +34,15 @@ class Atlas(NamedTuple):
 
 def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
     """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
-    s, faces = ring.domain.sample(min(subdivisions, CUT))
+    points, faces = ring.domain.sample(min(subdivisions, CUT))
     xatlas = need("xatlas", "textures")
     options = xatlas.PackOptions()
     options.resolution, options.padding, options.bilinear = resolution, PADDING, True
     charts = xatlas.Atlas()
-    charts.add_mesh(flowed(ring, s.numpy(), time), faces.astype(np.uint32))  # of size 1: it drops small triangles
+    charts.add_mesh(flowed(ring, points.numpy(), time), faces.astype(np.uint32))  # of size 1: it drops small triangles
     charts.generate(pack_options=options)
     origin, faces, uv = charts[0]
-    s, uv, faces = s.numpy()[origin], np.clip(uv, 0, 1), faces.astype(np.int64)
+    s, uv, faces = points.numpy()[origin], np.clip(uv, 0, 1), faces.astype(np.int64)
     for _ in range(subdivisions - CUT):
         s, uv, faces = subdivide(ring, s, uv, faces)
     return assemble(ring, s, uv, faces, subdivisions, time)
@@ -53,7 +54,9 @@ def flowed(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
 
-def subdivide(ring: Ring, s, uv, faces, *more):
+def subdivide(
+    ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """Every triangle cut in four, new points on the domain; `more` (V, n) is interpolated like `uv`."""
     columns = [s, uv, *more]
     ends = np.cumsum([c.shape[1] for c in columns])[:-1]
@@ -63,7 +66,9 @@ def subdivide(ring: Ring, s, uv, faces, *more):
     return (s.astype(np.float32), rest[0], faces, *rest[1:])
 
 
-def assemble(ring: Ring, s, uv, faces, subdivisions: int, time: float) -> Atlas:
+def assemble(
+    ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
+) -> Atlas:
     """An atlas with its vertices, normals and tangents."""
     points, normals, whole = seamless_surface(ring, s, faces, time)
     # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
@@ -85,7 +90,9 @@ def assemble(ring: Ring, s, uv, faces, subdivisions: int, time: float) -> Atlas:
     return Atlas(s, uv, vertices, normals, tangents, faces, whole, subdivisions)
 
 
-def seamless_surface(ring: Ring, s, faces, time: float):
+def seamless_surface(
+    ring: Ring, s: np.ndarray, faces: np.ndarray, time: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (V, 3) in the normalised frame, smooth normals (V, 3) that know of no seam, and `Atlas.whole`."""
     once, whole = np.unique(s, axis=0, return_inverse=True)
     whole = whole.ravel()
@@ -94,7 +101,8 @@ def seamless_surface(ring: Ring, s, faces, time: float):
     return points[whole], normals[whole], whole
 
 
-class Texels(NamedTuple):
+@dataclass(frozen=True)
+class Texels:
     """What the texels of a square texture show; those between charts show what the nearest ones in charts do."""
 
     s: np.ndarray  # (N, 3) domain points of the N texels in charts
@@ -114,13 +122,13 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
     flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
     y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
     centre = mi.Point3f(*((np.stack([x, y]) + 0.5) / resolution).astype(np.float32), 1)
-    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(mi.Ray3f(centre, [0, 0, -1]))
+    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(mi.Ray3f(centre, mi.Vector3f(0, 0, -1)))
     inside = np.array(hit.is_valid())
     corners = faces[np.array(hit.prim_index)[inside]]
     b = np.array(hit.prim_uv).T[inside]
     weights = np.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
 
-    def at(values):
+    def at(values: np.ndarray) -> np.ndarray:
         return (values[corners] * weights).sum(1).astype(np.float32)
 
     n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(normals)

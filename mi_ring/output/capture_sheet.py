@@ -26,7 +26,7 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
     figure = Figure(figsize=(12, 4), dpi=100)
     canvas, panels = FigureCanvasAgg(figure), figure.subplots(1, 3)
     for panel, (a, b) in zip(panels, ((0, 1), (0, 2), (1, 2))):
-        panel.add_patch(Circle(center[[a, b]], radius, color="tab:green", alpha=0.3))
+        panel.add_patch(Circle((center[a], center[b]), radius, color="tab:green", alpha=0.3))
         panel.scatter(*away[:, [a, b]].T, s=12, c="tab:orange", label="lights")
         panel.quiver(*cameras[:, [a, b], 3].T, *(0.25 * reach * cameras[:, [a, b], 2]).T, color="tab:blue", angles="xy",
                      scale_units="xy", scale=1, width=0.004, label="cameras")  # fmt: skip
@@ -67,7 +67,8 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
         cell.thumbnail((CELL, CELL))
         x, y = place % columns * CELL, top.height + place // columns * (CELL + 16)
         page.paste(cell, (x, y + 16))
-        fits = "" if rows[k].agreement is None else f"  {rows[k].agreement:.0%}"
-        good = rows[k].agreement is None or rows[k].agreement >= CONFORMS
+        agreement = rows[k].agreement
+        fits = "" if agreement is None else f"  {agreement:.0%}"
+        good = agreement is None or agreement >= CONFORMS
         ImageDraw.Draw(page).text((x + 2, y + 2), rows[k].name + fits, fill=(255, 255, 255) if good else (255, 90, 90))
     return page

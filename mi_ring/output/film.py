@@ -40,6 +40,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
         stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # Ctrl-C is for us alone
     )  # fmt: skip
     try:
+        assert ffmpeg.stdin is not None  # but a pipe
         with contextlib.suppress(BrokenPipeError):  # it ended, and says below why
             for picture in pictures:
                 image = to_bytes(linear_to_srgb(picture))

@@ -3,7 +3,8 @@
 import io
 import math
 import xml.etree.ElementTree as ElementTree
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -50,7 +51,7 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     fixed, params = constants(loaded), mi.traverse(loaded)
     count = len(next(iter(values.values())))
 
-    def value(name, channels=1):
+    def value(name: str, channels: int = 1) -> np.ndarray:
         if name in values:
             return values[name]
         if name not in fixed:
@@ -114,19 +115,22 @@ def glb(ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metre
     return assemble_glb(atlas, textures(material, texels), material, reflectances(ring, atlas.s), ring.bsdf, metres)
 
 
-def assemble_glb(atlas: Atlas, images, material: Material, exact, bsdf: str, metres: float | None = None) -> bytes:
+def assemble_glb(
+    atlas: Atlas, images: Mapping[str, np.ndarray], material: Material, exact: Mapping[str, np.ndarray], bsdf: str,
+    metres: float | None = None,
+) -> bytes:  # fmt: skip
     """The GLB file of a mesh, its `textures` and its exact parameters at the vertices."""
     file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
     blob = bytearray()
 
-    def view(content: bytes, target=None) -> int:
+    def view(content: bytes, target: int | None = None) -> int:
         blob.extend(b"\0" * (-len(blob) % 4))
         place = pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(content), target=target)
         file.bufferViews.append(place)
         blob.extend(content)
         return len(file.bufferViews) - 1
 
-    def accessor(array: np.ndarray, bounds: bool = False, target=pygltflib.ARRAY_BUFFER) -> int:
+    def accessor(array: np.ndarray, bounds: bool = False, target: int = pygltflib.ARRAY_BUFFER) -> int:
         kind = pygltflib.UNSIGNED_INT if array.dtype == np.uint32 else pygltflib.FLOAT
         columns = 1 if array.ndim == 1 else array.shape[1]
         entry = pygltflib.Accessor(
@@ -138,7 +142,7 @@ def assemble_glb(atlas: Atlas, images, material: Material, exact, bsdf: str, met
         file.accessors.append(entry)
         return len(file.accessors) - 1
 
-    def texture(name: str, kind=pygltflib.TextureInfo):
+    def texture(name: str, kind: Any = pygltflib.TextureInfo) -> Any:
         file.images.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=view(png(images[name]))))
         file.textures.append(pygltflib.Texture(sampler=0, source=len(file.images) - 1))
         return kind(index=len(file.textures) - 1)

@@ -1,7 +1,9 @@
 """A scene for Mitsuba without mi_ring: textures and stock plugins alone."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -18,14 +20,16 @@ from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.system.files import write_file
 
 
-def first_photograph(run: Path) -> mi.Sensor:
+def first_photograph(run: Path) -> Any:
     """The first photograph of a fit, as its scene.xml has it. Raises InputError if there is none."""
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
     return open_scene(run / "scene.xml")[1][0]
 
 
-def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, photograph: mi.Sensor) -> list[Path]:
+def write_scene(
+    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: Mapping[str, np.ndarray], photograph: Any
+) -> list[Path]:
     """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone."""
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
@@ -35,7 +39,7 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
     files.append(path.with_name(f"{path.stem}_object.ply"))
     write_ply(mesh, files[-1])
 
-    def bitmap(parent, name: str, image: np.ndarray) -> None:
+    def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray) -> None:
         """A texture (N, 3) or (N,) of the texels."""
         files.append(path.with_name(f"{path.stem}_{name}.exr"))
         write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
@@ -52,7 +56,7 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
     if element.get("type") == "cooktorrance":
         material = gltf.metallic_roughness(bsdf, values)
         scale = material.scale
-        distribution = next((e.get("value") for e in element if e.get("name") == "distribution"), "ggx")
+        distribution = next((e.get("value", "") for e in element if e.get("name") == "distribution"), "ggx")
         element = ElementTree.SubElement(shape, "bsdf", type="blendbsdf")
         bitmap(element, "weight", material.specular)
         bitmap(ElementTree.SubElement(element, "bsdf", type="diffuse"), "reflectance", material.base_color)
@@ -63,7 +67,7 @@ def write_scene(path: Path, atlas: Atlas, texels: Texels, bsdf: str, values, pho
     else:
         shape.append(element)
         for texture in [t for t in element.iter("texture") if t.get("type") == "mesh_attribute"]:
-            name = texture.get("name")
+            name = texture.get("name", "")
             parent = next(e for e in element.iter() if texture in e)
             parent.remove(texture)
             bitmap(parent, name, values[name])

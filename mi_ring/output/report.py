@@ -3,8 +3,10 @@
 import base64
 import io
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -38,7 +40,7 @@ class PhotographPanel:
     pictures: dict[str, str]
 
 
-def report_html(fit, glb: bytes | None = None) -> str:
+def report_html(fit: Any, glb: bytes | None = None) -> str:
     """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer."""
     capture, ring = fit.capture, fit.ring
     rows, errors = [], []
@@ -62,13 +64,14 @@ def report_html(fit, glb: bytes | None = None) -> str:
     files = resources.files("mi_ring.output")
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
-        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit), settings=fit.config.settings(),
-        findings=fit_findings(rows, fit.iteration, fit.iterations), view=first_view(fit),
-        glb=glb and base64.b64encode(glb).decode(), viewer=files.joinpath("viewer", "viewer.min.js").read_text("utf-8"),
+        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
+        settings=fit.config.settings(), findings=fit_findings(rows, fit.iteration, fit.iterations),
+        view=first_view(fit), glb=glb and base64.b64encode(glb).decode(),
+        viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
 
 
-def first_view(fit) -> dict[str, list[float]]:
+def first_view(fit: Any) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
     eye = fit.capture.sensors[0].camera.position
     irradiance = np.median(fit.capture.photographs.lights.irradiance(fit.ring.center.cpu().numpy()), axis=0)
@@ -86,22 +89,22 @@ def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
         found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
                      "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
-    masked = [row for row in rows if row.iou is not None]
-    if few := worst((row.iou, row.name, f"IoU {row.iou:.2f}") for row in masked if row.iou < COVERED):
+    covers = [(row.iou, row.name) for row in rows if row.iou is not None]
+    if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < COVERED):
         found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
                      "and pose are right.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
         found.append(f"{few}: so much of the object is saturated; the fit only knows that it is at least this bright. "
                      "Expose less.")  # fmt: skip
 
-    rows = [row for row in rows if row.shift is not None]
-    if rows:
-        shift, scatter = middle([row.shift for row in rows])
+    shifts = [(row.name, row.shift) for row in rows if row.shift is not None]
+    if shifts:
+        shift, scatter = middle([by for _, by in shifts])
         scatter = np.hypot(*scatter)
-        if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(rows))):
+        if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(shifts))):
             found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cx and cy, or the "
                          "poses, seem off by as much or more; the first pixel's centre is (0.5, 0.5).")  # fmt: skip
-        away = [(row.name, np.subtract(row.shift, shift)) for row in rows]
+        away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
             found.append(f"{few} of the prediction: shifted as the others are not; mend the pose, or leave the "
@@ -109,13 +112,13 @@ def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -
     return found
 
 
-def middle(values) -> tuple[np.ndarray, np.ndarray]:
+def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Median of values (n, ...) and, from the median absolute deviation, their standard deviation."""
     median = np.median(values, axis=0)
-    return median, 1.4826 * np.median(np.abs(values - median), axis=0)
+    return median, 1.4826 * np.median(np.abs(np.subtract(values, median)), axis=0)
 
 
-def worst(photographs, most: int = 5) -> str:
+def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
     """Names and numbers of the lowest (rank, name, number), in one line; empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
@@ -126,7 +129,7 @@ def sides(x: float, y: float) -> str:
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
-def panel_of(fit, k: int, name: str) -> tuple[PhotographPanel, float]:
+def panel_of(fit: Any, k: int, name: str) -> tuple[PhotographPanel, float]:
     """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
     capture = fit.capture
     observed, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k])[:4])
@@ -184,7 +187,7 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def loss_curve(fit) -> str:
+def loss_curve(fit: Any) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()

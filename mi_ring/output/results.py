@@ -5,6 +5,7 @@ import io
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -53,7 +54,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
     write_file(folder / "config.json", json.dumps(options | {"scene": where}, indent=2, default=str))
 
 
-def save_fit(folder: Path, fit) -> None:
+def save_fit(folder: Path, fit: Any) -> None:
     """All results of a `Fit`, finished or not, into a folder of its own."""
     with locked(folder):
         prepare_folder(folder, fit.capture.path, fit.config.settings())
@@ -61,7 +62,7 @@ def save_fit(folder: Path, fit) -> None:
         write(folder, fit, fitted_scene(fit, folder))
 
 
-def fitted_scene(fit, folder: Path) -> bytes:
+def fitted_scene(fit: Any, folder: Path) -> bytes:
     """scene.xml of a fit. Raises InputError for a scene that cannot be rewritten."""
     return fitted_scene_xml(fit.capture.path, folder, fit.ring.subdivisions, fit.ring.bsdf)
 
@@ -84,7 +85,7 @@ def read_log(folder: Path) -> list[dict]:
     return [json.loads(line) for line in lines if line.endswith("}\n")]
 
 
-def write_inputs(path: Path, fit) -> None:
+def write_inputs(path: Path, fit: Any) -> None:
     """inputs.png: the start surface drawn over photographs, in green, where mask or pose errors show at once."""
     s, faces = fit.ring.domain.sample(4)
     fit.surface.show(fit.ring, s, faces)
@@ -106,7 +107,7 @@ def write_inputs(path: Path, fit) -> None:
     write_file(path, buffer.getvalue())
 
 
-def write(folder: Path, fit, scene: bytes) -> None:
+def write(folder: Path, fit: Any, scene: bytes) -> None:
     """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
     write_state(ring_state(fit.ring, fit.config.settings()), folder / "ring.pt")
     write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply")

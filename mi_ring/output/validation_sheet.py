@@ -20,7 +20,7 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0
 
-    def signed(x):
+    def signed(x: np.ndarray) -> np.ndarray:
         return colormaps["RdBu_r"](0.5 + 0.5 * x.mean(-1) / white)[..., :3]
 
     cells = [

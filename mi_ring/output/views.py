@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import mitsuba as mi
 import numpy as np
@@ -84,7 +84,7 @@ class RenderConfig(MaterialOptions):
 class View:
     """A picture to render."""
 
-    sensor: mi.Sensor  #: a `photograph`
+    sensor: Any  #: a `photograph`
     name: str
     time: float  # of the flow
 
@@ -110,7 +110,8 @@ def views_of(capture: Capture, ring: Ring, config: RenderConfig) -> list[View]:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
         return [View(sensor, name, config.time) for sensor, name in zip(capture.sensors, names)]
     if config.view is not None and config.view not in capture.names:
-        raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {capture.names[0]}")
+        first = capture.names[0]
+        raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {first}")
     sensor = capture.sensors[capture.names.index(config.view) if config.view else 0]
     up = up_of(capture, config)
     width, height = sensor.size
@@ -180,8 +181,9 @@ def lit_surface(capture: Capture, ring: Ring, config: RenderConfig) -> bridge.Su
 
 
 def render_views(
-    surface: bridge.Surface, ring: Ring, views: list[View], integrator, shadows: bool, config: RenderConfig
-) -> Iterator[np.ndarray]:
+    surface: bridge.Surface, ring: Ring, views: list[View], integrator: mi.Integrator | None, shadows: bool,
+    config: RenderConfig,
+) -> Iterator[np.ndarray]:  # fmt: skip
     """The pictures, (H, W, 3) linear radiance each."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
@@ -197,18 +199,19 @@ def render_views(
             yield rgb[0].numpy()
 
 
-def in_passes(scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
+def in_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
     """A picture (H, W, 3) by an integrator of Mitsuba's: the mean of passes of `LANES` rays each.
 
     Or of one ray per pixel, where there are more pixels: memory does not grow with `spp`.
     """
     width, height = sensor.size
     at_once = min(spp, max(1, LANES // (width * height)))
-    total, left, number = 0.0, spp, 0
+    total, left, number = np.zeros(3, np.float32), spp, 0
     while left:
         samples = min(at_once, left)
         # Seeds of passes must not be those of other pictures.
-        picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=seed + (number << 16))
+        own: Any = seed + (number << 16)
+        picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=own)
         total = total + samples / spp * np.array(picture)[..., :3]
         left, number = left - samples, number + 1
     return total
@@ -220,7 +223,7 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
     to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
     require_file(envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
     try:
-        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world)})
+        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world.tolist())})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
     lamps = [e for e in own_emitters(capture.scene) if not e.is_environment()]

@@ -74,5 +74,6 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        file.unlink(missing_ok=True)
+        if os.name == "posix":  # elsewhere a file that is open cannot be removed, and filelock removes it itself
+            file.unlink(missing_ok=True)
         lock.release()

@@ -91,7 +91,7 @@ def missing() -> str | None:
 def _remedy(package: str, more: str = "") -> str:
     advice = {
         "darwin": "Run `brew install llvm`",
-        "win32": "Install LLVM from https://llvm.org, with LLVM-C.dll in PATH",
+        "win32": "Run `winget install LLVM.LLVM`",
     }
     if sys.platform in advice:
         return f"{advice[sys.platform]}{more}."
@@ -137,6 +137,9 @@ def _system_folders() -> list[str]:
 
 def find(folders: list[str] | None = None) -> str | None:
     """Return the path of the first library in `libraries(folders)` that is new enough and loads, or None."""
+    if sys.platform == "win32" and folders is None:  # whose libraries do not have their version in their names
+        places = shutil.which("LLVM-C.dll"), r"C:\Program Files\LLVM\bin\LLVM-C.dll"
+        return next((path for path in places if path and os.path.exists(path)), None)
     return next((path for major, path in libraries(folders) if major >= OLDEST and loads(path)), None)
 
 
