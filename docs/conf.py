@@ -10,7 +10,7 @@ import pkgutil
 import sys
 import textwrap
 from pathlib import Path
-from typing import Annotated, get_args, get_origin
+from typing import Annotated, TypeVar, get_args, get_origin
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 os.environ["COLUMNS"] = "100"  # of the commands' help
@@ -184,7 +184,8 @@ def link(app, env, node, content):
     name = target.rpartition(".")[2]
     if target in (name, PUBLIC.get(name)) and name in PUBLIC:
         return make_refnode(app.builder, here, "api", f"mi_ring.{name}", content)
-    return None
+    module = sys.modules.get(target.rpartition(".")[0])
+    return content if isinstance(getattr(module, name, None), TypeVar) else None  # which are described nowhere
 
 
 def setup(app):
