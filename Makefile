@@ -67,7 +67,6 @@ viewer:
 
 lint: setup
 	$(RUN) ruff check .
-	$(RUN) ruff format --check .
 	$(RUN) mypy
 
 docs: setup

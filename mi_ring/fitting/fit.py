@@ -36,7 +36,7 @@ TermLike = Term | Callable[[Iteration], Tensor | None]
 
 
 class Fit:
-    """A reconstruction in progress: networks, optimisers, random numbers and how far it is.
+    """A reconstruction in progress: networks, optimisers, random numbers and how far it is. ::
 
         for it in Fit(capture, Config.preset("fast")):
             print(it.number, it.loss)
