@@ -83,7 +83,7 @@ def exif_exposure(path: Path) -> float | None:
         return None
     exif = read_as(path, "image", read_exif)
     tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
-    values = [exif.get(tag) for tag in tags]
+    values: list[Any] = [exif.get(tag) for tag in tags]
     if not all(values):
         return None
     try:

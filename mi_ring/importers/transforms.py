@@ -71,7 +71,7 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    size: Any = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)
+    size: Any = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)  # cut by Lens
     width, height = size
     if given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")

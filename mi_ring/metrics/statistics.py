@@ -124,8 +124,10 @@ def probability(p: float) -> str:
 
 def comparison_table(rows: list[Comparison]) -> str:
     """The numbers as text, one line each; shares are of the radiance of `path`."""
-    cells: list[tuple[str, ...]] = [("", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
-              "unexplained %", "p direct", "p path")]  # fmt: skip
+    cells: list[tuple[str, ...]] = [(
+        "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
+        "unexplained %", "p direct", "p path",
+    )]  # fmt: skip
     cells += [(
         r.name, f"{r.radiance:.4g}", f"{100 * r.difference:+.2f}", f"{100 * r.absolute_difference:.2f}",
         f"{100 * r.noise:.2f}", f"{r.psnr:.1f} dB", f"{100 * r.shadows:.2f}", f"{100 * r.interreflection:.2f}",

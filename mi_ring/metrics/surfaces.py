@@ -123,7 +123,7 @@ def self_intersections(mesh: trimesh.Trimesh) -> int:
     while len(lanes):
         start = origin[lanes] + along[lanes] * reached[lanes, None]
         ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*along[lanes].T.astype(np.float32)))
-        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))  # type: ignore[assignment]
+        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))  # type: ignore[assignment]  # wrong stub
         hit = scene.ray_intersect_preliminary(ray)
         valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))
         lanes, t, triangle = lanes[valid], t[valid], triangle[valid]

@@ -66,9 +66,7 @@ def subdivide(
     return (s.astype(np.float32), rest[0], faces, *rest[1:])
 
 
-def assemble(
-    ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
-) -> Atlas:
+def assemble(ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float) -> Atlas:
     """An atlas with its vertices, normals and tangents."""
     points, normals, whole = seamless_surface(ring, s, faces, time)
     # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
@@ -122,7 +120,8 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
     flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
     y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
     centre = mi.Point3f(*((np.stack([x, y]) + 0.5) / resolution).astype(np.float32), 1)
-    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(mi.Ray3f(centre, mi.Vector3f(0, 0, -1)))
+    rays = mi.Ray3f(centre, mi.Vector3f(0, 0, -1))
+    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(rays)
     inside = np.array(hit.is_valid())
     corners = faces[np.array(hit.prim_index)[inside]]
     b = np.array(hit.prim_uv).T[inside]

@@ -3,7 +3,6 @@
 import io
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -116,7 +115,7 @@ def glb(ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metre
 
 
 def assemble_glb(
-    atlas: Atlas, images: Mapping[str, np.ndarray], material: Material, exact: Mapping[str, np.ndarray], bsdf: str,
+    atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None,
 ) -> bytes:  # fmt: skip
     """The GLB file of a mesh, its `textures` and its exact parameters at the vertices."""

@@ -1,7 +1,6 @@
 """A scene for Mitsuba without mi_ring: textures and stock plugins alone."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ def first_photograph(run: Path) -> Any:
 
 
 def write_scene(
-    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: Mapping[str, np.ndarray], photograph: Any
+    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any
 ) -> list[Path]:
     """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone."""
     files = [path]

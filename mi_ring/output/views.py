@@ -210,7 +210,7 @@ def in_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int,
     while left:
         samples = min(at_once, left)
         # Seeds of passes must not be those of other pictures.
-        own: Any = seed + (number << 16)
+        own: Any = seed + (number << 16)  # Mitsuba's annotation knows no int
         picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=own)
         total = total + samples / spp * np.array(picture)[..., :3]
         left, number = left - samples, number + 1
@@ -223,7 +223,8 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
     to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
     require_file(envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
     try:
-        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": mi.ScalarTransform4f(to_world.tolist())})
+        turn = mi.ScalarTransform4f(to_world.tolist())
+        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
     lamps = [e for e in own_emitters(capture.scene) if not e.is_environment()]
