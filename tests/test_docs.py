@@ -133,8 +133,8 @@ def values(tmp_path):
     grey = {"type": "rgb", "value": [0.1, 0.2, 0.3]}
     return {
         "photograph": [{
-            "filename": "a.png", "mask": "b.png", "valid": "c.png", "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0, "to_world": moved,
-            "encoding": "linear", "saturation": 0.9, "film": film, "emitter": light,
+            "filename": "a.png", "mask": "b.png", "valid": "c.png", "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0,
+            "to_world": moved, "encoding": "linear", "saturation": 0.9, "film": film, "emitter": light,
         }],
         "flash": [{}],
         "shapenet": [

@@ -59,7 +59,7 @@ def cameras() -> list[Camera]:
 
 
 def photographed(scene: mi.Scene, camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
-    """What a camera sees by `path`, linear radiance (H, W, 3) and coverage (H, W), each pixel a mean over its square."""
+    """What a camera sees by `path`: linear radiance (H, W, 3) and coverage (H, W), means over the pixels' squares."""
     width, height = camera.size
     n = int(np.sqrt(spp))
     y, x = (np.mgrid[: height * n, : width * n] + 0.5) / n
@@ -77,7 +77,7 @@ def write_example(folder: Path, spp: int = SPP) -> None:
     """Write scene.xml, images/, masks/ and truth/mesh.ply into a folder that is there."""
     shown = pot()
     mesh = mesh_of(shown.vertices, shown.faces)
-    mesh.add_attribute("vertex_color", 3, shown.colours.astype(np.float32).ravel())
+    mesh.add_attribute("vertex_color", 3, shown.colours.ravel().tolist())
     glaze = {"type": "principled", "roughness": 0.35, "specular": 0.6,
              "base_color": {"type": "mesh_attribute", "name": "vertex_color"}}  # fmt: skip
     mesh.set_bsdf(mi.load_dict(glaze))

@@ -52,8 +52,8 @@ class Domain:
         seen and not only what the vertices stand on. The faces stay the same.
         """
         if level not in self.levels:
-            points, faces = self.triangulate(level)
-            self.levels[level] = torch.from_numpy(np.asarray(points, np.float32)), np.asarray(faces, np.int64)
+            vertices, triangles = self.triangulate(level)
+            self.levels[level] = torch.from_numpy(np.asarray(vertices, np.float32)), np.asarray(triangles, np.int64)
         points, faces = self.levels[level]
         return (points if random is None else self.move(level, points, random)), faces
 
