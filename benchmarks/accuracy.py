@@ -129,7 +129,7 @@ def product_speed(rows: int, width: int, dtype) -> float:
 def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     """Run `mi_ring.fit` in this process and look on.
 
-    Returns the curve of so many points, (seconds, means of `evaluate.compare_surfaces`) each; seconds by part, of the
+    Returns the curve of so many points, (seconds, means of `surfaces.compare_surfaces`) each; seconds by part, of the
     fit and of all; peak memory [GiB]; FLOP/s of the machine.
     """
     started = time.perf_counter()

@@ -1,7 +1,6 @@
 """The XML of scene files: the one place that writes photographs, cameras and lights."""
 
 import math
-import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.rendering.lights import Light
+from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
 
@@ -119,7 +119,7 @@ def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -
     for element in tree.iter("string"):
         file = source.parent / element.get("value", "")
         if element.get("value") and file.is_file():
-            element.set("value", Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
+            element.set("value", relative_to(folder.resolve(), file.resolve()))
     shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
     for element in list(shape):
         if element.get("name") in ("weights", "to_world"):

@@ -1,7 +1,6 @@
 """Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
 
 import hashlib
-import os
 from pathlib import Path
 
 from mi_ring.capture.capture import Capture
@@ -9,7 +8,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.ring.saved import read_state
-from mi_ring.system.files import write_state
+from mi_ring.system.files import relative_to, write_state
 
 NAME = "checkpoint.pt"
 ADVICE = "run without --resume to start anew"
@@ -49,7 +48,7 @@ def digests(capture: Capture, config: Config) -> dict[str, str]:
     files |= {file for sensor in capture.sensors for file in (sensor.filename, sensor.mask, sensor.valid)}
     if isinstance(config.domain, tuple):
         files.add(Path(config.domain[1]))
-    return {Path(os.path.relpath(file, capture.path.parent)).as_posix(): digest(file) for file in files if file}
+    return {relative_to(capture.path.parent, file): digest(file) for file in files if file}
 
 
 def digest(file: Path) -> str:

@@ -16,7 +16,7 @@ from mi_ring.images import write_image
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.reading import pixels_of
 from mi_ring.importers.undistortion import undistort
-from mi_ring.system.files import write_file
+from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
@@ -47,7 +47,7 @@ class Writer:
 
     def relative(self, path: Path) -> str:
         """As the scene names it."""
-        return Path(os.path.relpath(path, self.scene.parent)).as_posix()
+        return relative_to(self.scene.parent, path)
 
     def finish(self, xml: bytes) -> None:
         """Move everything to its place. Raises InputError if there are other files, which may be the sources."""

@@ -59,6 +59,7 @@ def report_html(fit: Any, glb: bytes | None = None) -> str:
         "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
+        "Made by": f"mi_ring {__version__}",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
     }
     files = resources.files("mi_ring.output")

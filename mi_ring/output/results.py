@@ -3,7 +3,6 @@
 import contextlib
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +18,19 @@ from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, write_file, write_state, writing
+from mi_ring.system.files import locked, relative_to, write_file, write_state, writing
 
 VIEWED, TEXELS = 5, 1024  #: level of the report's object, and texels across its textures
 
 
 def default_folder(scene: Path) -> Path:
     """Where the results of a scene go: out/<its name>. Raises InputError if those of another scene are there."""
-    folder = Path("out") / scene_name(scene)
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+    folder, other = Path("out") / scene_name(scene), None
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it says nothing of use
         other = folder / json.loads((folder / "config.json").read_text())["scene"]
-        if other.is_file() and scene.is_file() and not other.samefile(scene):
-            raise InputError(f"{folder}: holds the results of another scene, {os.path.relpath(other)}; say with --out "
-                             "where those of this one are to go")  # fmt: skip
+    if other and other.is_file() and scene.is_file() and not other.samefile(scene):
+        raise InputError(f"{folder}: holds the results of another scene, {relative_to(Path(), other)}; say with --out "
+                         "where those of this one are to go")  # fmt: skip
     return folder
 
 
@@ -50,8 +49,8 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
             folder.rename(aside)
             print(f"The results that were in {folder}/ are now in {aside}/")
         folder.mkdir(parents=True, exist_ok=True)
-    where = Path(os.path.relpath(scene.resolve(), folder)).as_posix()
-    write_file(folder / "config.json", json.dumps(options | {"scene": where}, indent=2, default=str))
+    options = options | {"scene": relative_to(folder, scene.resolve())}
+    write_file(folder / "config.json", json.dumps(options, indent=2, default=str))
 
 
 def save_fit(folder: Path, fit: Any) -> None:

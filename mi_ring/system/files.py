@@ -32,6 +32,13 @@ def require_place(path: Path, field: str = "") -> None:
         tempfile.TemporaryFile(dir=path.parent).close()
 
 
+def relative_to(folder: Path, path: Path) -> str:
+    """A path as files in a folder name it, with forward slashes; absolute where it is on another drive (Windows)."""
+    with contextlib.suppress(ValueError):
+        path = Path(os.path.relpath(path, folder))
+    return path.as_posix()
+
+
 def partial_path(path: Path) -> Path:
     """Where a file grows until it is whole: beside it, under a name that no other process has."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
