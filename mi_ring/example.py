@@ -28,7 +28,8 @@ def main(arguments: Sequence[str]) -> None:
     """The command."""
     folder = command.parse(ExampleConfig, arguments, "mi_ring.example").folder
     with writing(folder):
-        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        here = folder.resolve() == Path.cwd()  # which cannot be replaced
+        if here or (folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))):
             raise InputError(f"{folder}: DIR: is there already; give another name")
         folder.parent.mkdir(parents=True, exist_ok=True)
         growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
