@@ -15,6 +15,8 @@ What it offers beyond that is read when first asked for:
 
 import importlib
 import os
+import re
+import sys
 import warnings
 from typing import TYPE_CHECKING
 
@@ -60,6 +62,12 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+def _command_looked_for() -> str | None:
+    """The command but the doctor, of which Python is about to import the module: `python -m mi_ring.fit …`."""
+    names = sys.orig_argv if sys.argv[:1] == ["-m"] else ()
+    return next(filter(re.compile(r"mi_ring\.(?!doctor)\w+").fullmatch, names), None)
+
+
 def _prepare_mitsuba() -> None:
     """Choose LLVM, register the plugins, select a variant."""
     # Torch's workers would spin after each operation and steal the cores from Dr.Jit. Read when torch is loaded.
@@ -84,6 +92,9 @@ def _prepare_mitsuba() -> None:
             register(None, str(mi.variant()))
         else:
             mi.set_variant("scalar_rgb" if problem else "llvm_ad_rgb")
+    elif command := _command_looked_for():  # which could not even be imported
+        print(f"{command}: {problem}", file=sys.stderr)
+        sys.exit(2)
     if problem:
         warnings.warn(problem, stacklevel=3)
 

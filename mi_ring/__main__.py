@@ -3,8 +3,12 @@
 import ast
 import importlib
 import sys
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+from mi_ring.errors import InputError
+from mi_ring.system import llvm
 from mi_ring.system.command import run
 from mi_ring.version import __version__
 
@@ -31,6 +35,13 @@ def overview() -> str:
     ])  # fmt: skip
 
 
+def run_command(name: str, arguments: Sequence[str]) -> int | None:
+    """Import a command and run it. Raises InputError where Mitsuba, which all but the doctor import, cannot be."""
+    if name != "doctor" and not llvm.has_atomic():
+        raise InputError(str(llvm.missing()))
+    return importlib.import_module(f"mi_ring.{name}").main(arguments)
+
+
 def main() -> None:
     """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -41,7 +52,7 @@ def main() -> None:
         what = f"is {name}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
         print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
         sys.exit(2)
-    run(f"mi-ring {name}", importlib.import_module(f"mi_ring.{name}").main, sys.argv[2:])
+    run(f"mi-ring {name}", partial(run_command, name), sys.argv[2:])
 
 
 if __name__ == "__main__":

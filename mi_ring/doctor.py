@@ -41,13 +41,16 @@ def findings() -> Iterator[Finding]:
         text = importlib.metadata.version(package) if there else f"pip install {package}"
         yield Finding("ok" if there else "MISSING", package, text)
     problem = llvm.missing()
+    if not llvm.has_atomic():
+        yield Finding("MISSING", "libatomic", str(problem))
+        problem = None if llvm.find() else f"mi_ring needs version {llvm.OLDEST} or newer. {llvm.cure('libllvm19')}"
     yield Finding("MISSING" if problem else "ok", "LLVM", problem or "for the variant llvm_ad_rgb: there")
     for package, use in OPTIONAL.items():
         if importlib.util.find_spec(package):
             yield Finding("ok", package, importlib.metadata.version(package))
         else:
             yield Finding("without", package, f"for {use}: pip install {package}, where it is ready-made")
-    if llvm.has_atomic():  # else Dr.Jit cannot be imported
+    if llvm.has_atomic() and importlib.util.find_spec("torch"):  # else Dr.Jit or torch cannot be imported
         yield from computing()
 
 

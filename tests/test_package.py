@@ -7,10 +7,13 @@ import sys
 import sysconfig
 import tarfile
 import venv
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 import mi_ring
 from mi_ring.__main__ import COMMANDS
@@ -107,50 +110,120 @@ def test_without_llvm_a_command_ends_with_one_line(command, tmp_path):
     assert not any("Traceback" in line for line in complaint)
 
 
-@pytest.mark.parametrize("kind", ["whl", "tar.gz"])
-def test_in_a_fresh_environment_without_a_checkout(kind, built, tmp_path):
-    """`pip install mi-ring && mi-ring example pot && mi-ring fit pot/scene.xml`; what it needs is the parent's."""
-    if os.name != "posix":
-        pytest.skip("the folders of environments are those of POSIX systems")
-    venv.create(tmp_path / "env", with_pip=False)
-    (site,) = (tmp_path / "env").glob("lib/python*/site-packages")
-    own = Path(sysconfig.get_paths()["purelib"])
-    (package,) = built.glob(f"*.{kind}")
-    install = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "--target",
-        site,
-        package,
-    ]
-    subprocess.run(install, check=True, capture_output=True, cwd=tmp_path)
-    # What it depends on, but not the checkout, which an editable installation would bring along.
-    (site / "parent.pth").write_text(f"import sys; sys.path.append({str(own)!r})\n")
-    program = "import mi_ring.__main__ as m; m.main()"
+#: Makes Python believe that this is a slim container, where Dr.Jit and Mitsuba are installed and cannot be loaded.
+SLIM = """
+import ctypes, importlib.machinery, sys
 
-    python = tmp_path / "env/bin/python"
-    environment = {name: os.environ[name] for name in ("PATH", llvm.VARIABLE) if name in os.environ}
-    environment["HOME"] = str(tmp_path)
+class Library(ctypes.CDLL):
+    def __init__(self, name, *more, **options):
+        if "libatomic" in str(name):
+            raise OSError(name)
+        super().__init__(name, *more, **options)
+
+class Broken:
+    def find_spec(self, name, path=None, target=None):
+        return importlib.machinery.ModuleSpec(name, self) if name in ("drjit", "mitsuba") else None
+    def create_module(self, spec):
+        return None
+    def exec_module(self, module):
+        raise ImportError("libatomic.so.1: cannot open shared object file")
+
+ctypes.CDLL = Library
+sys.meta_path.insert(0, Broken())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux needs libatomic")
+def test_without_libatomic_there_is_one_line_too(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(SLIM)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
 
     def run(*arguments):
-        call = [python, "-c", program, *arguments]
-        done = subprocess.run(call, capture_output=True, text=True, cwd=tmp_path, env=environment)
+        call = [sys.executable, "-W", "ignore", "-m", *arguments]
+        done = subprocess.run(call, capture_output=True, text=True, env=environment, cwd=tmp_path)
+        return done.returncode, done.stdout, done.stderr.splitlines()
+
+    for call in (["mi_ring.fit"], ["mi_ring", "fit"]):
+        status, _, complaint = run(*call, "scene.xml")
+        assert (status, len(complaint)) == (2, 1) and "Dr.Jit needs libatomic.so.1" in complaint[0]
+    for call in (["mi_ring.doctor"], ["mi_ring", "doctor"]):
+        status, said, complaint = run(*call)
+        assert (status, complaint) == (1, []) and said.endswith("A fit cannot run: libatomic missing\n")
+
+
+@pytest.fixture(scope="module", params=["whl", "tar.gz"])
+def program(request, built, tmp_path_factory):
+    """Runs `mi-ring` as installed in an environment of its own; what it depends on is the parent's. And its folder."""
+    if os.name != "posix":
+        pytest.skip("the folders of environments are those of POSIX systems")
+    folder = tmp_path_factory.mktemp("fresh")
+    venv.create(folder / "env", with_pip=False)
+    (site,) = (folder / "env").glob("lib/python*/site-packages")
+    # Appended this way, not as a folder of packages: that would bring the parent's editable installation along.
+    (site / "parent.pth").write_text(f"import sys; sys.path.append({sysconfig.get_paths()['purelib']!r})\n")
+    python, (package,) = folder / "env/bin/python", built.glob(f"*.{request.param}")
+    pip = [sys.executable, "-m", "pip", "--python", python, "install", "-q"]
+    options = ["--no-deps", "--no-build-isolation", "--ignore-installed"]
+    subprocess.run([*pip, *options, package], check=True, capture_output=True, cwd=folder)
+    environment = {name: os.environ[name] for name in ("PATH", llvm.VARIABLE) if name in os.environ}
+    environment["HOME"] = str(folder)
+
+    def run(*call):
+        done = subprocess.run([folder / "env/bin" / call[0], *call[1:]], capture_output=True, text=True, cwd=folder,
+                              env=environment)  # fmt: skip
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    where = subprocess.run([tmp_path / "env/bin/python", "-c", "import mi_ring; print(mi_ring.__file__)"],
-                           capture_output=True, text=True, cwd=tmp_path)  # fmt: skip
-    assert where.stdout.startswith(str(site)), where.stderr
-    assert "mi-ring fit" in run("--help")
-    assert "A fit can run." in run("doctor")
-    if kind == "whl":  # it takes 20 s
-        assert "Now: mi-ring fit pot/scene.xml" in run("example", "pot")
-        assert "Nothing to mend found." in run("check", "pot/scene.xml")
-        run("fit", "pot/scene.xml", "--iterations", "3", "--levels", "2", "--widths", "48", "--shares", "1",
-            "--subdivisions", "2")  # fmt: skip
-        assert mi_ring.__version__ in (tmp_path / "out/pot/report.html").read_text("utf-8")
+    assert run("python", "-c", "import mi_ring; print(mi_ring.__file__)").startswith(str(site))
+    return run, folder
+
+
+def test_the_program_runs_without_a_checkout(program):
+    run, _ = program
+    assert "mi-ring fit SCENE.xml" in run("mi-ring", "--help")
+    assert run("mi-ring", "doctor").endswith("A fit can run.\n")
+
+
+@pytest.mark.skipif("MI_RING_WHEEL_TEST" not in os.environ, reason="takes minutes; MI_RING_WHEEL_TEST=1 runs it")
+def test_example_and_fit_without_a_checkout(program):
+    """`pip install mi-ring && mi-ring example pot && mi-ring fit pot/scene.xml`."""
+    run, folder = program
+    assert "Now: mi-ring fit pot/scene.xml" in run("mi-ring", "example", "pot")
+    assert "Nothing to mend found." in run("mi-ring", "check", "pot/scene.xml")
+    run("mi-ring", "fit", "pot/scene.xml", "--iterations", "4", "--levels", "2", "--widths", "48", "--shares", "1",
+        "--subdivisions", "2")  # fmt: skip
+    assert mi_ring.__version__ in (folder / "out/pot/report.html").read_text("utf-8")
+
+
+def test_the_example_is_as_its_scene_file_says(tmp_path, monkeypatch):
+    from mi_ring import example
+    from mi_ring.capture import example as making
+
+    monkeypatch.setattr(making, "VIEWS", 3)
+    monkeypatch.setattr(example, "write_example", lambda folder: making.write_example(folder, spp=4))
+    example.main([str(tmp_path / "pot")])
+    assert sorted(path.name for path in (tmp_path / "pot").iterdir()) == ["images", "masks", "scene.xml", "truth"]
+    truth = trimesh.load(tmp_path / "pot/truth/mesh.ply")
+    assert truth.is_watertight and truth.volume > 0
+    capture = mi_ring.load_capture(tmp_path / "pot/scene.xml")
+    assert len(capture) == 3
+    for image, mask, sensor in zip(
+        capture.images, capture.masks, ElementTree.parse(tmp_path / "pot/scene.xml").iter("sensor")
+    ):
+        to_world = np.array(sensor.find("transform/matrix").get("value").split(), float).reshape(4, 4)
+        x, y, z = np.linalg.solve(to_world, np.c_[truth.vertices, np.ones(len(truth.vertices))].T)[:3]
+        seen = making.SIZE / 2 - making.FOCAL * np.stack([x, y]) / z
+        rows, columns = np.nonzero(mask)
+        assert np.allclose(seen.min(1), [columns.min(), rows.min()], atol=1.5)
+        assert np.allclose(seen.max(1), [columns.max() + 1, rows.max() + 1], atol=1.5)
+        assert image[mask == 0].mean() < 2 < 60 < image[mask > 0].mean()
+
+
+def test_the_example_replaces_nothing(tmp_path, monkeypatch):
+    from mi_ring import example
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    for place in (".", "..", "file"):
+        with pytest.raises(mi_ring.InputError, match="DIR: is there already"):
+            example.main([place])

@@ -57,7 +57,7 @@ def missing() -> str | None:
     Call it after `prepare`. Where libatomic is missing Dr.Jit cannot even be imported.
     """
     if not has_atomic():
-        return f"Dr.Jit needs libatomic.so.1, which this machine lacks. {_remedy('libatomic1')}"
+        return f"Dr.Jit needs libatomic.so.1, which this machine lacks. {cure('libatomic1')}"
     import drjit.detail
 
     version = drjit.detail.llvm_version()  # (-1, -1, -1): none
@@ -81,14 +81,15 @@ def missing() -> str | None:
     elif usable and chosen and os.path.realpath(chosen) not in usable:
         remedy = f"Unset {VARIABLE}: mi_ring then takes {usable[0]}."
     else:
-        remedy = _remedy("libllvm19", f", or set {VARIABLE} to the path of a newer libLLVM") + " Then restart Python."
+        remedy = cure("libllvm19", f", or set {VARIABLE} to the path of a newer libLLVM") + " Then restart Python."
     return (
         f"mi_ring needs LLVM {OLDEST} or newer, but Dr.Jit {found}. LLVM 15 and 16 are refused because "
         f"they abort the whole process at the first kernel; Dr.Jit itself refuses older ones. {remedy}"
     )
 
 
-def _remedy(package: str, more: str = "") -> str:
+def cure(package: str, more: str = "") -> str:
+    """How to get a Debian package's library on this machine."""
     advice = {
         "darwin": "Run `brew install llvm`",
         "win32": "Run `winget install LLVM.LLVM`",
