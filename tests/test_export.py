@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-import xatlas
 from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_bsdf import directions, twin
@@ -468,7 +467,7 @@ def test_what_a_fit_and_a_capture_are_made_of_is_not_overwritten(run, small_capt
 
 def test_a_report_goes_without_what_cannot_be_exported(ring, monkeypatch, capsys):
     assert results.viewed(ring) is not None
-    monkeypatch.setattr(xatlas, "Atlas", None)
+    monkeypatch.setattr("xatlas.Atlas", None)
     assert results.viewed(ring) is None
     assert len(capsys.readouterr().out.splitlines()) == 1
 
@@ -482,7 +481,7 @@ def test_a_material_that_gltf_lacks_is_refused_before_the_work(tmp_path, monkeyp
     bsdf = '<bsdf type="conductor"><texture name="specular_reflectance" type="mesh_attribute"><string name="name" ' \
            'value="vertex_specular_reflectance"/></texture></bsdf>'  # fmt: skip
     torch.save(ring_state(wild(bsdf=bsdf, parameters=parameters)), tmp_path / "ring.pt")
-    monkeypatch.setattr(xatlas, "Atlas", None)
+    monkeypatch.setattr("xatlas.Atlas", None)
     assert "conductor" in complaint(tmp_path / "ring.pt", tmp_path / "o.glb")
     export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.ply"), "--subdivisions", "2"])
     assert "vertex_specular_reflectance" in attributes(tmp_path / "o.ply")

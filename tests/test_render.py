@@ -606,3 +606,23 @@ def test_its_status_is_2(tmp_path, run):
     done = subprocess.run([sys.executable, "-m", "mi_ring.render", run, path, tmp_path / "out", "--integrator", "x"],
                           capture_output=True, text=True, timeout=120)  # fmt: skip
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("mi_ring.render: --integr")
+
+
+def test_pictures_by_other_integrators_are_made_in_passes_of_bounded_size(monkeypatch):
+    """Their mean is what many samples at once give, and a pass has no more than so many rays."""
+    scene = mi.load_dict({
+        "type": "scene", "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}}, "sky": {"type": "constant"},
+        "camera": {"type": "photograph", "filename": "none", "fx": 9.0, "fy": 9.0,
+                   "to_world": mi.ScalarTransform4f().look_at([0, 0.5, 5], [0.2, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 7, "height": 5}},
+    })  # fmt: skip
+    integrator, (sensor,) = mi.load_dict({"type": "path"}), scene.sensors()
+    genuine, passes = mi.render, []
+    monkeypatch.setattr(mi, "render", lambda *a, **k: passes.append((k["spp"], k["seed"])) or genuine(*a, **k))
+    whole = views.in_passes(scene, sensor, integrator, 400, seed=3)
+    monkeypatch.setattr(views, "LANES", 7 * 5 * 150)
+    parts = views.in_passes(scene, sensor, integrator, 400, seed=3)
+    assert [spp for spp, _ in passes] == [400, 150, 150, 100] and len({seed for _, seed in passes[1:]}) == 3
+    assert whole.shape == parts.shape == (5, 7, 3)
+    np.testing.assert_allclose(parts, whole, atol=0.05)
+    np.testing.assert_allclose(parts.mean(), whole.mean(), rtol=0.01)
