@@ -466,6 +466,7 @@ def test_what_a_fit_and_a_capture_are_made_of_is_not_overwritten(run, small_capt
 
 
 def test_a_report_goes_without_what_cannot_be_exported(ring, monkeypatch, capsys):
+    pytest.importorskip("xatlas")
     assert results.viewed(ring) is not None
     monkeypatch.setattr("xatlas.Atlas", None)
     assert results.viewed(ring) is None
