@@ -92,7 +92,7 @@ def doubled(x):
 
 
 def convolved(images, sigma):
-    """losses.blur by two convolutions."""
+    """images.blur by two convolutions."""
     radius = int(3 * sigma + 0.5)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
     kernel = kernel / kernel.sum()

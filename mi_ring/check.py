@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
     scene = load_capture(config.scene, masks=config.masks)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")
-    if out.resolve() in {file.resolve() for s in scene.sensors for file in (s.filename, s.mask) if file}:
+    if out.resolve() in {file for sensor in scene.sensors for file in sensor.files}:
         raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(scene)]
     try:

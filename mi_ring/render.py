@@ -84,7 +84,7 @@ def require_writable(views: list[View], capture: Capture, config: RenderConfig) 
         if config.out.is_dir():
             raise InputError(f"{config.out}: is a folder; a film needs the name of a file")
         return
-    own = {file.resolve() for sensor in capture.sensors for file in (sensor.filename, sensor.mask) if file}
+    own = {file for sensor in capture.sensors for file in sensor.files}
     names = set()
     for view in views:
         if Path(view.name).suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):

@@ -1,4 +1,4 @@
-"""`mi_ring.material`: one run's BRDF on another's shape, and edits of it, against networks evaluated by hand."""
+"""`mi_ring.ring.material`: one run's BRDF on another's shape, and edits of it, against networks evaluated by hand."""
 
 import math
 

@@ -73,7 +73,10 @@ class Capture:
         names = [file.name for file in files]
         if len(set(names)) == len(names):
             return names
-        common = os.path.commonpath([file.parent for file in files])
+        try:
+            common = os.path.commonpath([file.parent for file in files])
+        except ValueError:  # on several drives
+            return [file.as_posix() for file in files]
         return [file.relative_to(common).as_posix() for file in files]
 
     def spread(self, most: int = 200) -> list[int]:

@@ -14,6 +14,7 @@ from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.system import llvm
 
 
 def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
@@ -23,6 +24,11 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     are none, "auto" finds them by brightness where the room was dark; "none" does so even if there are.
     """
     path = Path(path)
+    if masks not in ("given", "auto", "none"):
+        raise InputError(f"masks: is {masks}, must be one of given, auto, none")
+    if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
+        why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
+        raise InputError(f"{path}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
     scene, sensors = open_scene(path)
     shapes = [s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh)]
     if len(shapes) != 1:

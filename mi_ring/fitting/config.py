@@ -5,7 +5,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 from mi_ring.errors import InputError
 
@@ -24,8 +24,9 @@ class Config:
     """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
     the scene's own if it names one, else the hull where it has handles, which a sphere can never get."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
-    room; none: as if it had none, which finds them in a dark room, too; --weights.mask 0 does without any."""
+    """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
+    if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,
+    which finds them in a dark room, too; --weights.mask 0 does without any."""
     seed: int = 0
     """Random seed."""
     iterations: int = 360
@@ -84,6 +85,14 @@ class Config:
             if not condition:
                 raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
 
+        for f in dataclasses.fields(Config):  # from Python nobody else has checked them
+            if get_origin(f.type) is Literal:
+                allowed = get_args(f.type)
+                require(getattr(self, f.name) in allowed, f.name, f"one of {', '.join(allowed)}")
+        if isinstance(self.domain, tuple | list) and len(self.domain) == 2 and self.domain[0] == "mesh":
+            object.__setattr__(self, "domain", ("mesh", Path(self.domain[1])))
+        else:
+            require(self.domain in ("auto", "sphere", "hull"), "domain", "auto, sphere, hull or (mesh, FILE)")
         for name in ("iterations", "steps", "batch", "spp"):
             require(getattr(self, name) >= 1, name, "at least 1")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")

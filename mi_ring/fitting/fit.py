@@ -30,6 +30,7 @@ from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device
 
 LOG_EVERY = 5  #: iterations between entries of the log
+RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices"}  #: see `Iteration.entry`
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -41,10 +42,12 @@ class Fit:
         for it in Fit(capture, Config.preset("fast")):
             print(it.number, it.loss)
 
-    `networks`: (Shape-Net, BRDF-Net), others than the paper's, as `mi_ring.nets.shapenet.Flow` and
-    `mi_ring.nets.brdfnet.ReflectanceMap` say. `terms`: of the loss, by name, each a `Term` or a function of an
-    `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration` when it is done. `state`: what
-    `state()` of an interrupted fit gave, to go on from there.
+    `networks`: (Shape-Net, BRDF-Net), others than the paper's, which are trained in place, as
+    `mi_ring.nets.shapenet.Flow` and `mi_ring.nets.brdfnet.ReflectanceMap` say. `terms`: of the loss, by name, each a
+    `Term` or a function of an `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration`
+    when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there.
+
+    A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand, once the capture is read.
 
     Raises InputError where capture, settings, terms and networks do not go together.
     """
@@ -59,6 +62,14 @@ class Fit:
         given = default_terms if terms is None else terms
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
         self.callbacks = list(callbacks)
+        if reserved := self.terms.keys() & RESERVED:
+            raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
+        if not any(self.config.weights.get(name, term.weight) for name, term in self.terms.items()):
+            raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
+        if not capture.images:
+            raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
+        if state and networks:
+            raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
         if self.config.deterministic:
@@ -93,11 +104,15 @@ class Fit:
                              "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
         indirect = config.indirect and math.pi * scale < 1
         if networks:
+            for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
+                if not hasattr(network, needed):
+                    raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
             networks[1].set_parameters(parameters, scale)
         ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
                     networks)  # fmt: skip
         require_networks(ring)
-        if "velocity" in self.terms and config.weights["velocity"] and not hasattr(ring.shape_net, "velocity"):
+        regularised = self.terms.get("velocity") is default_terms["velocity"] and config.weights["velocity"]
+        if regularised and not hasattr(ring.shape_net, "velocity"):
             raise InputError(f"networks: {type(ring.shape_net).__name__}: has no velocity, which the term of that name "
                              "needs; give it one, or the term the weight 0")  # fmt: skip
         return ring
@@ -113,7 +128,12 @@ class Fit:
             yield self.step()
 
     def step(self) -> Iteration:
-        """One iteration: sample the domain, deform, render, weigh, step. Raises InputError if the fit diverges."""
+        """One iteration: sample the domain, deform, render, weigh, step.
+
+        Raises InputError if the fit diverges, RuntimeError if there is no iteration left.
+        """
+        if self.iteration >= self.iterations:
+            raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
         it = self.predict()
         loss = self.weigh(it)
@@ -173,13 +193,21 @@ class Fit:
             value = term.function(it) if weight else None
             if value is None:
                 continue
+            if not isinstance(value, Tensor) or value.ndim:
+                raise InputError(f"terms: {name}: must give a scalar tensor or None, not {type(value).__name__} "
+                                 f"{tuple(getattr(value, 'shape', ()))}")  # fmt: skip
             it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
             it.terms[name] = float(value.detach())
             loss = loss + it.weights[name] * value
         return loss
 
     def descend(self, loss: Tensor, progress: float) -> None:
-        """The backward pass and a step of the optimisers; none if the loss or its gradient is not finite."""
+        """The backward pass and a step of the optimisers; none if the loss or its gradient is not finite.
+
+        Nor if no term had anything to say: masks alone, and photographs of which none has one.
+        """
+        if not loss.requires_grad:
+            return
         for optimizer in self.optimizers:
             optimizer.zero_grad()
         with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
@@ -212,6 +240,8 @@ class Fit:
     def save(self, folder: str | Path) -> None:
         """Write the results into a folder: `ring.pt`, `mesh.ply`, `scene.xml`, `report.html`, as `mi_ring.fit` does.
 
+        Earlier results there are moved aside.
+
         Raises InputError if they cannot be written, ValueError for networks that are not registered.
         """
         results.save_fit(Path(folder), self)
@@ -230,6 +260,7 @@ class Fit:
 
     def restore(self, state: dict) -> None:
         """Take up what a `state` says besides the ring."""
+        state = copy.deepcopy(state)  # which the next iteration would change
         for optimizer, saved in zip(self.optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
@@ -238,7 +269,7 @@ class Fit:
 
 def require_networks(ring: Ring) -> None:
     """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
-    s = torch.zeros(2, 3)
+    s = torch.zeros(2, 3, device=next(ring.parameters()).device)
     with torch.no_grad():
         moved = ring.shape_net(s)
         if moved.shape != s.shape:

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 class Iteration:
     """What an iteration has sampled, predicted and weighed. Tensors are attached while the terms are computed.
 
-    V vertices; n photographs of H × W pixels, those of the capture box-filtered to the stage's width.
+    It holds its pictures: keep numbers, not iterations. V vertices; n photographs of H × W pixels, those of the capture
+    box-filtered to the stage's width.
     """
 
     fit: "Fit"

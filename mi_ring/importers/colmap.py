@@ -54,7 +54,7 @@ class Colmap(Source):
         for image in found:
             path = existing(images / image.name, "photograph")
             pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
-            name = str(Path(image.name).with_suffix("")).replace("/", "_")
+            name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
             own = reconstruction.cameras[image.camera_id]
             lens = Lens(own.model_name, (own.width, own.height), own.params)
             frame = Frame(path, lens, pose, name=name)

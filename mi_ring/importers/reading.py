@@ -135,12 +135,12 @@ def load_npz(path: Path) -> Any:
 
 def load_json(path: Path) -> Any:
     """What a JSON file holds."""
-    return read_as(path, "JSON", lambda file: json.loads(file.read_text()))
+    return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
 
 
 def load_table(path: Path, columns: int) -> np.ndarray:
     """A text file of so many numbers a line."""
-    text = read_as(path, "table of numbers", Path.read_text)
+    text = read_as(path, "table of numbers", lambda file: file.read_text("utf-8"))
     if not text.strip():
         raise InputError(f"{path}: is empty; must have {columns} numbers a line")
     table = read_as(path, "table of numbers", lambda _: np.loadtxt(text.splitlines(), ndmin=2))

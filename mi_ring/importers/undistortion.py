@@ -34,7 +34,7 @@ def undistort(pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: fl
     """Resample a picture (H, W, C), linearly in radiance: `srgb` says that its first three channels are encoded.
 
     What a clipped pixel has a part in, one at or above `saturation` (encoded value, 1 = full scale), is clipped, too:
-    a mean of clipped values and others would claim to be exact.
+    a mean of clipped values and others would claim to be exact. Infinite: nothing is, as of masks.
     """
     places = distorted(lens)
     size = np.array(pixels.shape[:2])[:, None, None]
@@ -49,7 +49,7 @@ def undistort(pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: fl
         encoded = pixels[..., c].astype(np.float32) / full
         value = linear_to_srgb(resampled(srgb_to_linear(encoded))) if srgb and c < 3 else resampled(encoded)
         clipped = encoded >= saturation
-        if clipped.any():
+        if c < 3 and clipped.any():  # not of an alpha channel
             value = np.where(resampled(clipped) > 1e-6, np.maximum(value, encoded[clipped].min()), value)
         channels.append(np.where(valid, value, 0))
     result = np.stack(channels, -1)

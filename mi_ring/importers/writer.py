@@ -120,6 +120,6 @@ def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
         mask = pixels_of(file)
         if frame.fill_mask:
             mask = 255 * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None].astype(np.uint8)
-        return mask if straight else undistort(mask, frame.lens).pixels
+        return mask if straight else undistort(mask, frame.lens, saturation=np.inf).pixels
 
     return Files(image, shared("masks", (file, frame.lens), file, mask), valid)

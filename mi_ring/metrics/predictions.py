@@ -25,7 +25,10 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     for k, name in enumerate(capture.names):
         rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
         predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
-        observed = linear_to_srgb(capture.observe([k])[0][0].numpy())
+        seen = capture.observe([k])
+        observed = linear_to_srgb(seen.rgb[0].numpy())
+        if seen.valid is not None:  # what shows nothing is no error
+            predicted = np.where(seen.valid[0, ..., None].numpy(), predicted, observed)
         squares.append(np.mean((predicted - observed) ** 2))
         views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed)})
     similar = [view["ssim"] for view in views if "ssim" in view]

@@ -51,7 +51,7 @@ def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[
 
 
 def in_parallel(function: Callable, *arguments: Sequence) -> list:
-    """`map` over as many threads as torch is set to use, each computing alone."""
+    """`map` over threads that compute alone, as many as torch was ever set to use."""
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads == 1:
         return list(map(function, *arguments))
@@ -66,8 +66,12 @@ def pool(threads: int) -> ThreadPoolExecutor:
             before = torch.get_num_threads()
             executor = ThreadPoolExecutor(threads, "mi_ring", initializer=compute_alone)
             started = threading.Barrier(threads + 1)
-            for _ in range(threads):
-                executor.submit(started.wait)
+            try:
+                for _ in range(threads):
+                    executor.submit(started.wait)
+            except BaseException:
+                started.abort()  # those that are there already would wait forever
+                raise
             started.wait()
             torch.set_num_threads(before)  # torch takes what the last thread set for the number of all later ones
             _pool = threads, executor

@@ -25,7 +25,7 @@ def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
 
     def register(network: type[nn.Module]) -> type[nn.Module]:
         known = _networks.get(name)
-        if known is not None and (known.__module__, known.__qualname__) != (network.__module__, network.__qualname__):
+        if known is not None and names_of(known) != names_of(network):
             raise ValueError(f"network {name}: is registered already, as {known.__module__}.{known.__qualname__}")
         _networks[name] = network
         return network
@@ -33,10 +33,15 @@ def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
     return register
 
 
+def names_of(network: type) -> tuple[str, str]:
+    """What tells one class from another that was defined anew."""
+    return network.__module__, network.__qualname__
+
+
 def architecture_of(network: nn.Module) -> dict:
     """What makes a network anew: its registered name and its arguments. Raises ValueError if it is not registered."""
     for name, known in _networks.items():
-        if type(network) is known:
+        if names_of(type(network)) == names_of(known):  # a cell of a notebook may have defined it once more
             arguments = getattr(network, "arguments", None)
             return {"name": name, "arguments": arguments() if arguments else {}}
     raise ValueError(f'{type(network).__name__}: has no name to be saved by; put @mi_ring.register_network("…") above '

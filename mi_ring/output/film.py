@@ -41,7 +41,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
     )  # fmt: skip
     try:
         assert ffmpeg.stdin is not None  # but a pipe
-        with contextlib.suppress(BrokenPipeError):  # it ended, and says below why
+        with contextlib.suppress(OSError):  # it ended, and says below why
             for picture in pictures:
                 image = to_bytes(linear_to_srgb(picture))
                 ffmpeg.stdin.write(np.pad(image, ((0, odd_rows), (0, odd_columns), (0, 0)), "edge").tobytes())

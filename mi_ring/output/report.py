@@ -133,12 +133,15 @@ def sides(x: float, y: float) -> str:
 def panel_of(fit: Any, k: int, name: str) -> tuple[PhotographPanel, float]:
     """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
     capture = fit.capture
-    observed, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k])[:4])
+    seen = capture.observe([k])
+    observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
+    valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
     predicted, coverage = (t[0].numpy() for t in bridge.draw(
         fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
     ))  # fmt: skip
-    photo, guess, found = linear_to_srgb(observed), linear_to_srgb(predicted), coverage > 0.5
-    inside = mask > 0.5 if masked else found
+    photo, guess = linear_to_srgb(observed), linear_to_srgb(predicted * valid[..., None])
+    found = (coverage > 0.5) & valid
+    inside = (mask > 0.5) & valid if masked else found
     small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
     parameters = fit.ring.brdf_net.bsdf_parameters
     maps = {key: m[0] for key, m in bridge.maps(fit.surface, small, parameters).items()}
@@ -155,7 +158,7 @@ def panel_of(fit: Any, k: int, name: str) -> tuple[PhotographPanel, float]:
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
-    error = float(np.mean((photo - guess) ** 2))
+    error = float(np.mean((photo - guess)[valid] ** 2))
     row = PhotographPanel(
         name=name,
         psnr=-10 * np.log10(max(error, 1e-10)),

@@ -55,10 +55,12 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 def save_fit(folder: Path, fit: Any) -> None:
     """All results of a `Fit`, finished or not, into a folder of its own."""
+    scene = fitted_scene(fit, folder)
+    ring_state(fit.ring)  # before anything is moved: it may have no name for a network
     with locked(folder):
         prepare_folder(folder, fit.capture.path, fit.config.settings())
         write_log(folder, fit.log)
-        write(folder, fit, fitted_scene(fit, folder))
+        write(folder, fit, scene)
 
 
 def fitted_scene(fit: Any, folder: Path) -> bytes:

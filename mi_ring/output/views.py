@@ -22,6 +22,7 @@ from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.shading import is_flash
 from mi_ring.ring.material import MaterialOptions
 from mi_ring.ring.ring import Ring
 
@@ -227,7 +228,7 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
-    lamps = [e for e in own_emitters(capture.scene) if not e.is_environment()]
+    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring)

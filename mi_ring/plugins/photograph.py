@@ -1,5 +1,7 @@
 """The `photograph` sensor: a calibrated photograph and the light it was taken under (Mitsuba plugin)."""
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -116,6 +118,11 @@ class Photograph(mi.Sensor):
         """(width, height) [px]"""
         width, height = self.film().size()
         return int(width), int(height)
+
+    @property
+    def files(self) -> set[Path]:
+        """All that it names, resolved."""
+        return {file.resolve() for file in (self.filename, self.mask, self.valid) if file}
 
     @property
     def camera(self) -> Camera:

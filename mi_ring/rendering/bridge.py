@@ -94,6 +94,7 @@ def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
     """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape."""
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
+        "face_normals": shape.has_face_normals(),
         "bsdf": {"type": "cooktorrance"},
     })  # fmt: skip
     for parameter in ring.brdf_net.bsdf_parameters:
@@ -162,7 +163,8 @@ def draw(
     """Like `render`, of the surface as last written, without gradients, in the processor's memory.
 
     `indirect`: with interreflection. However many pixels and samples, it takes about a gigabyte
-    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take.
+    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take; `indirect` adds about
+    100 MB for each photograph.
     """
     parts = []
     for pixels in photographs.chunks(spp):

@@ -32,7 +32,12 @@ def shade(scene, si, light, next_2d, shadows):
 
 def lamps(scene) -> list:
     """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own."""
-    return [emitter for emitter in scene.emitters() if not getattr(emitter, "of_photographs", False)]
+    return [emitter for emitter in scene.emitters() if not is_flash(emitter)]
+
+
+def is_flash(emitter) -> bool:
+    """Is it a `flash`, whatever the variant that its class belongs to?"""
+    return getattr(emitter, "of_photographs", False)
 
 
 def sees(scene, si, ds, active=True):

@@ -17,7 +17,7 @@ class Ring(nn.Module):
     `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
     `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
     sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
-    paper's, which have `steps`, `scale` and `parameters`; as `mi_ring.nets.shapenet.Flow` and
+    paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shapenet.Flow` and
     `mi_ring.nets.brdfnet.ReflectanceMap` say.
     """
 

@@ -68,9 +68,10 @@ def locked(folder: Path) -> Iterator[None]:
 
     The lock is beside the folder, which may be moved meanwhile, and goes with the process.
     """
-    file = folder.with_name(f".{folder.name}.lock")
+    place = folder.resolve()
+    file = place.with_name(f".{place.name}.lock")
     with writing(f"{folder}: --out"):
-        folder.parent.mkdir(parents=True, exist_ok=True)
+        place.parent.mkdir(parents=True, exist_ok=True)
         lock = filelock.FileLock(file, timeout=0)
         try:
             lock.acquire()
