@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
+from mi_ring.doctor import OPTIONAL
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -16,6 +17,16 @@ def no_scenes_of_other_tests():
     """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others."""
     yield
     gc.collect()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(call):
+    """A test that needs a package which is not ready-made for every machine is skipped where it is missing."""
+    text = str(call.excinfo.value) if call.excinfo else ""
+    for name in OPTIONAL:
+        if f"needs the package {name}, which is not installed" in text or f"No module named '{name}'" in text:
+            skipped = pytest.skip.Exception(f"needs {name}")
+            call.excinfo = pytest.ExceptionInfo.from_exc_info((type(skipped), skipped, call.excinfo.tb))
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import json
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pycolmap
 import pytest
 import scipy.io
 from PIL import Image
@@ -241,6 +240,7 @@ def test_a_fisheye_without_coefficients_is_no_pinhole(tmp_path):
 @pytest.mark.parametrize("scene", ["pot.xml", "pot/scene.xml"])
 def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
     """The scene is to be where its files get the very names that the source's have."""
+    pytest.importorskip("pycolmap")
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2}
     source = transforms(tmp_path / "pot", top, [{"file_path": "images/a.png"}], lambda k: noise(np.uint8))
     before = (source / "images/a.png").read_bytes()
@@ -252,6 +252,7 @@ def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
 
 @pytest.mark.parametrize("out", ["out", "out/deeper"])
 def test_a_failure_halfway_leaves_nothing(tmp_path, out):
+    pytest.importorskip("pycolmap")
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2, "w": W, "h": H}
     frames = [{"file_path": "a.png"}, {"file_path": "b.png"}]
     source = transforms(tmp_path / "data", top, frames, lambda k: noise(np.uint8, seed=k))
@@ -279,6 +280,7 @@ def test_an_existing_scene_is_not_overwritten(tmp_path):
 def colmap(tmp_path):
     """A model in both forms, written by COLMAP's own library."""
     folder = tmp_path / "colmap"
+    pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(model="PINHOLE", width=W, height=H, params=[70, 76, 28.5, 27.25], camera_id=1)

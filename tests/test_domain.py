@@ -55,6 +55,7 @@ def test_points_wander_over_all_of_the_surface_and_faces_stay_faces(torus):
 
 
 def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
+    pytest.importorskip("gpytoolbox")
     monkeypatch.setattr("mi_ring.geometry.domain.FINEST", 3)
     torus.levels.pop(4, None)
     try:

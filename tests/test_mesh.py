@@ -153,6 +153,7 @@ def torus(tmp_path):
 
 
 def test_domain_file_keeps_its_place_and_its_genus(torus):
+    pytest.importorskip("gpytoolbox")
     path, original = torus
     shape = shapenet(domain=path, center=CENTER, radius=4.0, subdivisions=3)
     mesh = mesh_of(shape)
@@ -164,6 +165,7 @@ def test_domain_file_keeps_its_place_and_its_genus(torus):
 
 
 def test_domain_file_that_is_inside_out_is_turned(torus):
+    pytest.importorskip("gpytoolbox")
     path, original = torus
     original.invert()
     original.export(path)
@@ -171,6 +173,7 @@ def test_domain_file_that_is_inside_out_is_turned(torus):
 
 
 def test_saved_fit_of_another_domain_loads(torus, tmp_path):
+    pytest.importorskip("gpytoolbox")
     _, mesh = torus
     domain = Domain((mesh.vertices - CENTER) / 4.0, mesh.faces)
     ring = ring_file(tmp_path / "ring.pt", domain=domain, radius=4.0)
