@@ -126,7 +126,7 @@ def test_a_capture_can_be_fitted_again_and_is_left_as_it_was(capture):
     before = {key: np.array(value) for key, value in mi.traverse(capture.scene).__iter__() if "vertex" in key}
     bsdf = capture.shape.bsdf()
     first, second = losses(capture), losses(capture)
-    assert first == second
+    assert first == pytest.approx(second, rel=1e-4)  # parallel sums differ in their order
     assert capture.shape.bsdf() is bsdf
     now = {key: np.array(value) for key, value in mi.traverse(capture.scene).__iter__() if "vertex" in key}
     assert before.keys() == now.keys() and all(np.array_equal(before[key], now[key]) for key in before)
