@@ -590,7 +590,7 @@ def test_paper_preset_is_the_papers():
 
 
 def test_regulariser_is_relaxed_and_nothing_else():
-    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04)), progress=0.5)
+    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04), calm=0.5))
     assert terms.default_terms["velocity"].schedule(it) == pytest.approx(0.2)
     assert all(term.schedule is None for name, term in terms.default_terms.items() if name != "velocity")
 

@@ -16,11 +16,13 @@ from mi_ring.capture.decoding import decode
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import NoParallax, nearest_point
 from mi_ring.geometry.hull import Hull, Silhouette, evenly
-from mi_ring.images import box_filter
+from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23
+
+LIT = 0.01  #: brightness of the background, in that of the object, from which a room is not black
 
 
 class Observation(NamedTuple):
@@ -137,6 +139,22 @@ class Capture:
         if not total > 0:
             raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
         return total / count
+
+    @functools.cached_property
+    def lit_room(self) -> bool:
+        """Is more to be seen than the object, by the photographs' masks? Then colours beside it say nothing.
+
+        Where the room was black they say that nothing is there.
+        """
+        shares = []
+        for k in self.spread(50):
+            rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.sensors[k].size) // 128))
+            inside, outside = mask[0] > 0.99, blur(mask, 2.0)[0] < 0.01
+            if valid is not None:
+                outside &= valid[0]
+            if masked and inside.any() and outside.any():
+                shares.append(float(rgb[0][outside].quantile(0.9) / rgb[0][inside].mean().clamp(min=1e-9)))
+        return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
         """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights."""

@@ -25,12 +25,17 @@ from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
+from mi_ring.rendering.crossings import crossing_triangles
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device
 
 LOG_EVERY = 5  #: iterations between entries of the log
-RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices"}  #: see `Iteration.entry`
+#: Names that `Iteration.entry` has.
+RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing"}
+CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
+CROSSING_EVERY = 20  #: iterations between counts of them
+RETREAT, STRONGEST = 2.0, -0.3  #: how fast it strengthens then, for one that it weakens by, and how far, in `calm`
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -87,6 +92,8 @@ class Fit:
         self.autocast = autocast(self.config.precision, self.device)
         self.iteration, self.seconds = 0, 0.0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
+        self.crossing = 0.0  #: share of the triangles that cross others, when they were counted last
+        self.calm = 0.0  #: how far the regulariser has weakened: `Iteration.progress`, but for what it was held back
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
@@ -140,6 +147,7 @@ class Fit:
         self.descend(loss, it.progress)
         it.loss = float(loss.detach())
         it.detach()
+        self.hold(it)
         self.iteration += 1
         self.seconds += time.perf_counter() - started
         if it.number % LOG_EVERY == 0 or it.number == self.iterations:
@@ -226,6 +234,16 @@ class Fit:
             if healthy:
                 optimizer.step()
 
+    def hold(self, it: Iteration) -> None:
+        """Let the regulariser weaken as the fit goes on; hold it and strengthen it while the surface crosses itself.
+
+        Where photographs disagree with the model a weak one lets the surface fold.
+        """
+        if it.number % CROSSING_EVERY == 0:
+            self.crossing = float(crossing_triangles(it.vertices.cpu().numpy(), it.faces).mean())
+        step = 1 / self.iterations
+        self.calm = max(STRONGEST, self.calm - RETREAT * step) if self.crossing > CROSSING else self.calm + step
+
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.
 
@@ -255,6 +273,8 @@ class Fit:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "log": self.log,
+            "crossing": self.crossing,
+            "calm": self.calm,
         }
         return copy.deepcopy(state)  # which the next iteration would change
 
@@ -265,6 +285,7 @@ class Fit:
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
+        self.crossing, self.calm = state["crossing"], state["calm"]
 
 
 def require_networks(ring: Ring) -> None:

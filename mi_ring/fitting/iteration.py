@@ -49,7 +49,7 @@ class Iteration:
         return {
             "iteration": self.number, "seconds": round(fit.seconds, 3), "loss": self.loss, **self.terms,
             "weights": self.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
-            "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices),
+            "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices), "crossing": fit.crossing,
         }  # fmt: skip
 
     def detach(self) -> None:

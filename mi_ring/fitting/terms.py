@@ -15,10 +15,13 @@ from mi_ring.images import blur
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
-def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str) -> Tensor:
+def rgb_loss(
+    predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, telling: Tensor | None = None
+) -> Tensor:
     """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
 
-    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error.
+    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error. Where
+    not `telling` (n, H, W) nothing is.
     `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
     that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the mean of both.
     """
@@ -32,6 +35,8 @@ def rgb_loss(predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: flo
 
     error = perceived(predicted) - perceived(observed)
     error = torch.where(clipped, error.clamp(max=0), error)
+    if telling is not None:
+        error = error * telling[..., None]
     return error.square().mean() if kind == "l2" else error.abs().mean()
 
 
@@ -66,8 +71,15 @@ class Term(NamedTuple):
 
 
 def rgb(it: Iteration) -> Tensor:
-    """Colours: predicted photographs against observed ones."""
-    return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss)
+    """Colours: predicted photographs against observed ones.
+
+    In a room that was not black, what is not wholly object by its mask, or by its prediction, could be anything.
+    """
+    telling = None
+    if it.fit.capture.lit_room:
+        known = it.masked.to(it.mask.device)[:, None, None]
+        telling = torch.where(known, it.mask, it.coverage.detach()) > 0.99
+    return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss, telling)
 
 
 def mask(it: Iteration) -> Tensor | None:
@@ -99,5 +111,5 @@ def velocity(it: Iteration) -> Tensor:
 default_terms: dict[str, Term] = {
     "rgb": Term(rgb),
     "mask": Term(mask),
-    "velocity": Term(velocity, schedule=lambda it: it.fit.config.velocity_decay**it.progress),
+    "velocity": Term(velocity, schedule=lambda it: it.fit.config.velocity_decay**it.fit.calm),
 }

@@ -17,26 +17,46 @@ class Undistorted(NamedTuple):
     valid: np.ndarray  #: (H, W) bool: does the source show it? Elsewhere pixels are 0
 
 
+class Window(NamedTuple):
+    """A part of the undistorted picture, perhaps reduced."""
+
+    left: int
+    top: int
+    width: int  #: of the part as it is written [px]
+    height: int
+    scale: int = 1  #: how many pixels are one of these, across
+
+
+def whole(lens: Lens, scale: int = 1) -> Window:
+    """All of the picture."""
+    return Window(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
+
+
 @lru_cache(maxsize=1)
-def distorted(lens: Lens) -> np.ndarray:
+def distorted(lens: Lens, window: Window) -> np.ndarray:
     """Where in the photograph (2, H, W) [px], row and column, each pixel of the undistorted one is.
 
     As `scipy.ndimage` counts, whose first pixel's centre is 0.
     """
-    (fx, fy), (cx, cy), (width, height) = lens.focal, lens.centre, lens.size
-    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    (fx, fy), (cx, cy) = lens.focal, lens.centre
+    left, top, width, height, scale = window
+    x = (left + (np.arange(width) + 0.5) * scale - cx) / fx
+    y = (top + (np.arange(height) + 0.5) * scale - cy) / fy
     rays = np.stack([*np.broadcast_arrays(x, y[:, None]), np.ones((height, width))], -1).reshape(-1, 3)
     pixels = lens.colmap.img_from_cam(rays).reshape(height, width, 2) - 0.5
     return pixels[..., ::-1].transpose(2, 0, 1)
 
 
-def undistort(pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0) -> Undistorted:
+def undistort(
+    pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
+) -> Undistorted:
     """Resample a picture (H, W, C), linearly in radiance: `srgb` says that its first three channels are encoded.
 
     What a clipped pixel has a part in, one at or above `saturation` (encoded value, 1 = full scale), is clipped, too:
-    a mean of clipped values and others would claim to be exact. Infinite: nothing is, as of masks.
+    a mean of clipped values and others would claim to be exact. Infinite: nothing is, as of masks. `window`: only this
+    part of it, not reduced.
     """
-    places = distorted(lens)
+    places = distorted(lens, window or whole(lens))
     size = np.array(pixels.shape[:2])[:, None, None]
     valid = np.all((places >= -0.5) & (places <= size - 0.5), 0)  # a pixel is as wide as 1
     full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max

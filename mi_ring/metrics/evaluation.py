@@ -8,7 +8,8 @@ import numpy as np
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.predictions import SPP, compare_photographs
-from mi_ring.metrics.surfaces import THRESHOLDS, compare_shapes, compare_surfaces, load_true_mesh, self_intersections
+from mi_ring.metrics.surfaces import THRESHOLDS, compare_shapes, compare_surfaces, load_true_mesh
+from mi_ring.rendering.crossings import crossing_triangles
 from mi_ring.ring.saved import load_fit
 
 LINES = {  # of the table
@@ -34,7 +35,7 @@ def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SP
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:
             numbers[key] = genus(surface)
-    numbers["self_intersections"] = self_intersections(guess_mesh)
+    numbers["self_intersections"] = int(crossing_triangles(guess_mesh.vertices, guess_mesh.faces).sum())
     predicted, photographs = compare_photographs(capture, ring, spp)
     numbers |= {f"{key}_input": value for key, value in predicted.items()}
     lists = {"views": [view | photograph for view, photograph in zip(views, photographs)]}

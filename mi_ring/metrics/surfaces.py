@@ -17,7 +17,6 @@ from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
 THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
-STEP = 1e-6  #: past a triangle that was met, for a mesh of size 1: more than what float32 rounds off
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
@@ -103,32 +102,3 @@ def distances(start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray) 
     mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)
     squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
     return np.sqrt(squared)
-
-
-def self_intersections(mesh: trimesh.Trimesh) -> int:
-    """Number of triangles that cross another, of a mesh without seams.
-
-    Two triangles cross where an edge of one pierces the other: all edges are traced as rays. Those that share a vertex
-    with the edge are not pierced by it; triangles that overlap in one plane do not count.
-    """
-    vertices = np.asarray(mesh.vertices - mesh.bounds.mean(0)) / mesh.extents.max()  # for float32
-    scene, crossing = scene_of(vertices, mesh.faces), np.zeros(len(mesh.faces), bool)
-    # Each edge once, and the triangles that have it.
-    edges, edge_of = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
-    pierces = np.zeros(len(edges), bool)
-    origin, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    length = np.linalg.norm(along, axis=1)
-    along, reached = along / np.maximum(length, 1e-30)[:, None], np.zeros(len(edges))
-    lanes = np.flatnonzero(length > 0)
-    while len(lanes):
-        start = origin[lanes] + along[lanes] * reached[lanes, None]
-        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*along[lanes].T.astype(np.float32)))
-        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))  # type: ignore[assignment]  # wrong stub
-        hit = scene.ray_intersect_preliminary(ray)
-        valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))
-        lanes, t, triangle = lanes[valid], t[valid], triangle[valid]
-        apart = (mesh.faces[triangle][:, :, None] != edges[lanes][:, None]).all((1, 2))
-        crossing[triangle[apart]] = pierces[lanes[apart]] = True
-        reached[lanes] += t + STEP
-        lanes = lanes[reached[lanes] < length[lanes]]
-    return int((crossing | pierces[edge_of].reshape(-1, 3).any(1)).sum())

@@ -1,0 +1,132 @@
+"""Real photographs: cameras, masks and a fit of the flash skull, judged on photographs that the fit has not seen.
+
+    python benchmarks/skull.py PHOTOS OUT [--preset default] [--flash-offset X Y Z]
+
+PHOTOS is the folder of the 66 JPEGs. Every eighth photograph from the fifth is held out of the fit, though not of the
+search for cameras and masks. If `../shared` is there, cameras are compared with COLMAP's of the full-size photographs,
+masks and predictions with the judge's.
+"""
+
+import argparse
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from mi_ring.system.files import write_file
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+REFERENCE = SHARED / "data/real/flash_skull"
+
+
+def run(*arguments: object) -> None:
+    """A command of mi_ring, which must end well; `check` may find something."""
+    command = [sys.executable, "-m", *map(str, arguments)]
+    print("$", *command[2:], flush=True)
+    if subprocess.run(command).returncode not in (0, 1):
+        sys.exit(f"failed: {' '.join(command)}")
+
+
+def split(capture: Path) -> tuple[Path, Path, list[str]]:
+    """The scene without the photographs held out, and these alone, uncropped; and their names."""
+    names = []
+    trees = [ElementTree.parse(capture / "scene.xml") for _ in range(2)]
+    sensors = sorted(sensor.get("id") for sensor in trees[0].getroot().findall("sensor"))
+    held = set(sensors[4::8])
+    for tree, keep in zip(trees, (set(sensors) - held, held)):
+        for sensor in tree.getroot().findall("sensor"):
+            if sensor.get("id") not in keep:
+                tree.getroot().remove(sensor)
+    for sensor in trees[1].getroot().findall("sensor"):
+        names.append(sensor.get("id"))
+        width, height = uncropped(capture)
+        for field, value in (("cx", width / 2), ("cy", height / 2)):
+            sensor.find(f"float[@name='{field}']").set("value", str(value))
+        for field, value in (("width", width), ("height", height)):
+            sensor.find(f"film/integer[@name='{field}']").set("value", str(value))
+        for string in sensor.findall("string"):
+            if string.get("name") != "filename":
+                sensor.remove(string)
+    paths = capture / "fitted.xml", capture / "held_out.xml"
+    for path, tree in zip(paths, trees):
+        write_file(path, ElementTree.tostring(tree.getroot()))
+    return *paths, names
+
+
+def uncropped(capture: Path) -> tuple[int, int]:
+    """Size of the photographs [px], whose principal point is the middle."""
+    import pycolmap
+
+    camera = next(iter(pycolmap.Reconstruction(capture / "work/sparse").cameras.values()))
+    return camera.width, camera.height
+
+
+def cameras_off(capture: Path) -> str:
+    """How far the cameras are from COLMAP's of the full-size photographs, after a similarity."""
+    import pycolmap
+
+    found, true = (
+        {Path(i.name).stem: i.projection_center() for i in pycolmap.Reconstruction(f).images.values() if i.has_pose}
+        for f in (capture / "work/sparse", REFERENCE / "sparse/0")
+    )
+    names = sorted(found.keys() & true.keys())
+    a, b = (np.array([centers[name] for name in names]) for centers in (found, true))
+    u, s, v = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ v))])
+    rotation, scale = u * sign @ v, (s * sign).sum() / ((a - a.mean(0)) ** 2).sum()
+    moved = scale * (a - a.mean(0)) @ rotation.T + b.mean(0)
+    cameras = pycolmap.Reconstruction(REFERENCE / "sparse/0").images.values()
+    ahead = np.array([i.cam_from_world().rotation.matrix()[2] for i in cameras])
+    origins = np.array([i.projection_center() for i in cameras])
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None]
+    center = np.linalg.solve(across.sum(0), (across @ origins[..., None]).sum(0)[:, 0])
+    off = np.linalg.norm(moved - b, axis=1) / np.linalg.norm(b - center, axis=1)
+    return f"cameras: {len(names)} of 66, off by {off.mean():.3%} of the distance, worst {off.max():.3%}"
+
+
+def masks_off(capture: Path) -> str:
+    """Overlap of the masks with the judge's, dilated by 6 px."""
+    import cv2
+
+    overlaps = []
+    for file in sorted((REFERENCE / "judged").glob("*.png")):
+        true = cv2.dilate(np.array(Image.open(file)), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 127
+        shades = np.array(Image.open(capture / f"work/masks/{file.name}").resize(true.shape[::-1], Image.NEAREST))
+        judged = shades != 128  # the rod: neither object nor background
+        mask = shades == 255
+        overlaps.append((mask & true & judged).sum() / ((mask | true) & judged).sum())
+    return f"masks: intersection over union {np.mean(overlaps):.3f}, worst {min(overlaps):.3f}"
+
+
+def main() -> None:
+    """The benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--flash-offset", nargs=3, default=None)
+    parser.add_argument("--fit", nargs=argparse.REMAINDER, default=[], help="more options of the fit")
+    options = parser.parse_args()
+    capture = options.out
+    if not (capture / "scene.xml").exists():
+        offset = ["--flash-offset", *options.flash_offset] if options.flash_offset else []
+        run("mi_ring.photos", options.photos, capture, *offset)
+    if REFERENCE.is_dir():
+        print(cameras_off(capture), masks_off(capture), sep="\n", flush=True)
+    fitted, held_out, _ = split(capture)
+    result = capture / f"fit_{options.preset}"
+    run("mi_ring.fit", fitted, "--preset", options.preset, "--out", result, *options.fit)
+    run("mi_ring.render", result, held_out, result / "held_out")
+    if REFERENCE.is_dir():
+        photographs = capture / "reference"
+        if not photographs.is_dir():
+            run("mi_ring.convert", "colmap", REFERENCE, photographs / "scene.xml")
+        judge = [SHARED / "tools/judge_photos.py", photographs / "images", REFERENCE / "judged", result / "held_out"]
+        print(subprocess.run([sys.executable, *map(str, judge)], capture_output=True, text=True).stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Masks that nobody has to draw: a first guess, then GrabCut in each photograph and votes of all in space, in turn.
+
+Votes keep what most photographs that show a place call object, so that lamps, highlights and the neighbours of one
+photograph drop out, and GrabCut ("GrabCut", Rother et al. 2004) finds the outline that the coarse votes leave open.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from skimage.filters import threshold_otsu
+
+from mi_ring.geometry.camera import nearest_point
+from mi_ring.photogrammetry.motion import Progress
+from mi_ring.photogrammetry.views import View
+
+SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
+AGREE = 0.9  #: share of those that must call it object
+RESOLUTION = 96  #: voxels along an edge of the space that is looked at
+BAND = 0.04  #: of the object's size: GrabCut decides so far inside and outside the votes' outline
+FINE_BAND = 0.015  #: the same, of the larger pictures in the end
+ROUNDS, SETTLED = 6, 0.995  #: at most; or when so much of the masks' union is the same as before
+DARKEST = 1e-3  #: radiance below which nothing is told
+
+
+@dataclass
+class Body:
+    """Voxels that the photographs take for the object."""
+
+    corner: np.ndarray  #: (3,) of the first voxel's centre
+    spacing: float
+    voxels: np.ndarray  #: (n, n, n) bool
+
+    @property
+    def points(self) -> np.ndarray:
+        """(N, 3) centres of the object's voxels."""
+        return self.corner + self.spacing * np.argwhere(self.voxels)
+
+    def coverage(self, view: View) -> np.ndarray:
+        """(H, W) uint8: which pixels show it."""
+        points = self.points
+        pixel, inside = view.places(points)
+        mask = np.zeros(view.shown.shape, np.uint8)
+        mask[pixel[inside, 1], pixel[inside, 0]] = 1
+        distance = np.median(np.linalg.norm(points - view.camera.position, axis=1))
+        return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.spacing * view.camera.focal.mean() / distance + 1))
+
+
+class Space:
+    """The voxels about the point that the cameras look at, and where each view has them."""
+
+    def __init__(self, views: Sequence[View], center: np.ndarray, reach: float) -> None:
+        self.views, self.center = views, center
+        self.axis = np.linspace(-reach, reach, RESOLUTION)
+        grid = np.stack(np.meshgrid(*[self.axis] * 3, indexing="ij"), -1).reshape(-1, 3) + center
+        self.allowed = np.ones(len(grid), bool)  #: may it be the object?
+        self.grid = grid.astype(np.float32)
+
+    @classmethod
+    def seen_by(cls, views: Sequence[View]) -> "Space":
+        """As large as the middle one of the photographs shows."""
+        cameras = [view.camera for view in views]
+        origins = np.stack([camera.position for camera in cameras])
+        center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
+        half = np.median([min(camera.size) / 2 / camera.focal.max() for camera in cameras])
+        return cls(views, center, 1.2 * float(np.median(np.linalg.norm(origins - center, axis=1)) * half))
+
+    def vote(self, masks: Sequence[np.ndarray]) -> Body | None:
+        """The largest piece of what most masks (H, W) call object; None if there is nothing."""
+        yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
+        for view, mask in zip(self.views, masks):
+            pixel, inside = view.places(self.grid)
+            shown += inside
+            yes += inside & (mask[pixel[:, 1], pixel[:, 0]] > 0)
+        object_ = (yes >= AGREE * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
+        pieces, count = ndimage.label(object_.reshape([len(self.axis)] * 3))
+        if not count:
+            return None
+        sizes = np.bincount(pieces.ravel())
+        sizes[0] = 0
+        return Body(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
+
+
+def disk(radius: float) -> np.ndarray:
+    """A structuring element."""
+    r = max(1, round(radius))
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
+
+
+def bright(view: View) -> np.ndarray:
+    """(H, W) uint8: what is nearer to the flash than the rest, by Otsu's threshold of the photograph's log radiance."""
+    log = np.log(np.maximum(view.linear.max(-1), DARKEST))
+    return (log > threshold_otsu(log)).astype(np.uint8)
+
+
+def grabcut(view: View, coverage: np.ndarray, band: float = BAND) -> np.ndarray:
+    """(H, W) uint8: the object's outline near that of its coverage (H, W), within a `band` of its size."""
+    size = np.sqrt(max(1, int(coverage.sum())))
+    seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
+    seed[cv2.dilate(coverage, disk(1.5 * band * size)) > 0] = cv2.GC_PR_BGD
+    seed[coverage > 0] = cv2.GC_PR_FGD
+    seed[cv2.erode(coverage, disk(band * size)) > 0] = cv2.GC_FGD
+    seed[~view.shown] = cv2.GC_BGD
+    if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
+        return coverage
+    cv2.setRNGSeed(0)  # of this thread
+    cv2.grabCut(np.ascontiguousarray(view.rgb[..., ::-1]), seed, None, np.zeros((1, 65)), np.zeros((1, 65)), 5,
+                cv2.GC_INIT_WITH_MASK)  # fmt: skip
+    return ((seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)).astype(np.uint8)
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks; 1 if both are empty."""
+    union = int(((a > 0) | (b > 0)).sum())
+    return int(((a > 0) & (b > 0)).sum()) / union if union else 1.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """Masks of all views, and how sure they are."""
+
+    masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
+    body: Body
+    agreement: list[float]  #: of each, intersection over union with what all say together
+
+    @property
+    def quality(self) -> float:
+        """Of most of them."""
+        return float(np.quantile(self.agreement, 0.2))
+
+
+def settle(space: Space, guesses: Sequence[np.ndarray], progress: Progress) -> Found | None:
+    """Masks from a first guess of each (H, W): votes and GrabCut in turn until nothing changes.
+
+    None if the guesses have nothing in common.
+    """
+    body, masks = space.vote(guesses), list(guesses)
+    if body is None:
+        return None
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for number in range(ROUNDS):
+            before, covered = masks, [body.coverage(view) for view in space.views]
+            found = pool.map(grabcut, space.views, covered)
+            masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
+            body = space.vote(masks)
+            if body is None:
+                return None
+            if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
+                break
+    return Found(masks, body, [overlap(m, body.coverage(view)) for m, view in zip(masks, space.views)])
+
+
+def sharpen(view: View, mask: np.ndarray) -> np.ndarray:
+    """The outline of a mask of another size, found anew in a larger picture: (H, W) uint8."""
+    height, width = view.shown.shape
+    large = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return grabcut(view, (large > 0.5).astype(np.uint8), FINE_BAND)
+
+
+def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """(H, W) bool: what looks like the object, touches it and is not in its mask: a rod, a stand, a lamp behind.
+
+    Whether it hides the object cannot be told.
+    """
+    beside = (guess > 0) & (mask == 0)
+    pieces, _ = ndimage.label(beside)
+    touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
+    return np.isin(pieces, touching[touching > 0])

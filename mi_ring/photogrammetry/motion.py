@@ -1,0 +1,217 @@
+"""Structure from motion: cameras and points from photographs alone, by COLMAP's library."""
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.photogrammetry.folder import Picture, focal_35mm
+from mi_ring.system.optional import need
+
+#: Features are looked for in pictures of so many pixels at most, and so many of them. An evenly lit, smooth object has
+#: few strong ones: weak ones are let in, and what they are worth is told by geometry.
+LONGEST, FEATURES, PEAK = 1600, 8192, 0.003
+ALL_PAIRS = 150  #: photographs up to which each is compared with each
+NEIGHBOURS, KEYS = 12, 40  #: beyond: with so many before and after, and so many of them with each other
+PAIRS_AT_ONCE = 60
+ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
+SURE_CENTRE = 1e-3  #: of the width: a principal point that is not known so well is taken to be the middle
+
+
+@dataclass
+class Motion:
+    """Cameras of photographs by name, and points [units of its own]."""
+
+    cameras: dict[str, tuple[Lens, np.ndarray]]  #: lens and camera-to-world pose (4, 4), OpenCV's axes
+    points: np.ndarray  #: (N, 3)
+    colors: np.ndarray  #: (N, 3) uint8
+    seen_by: list[list[str]]  #: of each point, the photographs that show it
+    error: float  #: mean reprojection error [px of the photographs]
+    failed: dict[str, str]  #: photographs without a camera, and why
+
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Motion":
+        """In another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        cameras = {}
+        for name, (lens, pose) in self.cameras.items():
+            there = np.eye(4)
+            there[:3, :3] = rotation @ pose[:3, :3]
+            there[:3, 3] = scale * rotation @ pose[:3, 3] + shift
+            cameras[name] = lens, there
+        return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
+
+
+Progress = Callable[..., Iterable]  #: (things, what, how many of them): iterates over them and shows how far it is
+
+
+def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: Progress) -> Motion:
+    """Cameras of photographs, one lens for all of a size. What is done is kept in `folder`, to go on from there.
+
+    Raises InputError, which says why, if fewer than half of the photographs belong together.
+    """
+    pycolmap = need("pycolmap", "cameras from photographs")
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    sparse = folder / "sparse"
+    if sparse.is_dir():
+        return motion_of(pycolmap.Reconstruction(sparse), pictures, folder)
+    (folder / "grey").mkdir(parents=True, exist_ok=True)
+    find_features(pictures, folder, progress)
+    match_features(pictures, folder, progress)
+    model = map_incrementally(folder, len(pictures), progress)
+    found = model.num_reg_images() if model else 0
+    if found < max(3, len(pictures) / 2):
+        raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put together; "
+                         f"{why_not(pictures, folder)}")  # fmt: skip
+    adjust(model)
+    growing = folder / "sparse.partial"
+    growing.mkdir(exist_ok=True)
+    model.write(growing)
+    growing.rename(sparse)
+    return motion_of(model, pictures, folder)
+
+
+def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
+    """Reduced pictures in grey, and their features in the database."""
+    pycolmap = need("pycolmap", "features")
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False)
+    options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
+    database, grey = folder / "database.db", folder / "grey"
+    cameras = {image.name: image.camera_id for image in images_of(database)}
+    lenses: dict[tuple[int, int], int] = {}
+    equivalent = focal_35mm(pictures)
+    for picture in progress(pictures, "features"):
+        file = f"{picture.name}.png"
+        if file not in cameras:
+            reduced = Image.fromarray(picture.grey(LONGEST))
+            picture.close()
+            reduced.save(grey / file)
+            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+            if picture.size in lenses:
+                reader.existing_camera_id = lenses[picture.size]
+            elif equivalent:
+                focal = equivalent / 36 * max(reduced.size)
+                reader.camera_params = f"{focal},{reduced.width / 2},{reduced.height / 2},0"
+            pycolmap.extract_features(database, grey, [file], pycolmap.CameraMode.SINGLE, reader, options)
+            cameras = {image.name: image.camera_id for image in images_of(database)}
+        lenses.setdefault(picture.size, cameras[file])
+
+
+def images_of(database: Path) -> list[Any]:
+    """The images of COLMAP's database; none if there is no database."""
+    if not database.is_file():
+        return []
+    pycolmap = need("pycolmap", "features")
+    with pycolmap.Database.open(database) as opened:
+        return opened.read_all_images()
+
+
+def pairs_to_match(count: int) -> list[tuple[int, int]]:
+    """Which of so many photographs are compared, by their place in the order that they were taken in."""
+    pairs = itertools.combinations(range(count), 2)
+    if count <= ALL_PAIRS:
+        return list(pairs)
+    keys = set(range(0, count, -(-count // KEYS)))
+    return [(a, b) for a, b in pairs if b - a <= NEIGHBOURS or (a in keys and b in keys)]
+
+
+def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
+    """Compare photographs with each other; pairs that the database has already are left as they are."""
+    pycolmap = need("pycolmap", "features")
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    pairs = pairs_to_match(len(pictures))
+    batches = [pairs[k : k + PAIRS_AT_ONCE] for k in range(0, len(pairs), PAIRS_AT_ONCE)]
+    chosen = folder / "pairs.txt"
+    for batch in progress(batches, "matching"):
+        chosen.write_text("".join(f"{pictures[a].name}.png {pictures[b].name}.png\n" for a, b in batch), "utf-8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
+        pycolmap.match_image_pairs(folder / "database.db", matching, pairing)
+
+
+def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
+    """The largest `pycolmap.Reconstruction` that the matches give; None if there is none."""
+    pycolmap = need("pycolmap", "structure from motion")
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=True)
+    bar = iter(progress(range(count), "cameras", count))
+    for _ in range(2):  # the pair that it begins with
+        next(bar, None)
+    (folder / "models").mkdir(exist_ok=True)
+    models = pycolmap.incremental_mapping(
+        folder / "database.db", folder / "grey", folder / "models", options, next_image_callback=lambda: next(bar, None)
+    )
+    for _ in bar:
+        pass
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def adjust(model: Any) -> None:
+    """Bundle adjustment with a robust loss, points that do not fit left out; the principal point where it can be told.
+
+    Highlights and the flash's shadows move with the camera: features on them are wrong but match, and by least squares
+    alone they would bend all cameras.
+    """
+    pycolmap = need("pycolmap", "bundle adjustment")
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # which mapping has changed
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
+    observations = pycolmap.ObservationManager(model)
+    for _ in range(3):
+        pycolmap.bundle_adjustment(model, options)
+        if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
+            break
+
+
+def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
+    """In terms of the photographs as they were taken."""
+    by_file = {f"{picture.name}.png": picture for picture in pictures}
+    cameras, names, scales = {}, {}, []
+    for k in model.reg_image_ids():
+        image = model.images[k]
+        picture = by_file.get(image.name)
+        if picture is None:  # of a photograph that is not there any more
+            continue
+        own = model.cameras[image.camera_id]
+        scale = max(picture.size) // max(own.width, own.height)
+        (f, cx, cy, radial), pose = own.params, np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        lens = Lens("SIMPLE_RADIAL", picture.size, (scale * f, scale * cx, scale * cy, radial))
+        cameras[picture.name], names[k] = (lens, pose), picture.name
+        scales.append(scale)
+    points = list(model.points3D.values())
+    failed = {p.name: reason_of(p, folder) for p in pictures if p.name not in cameras}
+    return Motion(
+        dict(sorted(cameras.items())), np.array([p.xyz for p in points]).reshape(-1, 3),
+        np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        [[names[e.image_id] for e in p.track.elements if e.image_id in names] for p in points],
+        float(model.compute_mean_reprojection_error() * np.mean(scales)), failed,
+    )  # fmt: skip
+
+
+def reason_of(picture: Picture, folder: Path) -> str:
+    """Why a photograph has got no camera."""
+    pycolmap = need("pycolmap", "features")
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        image = opened.read_image_with_name(f"{picture.name}.png")
+        features = opened.num_keypoints_for_image(image.image_id)
+    if features < 300:
+        return f"{features} features only: out of focus, blurred or too dark"
+    return "nothing in it fits the others: it shows something else, or there are too few photographs in between"
+
+
+def why_not(pictures: Sequence[Picture], folder: Path) -> str:
+    """Why photographs could not be put together."""
+    pycolmap = need("pycolmap", "features")
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        features = [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
+        pairs, geometries = opened.read_two_view_geometries()
+    sharp = np.median(features)
+    inliers = [len(geometry.inlier_matches) for geometry in geometries]
+    still = [g.config == pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC for g in geometries if len(g.inlier_matches) > 50]
+    if sharp < 300:
+        return (f"they have {sharp:.0f} features in the middle: they are out of focus, too dark, or of something without "
+                "texture; put a sheet of `mi-ring board` under the object")  # fmt: skip
+    return "TODO"

@@ -1,0 +1,97 @@
+"""The capture that is written: photographs cropped to the object, without distortion, with masks and lights."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mi_ring.capture.scenefile import Element, photograph_element
+from mi_ring.geometry.camera import Camera
+from mi_ring.importers.cameras import Lens
+from mi_ring.importers.undistortion import Window, undistort
+from mi_ring.importers.writer import Writer
+from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.views import camera_of
+from mi_ring.rendering.lights import Light
+
+MARGIN = 0.06  #: of the object's size, left free around it
+OBJECT, UNSURE = 255, 128  #: in masks; 0 is the background
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph as the scene has it."""
+
+    picture: Picture
+    lens: Lens
+    pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes [scene units]
+    mask: np.ndarray | None  #: (h, w) uint8 of all of the undistorted photograph, perhaps reduced
+    light: Light
+
+    def extent(self) -> np.ndarray | None:
+        """Of the object [px]: (2, 2), lowest and highest column and row."""
+        if self.mask is None or not (self.mask == OBJECT).any():
+            return None
+        rows, columns = np.nonzero(self.mask == OBJECT)
+        corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+        return corners * (np.array(self.lens.size) / self.mask.shape[::-1])
+
+
+def windows(shots: Sequence[Shot]) -> list[Window]:
+    """What to cut out of each, equally large for all photographs of a size, for one launch renders such ones."""
+    extents = [shot.extent() for shot in shots]
+    result = []
+    for shot, extent in zip(shots, extents):
+        alike = [e for s, e in zip(shots, extents) if s.lens.size == shot.lens.size and e is not None]
+        size = np.array(shot.lens.size)
+        if not alike:
+            result.append(Window(0, 0, *shot.lens.size))
+            continue
+        wanted = np.max([e[1] - e[0] for e in alike], 0)
+        wanted = np.minimum(np.ceil(wanted + 2 * MARGIN * wanted.max()), size).astype(int)
+        middle = size / 2 if extent is None else extent.mean(0)
+        corner = np.clip(np.round(middle - wanted / 2), 0, size - wanted).astype(int)
+        result.append(Window(*map(int, corner), *map(int, wanted)))
+    return result
+
+
+def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
+    """The files of a photograph and its element."""
+    picture = shot.picture
+    pixels = picture.pixels[..., :3]
+    left, top, width, height = window[:4]
+    if shot.lens.is_pinhole:
+        cut, shown = pixels[top : top + height, left : left + width], np.ones((height, width), bool)
+    else:
+        cut, shown = undistort(pixels, shot.lens, picture.encoding == "srgb", window=window)
+    picture.close()
+    filename = writer.relative(writer.image(f"images/{picture.name}", cut))
+    encoding = picture.encoding if cut.dtype == np.uint16 else None
+    mask = valid = None
+    if shot.mask is not None:
+        full = cut_mask(shot.mask, shot.lens.size, window)
+        shown = shown & (full != UNSURE)
+        white = np.where(full == OBJECT, 255, 0).astype(np.uint8)
+        mask = writer.relative(writer.image(f"masks/{picture.name}", white[..., None]))
+    if not shown.all():
+        white = np.where(shown, 255, 0).astype(np.uint8)
+        valid = writer.relative(writer.image(f"valid/{picture.name}", white[..., None]))
+    camera = camera_of(shot.lens, shot.pose)
+    camera = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
+    return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid)
+
+
+def cut_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
+    """The part of a mask of a photograph of this size (width, height), enlarged: (H, W) float, 0 to 255."""
+    left, top, width, height = window[:4]
+    scale = np.array(mask.shape[::-1]) / size
+    x = ((left + np.arange(width) + 0.5) * scale[0] - 0.5).astype(np.float32)
+    y = ((top + np.arange(height) + 0.5) * scale[1] - 0.5).astype(np.float32)
+    grids = np.broadcast_arrays(x, y[:, None])
+    object_, unsure = (
+        cv2.remap((mask == value).astype(np.float32), *map(np.ascontiguousarray, grids), cv2.INTER_LINEAR,
+                  borderMode=cv2.BORDER_REPLICATE)
+        for value in (OBJECT, UNSURE)
+    )  # fmt: skip
+    return np.where(object_ > 0.5, OBJECT, np.where(unsure > 0.5, UNSURE, 0)).astype(np.float32)

@@ -1,0 +1,101 @@
+"""The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mi_ring.errors import InputError
+from mi_ring.images import read_image, write_image
+from mi_ring.importers.colmap import exif_exposure
+from mi_ring.photogrammetry import masks
+from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.motion import Motion, Progress
+from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
+from mi_ring.photogrammetry.views import reduced, reduced_all
+from mi_ring.rendering.lights import Light
+from mi_ring.system.files import write_file
+
+SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
+COARSE, FINE = 600, 1200  #: pixels at most along the pictures that masks are found in, and that outlines are
+DIM = 3.0  #: albedo that lights of unknown intensity are made to imply: more than all, which tells that they are
+
+
+
+
+def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
+    """Raise InputError if what a folder holds was found in other photographs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    known, listed = folder / "photographs.json", {p.path.name: p.path.stat().st_size for p in pictures}
+    if known.exists() and json.loads(known.read_text("utf-8")) != listed:
+        raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, or "
+                         "give another DIR")  # fmt: skip
+    write_file(known, json.dumps(listed))
+
+
+def upright(motion: Motion, center: np.ndarray) -> Motion:
+    """Moved so that the object's `center` (3,) is the origin and the photographs' mean up is z; 1 is how far it is."""
+    poses = np.stack([pose for _, pose in motion.cameras.values()])
+    scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
+    up = -poses[:, :3, 1].mean(0)
+    rotation = rotation_to_z(up / np.linalg.norm(up)) if np.linalg.norm(up) > 0.1 else np.eye(3)
+    return motion.moved(scale, rotation, -scale * rotation @ center)
+
+
+def rotation_to_z(direction: np.ndarray) -> np.ndarray:
+    """The shortest rotation (3, 3) of a unit vector to z."""
+    return Rotation.align_vectors([[0, 0, 1.0]], [direction])[0].as_matrix()
+
+
+def found_masks(
+    pictures: Sequence[Picture], motion: Motion, folder: Path, progress: Progress
+) -> tuple[dict[str, np.ndarray | None], np.ndarray]:
+    """Masks (H, W) uint8 by name, None where they are not sure, and the object's centre (3,).
+
+    Masks that `folder` has already are taken as they are; anybody may have painted in them.
+    """
+    folder.mkdir(exist_ok=True)
+    kept = folder / "object.json"
+    if kept.exists():
+        known = json.loads(kept.read_text("utf-8"))
+        read = {name: read_image(folder / f"{name}.png")[..., 0] if sure else None for name, sure in known["sure"].items()}
+        return read, np.array(known["center"])
+    views = reduced_all(pictures, motion.cameras, COARSE)
+    guesses = [masks.bright(view) for view in views]
+    found = masks.settle(masks.Space.seen_by(views), guesses, progress)
+    if found is None or found.quality < SURE:
+        raise InputError(f"{pictures[0].path.parent}: masks: nothing that the flash lights more than the rest was found; "
+                         "bring masks by --masks, or use a dark room")  # fmt: skip
+    result: dict[str, np.ndarray | None] = {}
+    by_name = {picture.name: picture for picture in pictures}
+    for view, mask, guess, agreed in progress(list(zip(views, found.masks, guesses, found.agreement)), "outlines"):
+        large = reduced(by_name[view.name], *motion.cameras[view.name], FINE)
+        fine = masks.sharpen(large, mask)
+        maybe = masks.unsure(mask, guess).astype(np.uint8)
+        maybe = cv2.resize(maybe, fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        shades = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
+        write_image(shades[..., None], folder / f"{view.name}.png")
+        result[view.name] = shades if agreed >= SURE else None
+    center = found.body.points.mean(0)
+    write_file(kept, json.dumps({"center": center.tolist(), "sure": {n: m is not None for n, m in result.items()}}))
+    return result, center
+
+
+def shots(
+    pictures: Sequence[Picture], motion: Motion, masks_: dict[str, np.ndarray | None], flash: np.ndarray
+) -> list[Shot]:
+    """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units]."""
+    exposures = [exif_exposure(picture.path) for picture in pictures]
+    known = [exposure for exposure in exposures if exposure]
+    result = []
+    for picture, exposure in zip(pictures, exposures):
+        if picture.name not in motion.cameras:
+            continue
+        lens, pose = motion.cameras[picture.name]
+        relative = exposure / np.median(known) if exposure and len(known) == len(pictures) else 1.0
+        light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], np.full(3, relative / DIM))
+        result.append(Shot(picture, lens, pose, masks_.get(picture.name), light))
+    return result

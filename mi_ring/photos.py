@@ -1,0 +1,88 @@
+"""From a folder of photographs to a capture to fit: `python -m mi_ring.photos FOLDER DIR`."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from mi_ring import check
+from mi_ring.capture.scenefile import scene_bytes, scene_element
+from mi_ring.errors import InputError
+from mi_ring.importers.writer import Writer
+from mi_ring.photogrammetry.folder import find_pictures
+from mi_ring.photogrammetry.motion import Motion, structure_from_motion
+from mi_ring.photogrammetry.scene import windows, write_shot
+from mi_ring.photogrammetry.workflow import found_masks, require_same_photographs, shots, upright
+from mi_ring.system import command
+from mi_ring.system.files import writing
+
+
+@dataclass(frozen=True)
+class PhotosConfig:
+    """Find the cameras of photographs, masks of the object and its place, and write a capture to fit.
+
+    The photographs: one object from all around that does not move, lit by a flash beside the lens in a dim room; JPEG,
+    HEIC, PNG, TIFF or raw. With a sheet of `mi-ring board` under the object, the capture is in millimetres and
+    upright. It can be interrupted: the same command goes on.
+    """
+
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
+    """Folder of the photographs."""
+    out: Positional[Annotated[Path, arg(metavar="DIR")]]
+    """Folder to write: scene.xml, with what belongs to it; work/ holds what has been found so far."""
+    flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the flash from the lens, in the camera's axes (x right, y down, z forward) [mm with a sheet; else the unit is
+    the median distance from the cameras to the object]."""
+
+
+def progress(things: Iterable, what: str, total: int | None = None) -> Iterable:
+    """Iterates over things and shows how far it is."""
+    return tqdm(things, what, total, leave=False, disable=None)
+
+
+def cameras_report(motion: Motion) -> str:
+    """What structure from motion has found."""
+    count, failed = len(motion.cameras), motion.failed
+    return "\n".join([
+        f"Cameras: {count} of {count + len(failed)} photographs, by {len(motion.points)} points, reprojection error "
+        f"{motion.error:.2f} px",
+        *(f"  without: {name}: {why}" for name, why in failed.items()),
+    ])  # fmt: skip
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command. Returns its exit status: 1 if `check` finds something to mend."""
+    config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
+    scene = config.out / "scene.xml"
+    if scene.exists():
+        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it to make it anew from "
+                         f"{config.out}/work")  # fmt: skip
+    pictures = find_pictures(config.folder)
+    with writing(config.out):
+        config.out.mkdir(parents=True, exist_ok=True)
+    work = config.out / "work"
+    require_same_photographs(pictures, work)
+    motion = structure_from_motion(pictures, work, progress)
+    print(cameras_report(motion))
+    masks, center = found_masks(pictures, motion, work / "masks", progress)
+    motion = upright(motion, center)
+    taken = shots(pictures, motion, masks, np.array(config.flash_offset))
+    root, writer = scene_element([]), Writer(scene)
+    try:
+        for shot, window in progress(list(zip(taken, windows(taken))), "writing"):
+            root.append(write_shot(writer, shot, window))
+        writer.finish(scene_bytes(root))
+    finally:
+        writer.close()
+    print(f"{scene}: {len(taken)} photographs\n")
+    status = check.main([str(scene), "--out", str(config.out / "check.png")])
+    print(f"Now: mi-ring fit {scene}")
+    return status
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.photos", main)
