@@ -28,6 +28,8 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
     frames = list(source.frames())
+    if source.left_out and not frames:
+        raise InputError(f"{source.src}: SRC: none of {len(source.left_out)} photographs has a pose")
     require_frames(frames, source.src)
     names = [frame.name or frame.image.stem for frame in frames]
     if len({*names, "object"}) <= len(names):
@@ -51,6 +53,10 @@ def main(arguments: Sequence[str]) -> None:
             writer.close()
     except OSError as error:
         raise InputError(f"{source.scene}: cannot be written ({error.strerror or error})") from error
+    if source.left_out:
+        some = sorted(source.left_out)
+        print(f"{len(some)} of {len(some) + len(frames)} photographs left out, without a pose: {', '.join(some[:3])}"
+              f"{', …' if len(some) > 3 else ''}")  # fmt: skip
     masked = sum(frame.mask is not None for frame in frames)
     print(f"{len(frames)} photographs, {masked} with masks, of {len({f.pose.tobytes() for f in frames})} cameras: "
           f"{source.scene}\nNow: python -m mi_ring.fit {source.scene}")  # fmt: skip

@@ -11,6 +11,8 @@ import scipy.linalg
 from mi_ring.errors import InputError
 from mi_ring.system.optional import need
 
+LARGEST = 10**6  #: side of a photograph [px]
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -21,8 +23,9 @@ class Lens:
     params: tuple[float, ...]  #: in COLMAP's order
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.size).all() and min(self.size) >= 1):
-            raise InputError(f"camera: is for photographs of {self.size[0]} x {self.size[1]} pixels; must be 1 or more")
+        if not all(1 <= side <= LARGEST for side in self.size):
+            raise InputError("camera: is for photographs of {:g} x {:g} pixels; must be 1 to {}".format(
+                *np.clip(self.size, -1e9, 1e9), LARGEST))  # fmt: skip
         object.__setattr__(self, "size", tuple(map(int, self.size)))
         object.__setattr__(self, "params", tuple(map(float, self.params)))
 
@@ -65,6 +68,13 @@ def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what:
         raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here; is "
                          "the matrix transposed?")  # fmt: skip
     return Lens("PINHOLE", (size[0], size[1]), (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
+
+
+def brown(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
+    """Of `intrinsics` fx, fy, cx, cy [px] and OpenCV's distortion: radial k1, k2, k3, tangential p1, p2."""
+    if not any((*k, *p)):
+        return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))
+    return Lens("FULL_OPENCV", (size[0], size[1]), (*intrinsics, *k[:2], *p, k[2], 0, 0, 0))
 
 
 def inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """What importers make: frames, each a photograph with its camera and light. One file a format beside this one."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -63,6 +64,15 @@ class Source:
     encoding: Literal["auto", "srgb", "linear"] = "auto"
     """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
     are written anew with 16."""
+
+    def frames(self) -> Iterator[Frame]:
+        """The photographs that have a pose. Raises InputError for what is no data of the format."""
+        raise NotImplementedError
+
+    @cached_property
+    def left_out(self) -> set[str]:
+        """Names of the photographs that have no pose, complete once all `frames` were taken."""
+        return set()
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:

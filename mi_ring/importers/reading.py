@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -47,9 +48,17 @@ def has_alpha(path: Path) -> bool:
     return read_as(path, "image", alpha)
 
 
+def is_file(path: Path) -> bool:
+    """Is there such a file? There is none of a name that cannot be."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def existing(path: Path, field: str) -> Path:
     """A file that must be there."""
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
 
@@ -57,24 +66,29 @@ def existing(path: Path, field: str) -> Path:
 def first_file(candidates: list[Path], field: str) -> Path:
     """The first of these files that there is."""
     for path in candidates:
-        if path.is_file():
+        if is_file(path):
             return path
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def with_suffix(path: Path, field: str) -> Path:
     """An image file whose name may lack its suffix."""
-    if path.is_file():
+    if is_file(path):
         return path
     for suffix in SUFFIXES:
-        if (file := path.with_name(path.name + suffix)).is_file():
+        if is_file(file := path.with_name(path.name + suffix)):
             return file
     raise InputError(f"{field}: no such file: {path}, nor with any of {' '.join(SUFFIXES)}")
 
 
+def pictures(folder: Path) -> list[Path]:
+    """The image files of a folder, by name."""
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and is_file(path))
+
+
 def numbered(folder: Path) -> dict[int, Path]:
     """Images of a folder by the numbers that they are called, or by their order if some are called otherwise."""
-    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    files = pictures(folder)
     if all(path.stem.isdigit() for path in files):
         return {int(path.stem): path for path in files}
     return dict(enumerate(files))
@@ -92,10 +106,11 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Finite numbers of this shape. Raises InputError for anything else."""
     try:
         array = np.array(values, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.shape != shape or (array.ndim == 0 and np.isnan(array)):
-        shown = "missing" if values is None else f"of shape {array.shape}" if array.size > 1 else values
+        shown = "missing" if values is None else f"of shape {array.shape}" if array.size > 1 else str(values)[:60]
+        shown = " ".join(shown.split())
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         raise InputError(f"{what}: is {shown}; must be {wanted}")
     if not np.isfinite(array).all():
@@ -136,6 +151,17 @@ def load_npz(path: Path) -> Any:
 def load_json(path: Path) -> Any:
     """What a JSON file holds."""
     return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
+
+
+def load_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file."""
+    return read_as(path, "XML", lambda file: ElementTree.fromstring(file.read_bytes()))
+
+
+def load_lines(path: Path) -> list[str]:
+    """The lines of a text file that are not empty."""
+    text = read_as(path, "text", lambda file: file.read_bytes().decode("utf-8-sig"))
+    return [line for line in text.splitlines() if line.strip()]
 
 
 def load_table(path: Path, columns: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.cameras import Lens, brown
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
 from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
 
@@ -62,9 +62,7 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
 
     def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)
-        if not isinstance(value, int | float):
-            raise InputError(f"{where}.{names[0]}: is {'missing' if value is None else value}; must be a number")
-        return float(value)
+        return float(matrix(value, (), f"{where}.{names[0]}"))
 
     def angle(name: str) -> float:
         if not 0 < (value := number(name)) < math.pi:
@@ -92,6 +90,4 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
         raise InputError(f"{where}.camera_model: is {model}; must be OPENCV, OPENCV_FISHEYE or PINHOLE")
     if k4:
         raise InputError(f"{where}.k4: is {k4}; OPENCV has no such term of distortion, must be 0")
-    if not any((k1, k2, k3, p1, p2)):
-        return Lens("PINHOLE", size, (fx, fy, cx, cy))
-    return Lens("FULL_OPENCV", size, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0, 0, 0))
+    return brown(size, (fx, fy, cx, cy), (k1, k2, k3), (p1, p2))

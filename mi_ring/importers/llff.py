@@ -1,0 +1,50 @@
+"""poses_bounds.npy of LLFF and NeRF."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.importers.frames import Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import existing, image_size, load_npz, matrix, pictures
+
+
+@dataclass(frozen=True)
+class Llff(Photogrammetry):
+    """LLFF, NeRF: poses_bounds.npy with folders images, images_4, …; the light is beside the camera.
+
+    SRC is the folder. Its first folder of photographs counts; they belong to the poses by the order of their names.
+    """
+
+    def posed(self) -> Iterator[tuple[str, Frame]]:
+        path = existing(self.src / "poses_bounds.npy", "SRC")
+        array = load_npz(path)
+        if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 17:
+            raise InputError(f"{path}: is of shape {getattr(array, 'shape', None)}; must be N x 17 numbers")
+        poses = matrix(array, array.shape, str(path))[:, :15].reshape(-1, 3, 5)
+        folders = [self.src / "images", *sorted(self.src.glob("images_*"), key=by_number), self.src]
+        folder = self.images or next((f for f in folders if pictures(f)), folders[0])
+        images = pictures(folder)
+        if len(images) != len(poses):
+            raise InputError(f"{folder}: has {len(images)} photographs, {path.name} {len(poses)} poses; must be as "
+                             "many, or give --images")  # fmt: skip
+        for k, (image, own) in enumerate(zip(images, poses)):
+            pose = np.eye(4)
+            pose[:3] = own[:, [1, 0, 2, 3]] * [1, 1, -1, 1]  # axes down, right, back
+            height, width, focal = own[:, 4]
+            size = image_size(image)
+            if min(own[:, 4]) <= 0 or abs(size[0] / width * height - size[1]) > 2:  # smaller ones are rounded
+                raise InputError(f"{image}: is {size[0]} x {size[1]} pixels, which is no scale of the {width:g} x "
+                                 f"{height:g} of pose {k} in {path.name}")  # fmt: skip
+            centre = (size[0] / 2, size[1] / 2)
+            focals = (focal * size[0] / width, focal * size[1] / height)
+            yield image.name, Frame(image, Lens("PINHOLE", size, (*focals, *centre)), pose)
+
+
+def by_number(folder: Path) -> tuple[int, str]:
+    """Sorts images_4 before images_16."""
+    return len(folder.name), folder.name

@@ -1,0 +1,34 @@
+"""Middlebury's multi-view stereo data."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import inverse, pinhole
+from mi_ring.importers.frames import Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import image_size, load_lines, matrix
+
+
+@dataclass(frozen=True)
+class Middlebury(Photogrammetry):
+    """Middlebury's multi-view stereo: NAME_par.txt beside its photographs; the light is beside the camera.
+
+    SRC is that file or the folder with it.
+    """
+
+    def posed(self) -> Iterator[tuple[str, Frame]]:
+        files = sorted(self.src.glob("*_par.txt")) if self.src.is_dir() else [self.src]
+        if len(files) != 1:
+            raise InputError(f"{self.src}: SRC: has {len(files)} files *_par.txt; must have one, or give the file")
+        path, (count, *lines) = files[0], load_lines(files[0]) or [""]
+        if count.strip() != str(len(lines)):
+            raise InputError(f"{path}: line 1: is {count[:40]!r}; must be the number of cameras, of which "
+                             f"{len(lines)} follow")  # fmt: skip
+        for line in lines:
+            name, *numbers = line.split()
+            what = f"{path}: {name}"
+            values = matrix(numbers, (21,), f"{what}: K, R, t")
+            K, R, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
+            image = self.photograph(name, what)
+            yield image.name, Frame(image, pinhole(K, image_size(image), 0.5, what), inverse(R, t))  # OpenCV's pixels

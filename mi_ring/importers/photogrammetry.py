@@ -1,0 +1,102 @@
+"""What formats of photogrammetry have in common: ordinary photographs, taken with a light beside the camera."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from mi_ring.errors import InputError
+from mi_ring.importers.frames import Frame, Source
+from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
+
+
+@dataclass(frozen=True)
+class Photogrammetry(Source):
+    """Photographs with poses from photogrammetry; formats say where from in `posed`."""
+
+    images: Path | None = None
+    """Folder of the photographs. Default: the nearest `images` beside or above SRC, else the folder of SRC."""
+    masks: Path | None = None
+    """Folder of masks, each called like its photograph with .png added, as COLMAP's are, or instead of its suffix."""
+    flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the light from the camera, in the camera's axes (x right, y down, z forward) [scene units]."""
+    exif: bool = True
+    """Bring the photographs to one scale by the exposure time, ISO and aperture in their EXIF data."""
+
+    def posed(self) -> Iterator[tuple[str, Frame]]:
+        """Photographs that have a pose, each with its name, by which its mask is called."""
+        raise NotImplementedError
+
+    @property
+    def folder(self) -> Path:
+        """Of the photographs, unless the format knows better."""
+        own = self.src if self.src.is_dir() else self.src.parent
+        beside = (own / "images", own.parent / "images")
+        return self.images or next((folder for folder in beside if folder.is_dir()), own)
+
+    @cached_property
+    def pictures(self) -> list[Path]:
+        """The image files of `folder`."""
+        return pictures(self.folder)
+
+    def photograph(self, name: str, what: str) -> Path:
+        """The photograph of this name in `folder`, whatever its suffix and that of the name are."""
+        name = PureWindowsPath(name).name
+        stem = PureWindowsPath(name).stem
+        for file in sorted(self.pictures, key=lambda file: (file.name != name, file.stem != name)):
+            if file.name == name or file.stem in (name, stem):
+                return file
+        raise InputError(f"{what}: no photograph {name[:99]!r} with any of {' '.join(SUFFIXES)} in {self.folder}; give "
+                         "--images")  # fmt: skip
+
+    def frames(self) -> Iterator[Frame]:
+        frames = []
+        for name, frame in self.posed():
+            if self.masks:
+                names = (f"{name}.png", str(Path(name).with_suffix(".png")))
+                frame.mask = first_file([self.masks / n for n in names], "mask")
+            frames.append(frame)
+        exposures = [exif_exposure(frame.image) for frame in frames] if self.exif else []
+        known = np.array([exposure for exposure in exposures if exposure is not None])
+        scale = np.ones(len(frames))
+        if len(known) and len(known) == len(frames):
+            scale = known / np.median(known)
+        elif len(known):
+            k = exposures.index(None)
+            raise InputError(f"{frames[k].image}: EXIF: no exposure time, ISO or aperture, but other photographs have "
+                             "them; add them, or give --no-exif if all have the same exposure")  # fmt: skip
+        for frame, exposure in zip(frames, scale):
+            if exposure != 1 or any(self.flash_offset):
+                frame.light = frame.at_camera(np.full(3, exposure), self.flash_offset)
+            yield frame
+
+
+def exif_exposure(path: Path) -> float | None:
+    """Exposure time · ISO / aperture², to which radiance as recorded is proportional; None if EXIF lacks one."""
+    if path.suffix.lower() == ".exr":
+        return None
+    exif = read_as(path, "image", read_exif)
+    tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
+    values: list[Any] = [exif.get(tag) for tag in tags]
+    if not all(values):
+        return None
+    try:
+        seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
+        exposure = seconds * iso / f_number**2
+    except (TypeError, ValueError, ZeroDivisionError):
+        exposure = math.nan
+    if not 0 < exposure < math.inf:
+        raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {', '.join(map(str, values))}; must be "
+                         "positive numbers, or give --no-exif if all photographs have the same exposure")  # fmt: skip
+    return exposure
+
+
+def read_exif(path: Path) -> dict[int, Any]:
+    """The part of the EXIF data that is about the exposure."""
+    with Image.open(path) as image:
+        return image.getexif().get_ifd(ExifTags.IFD.Exif)

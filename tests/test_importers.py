@@ -1,0 +1,682 @@
+"""Cameras of photogrammetry: points land where each program's own published formulas put them."""
+
+import copy
+import csv
+import io
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from mi_ring import convert
+from mi_ring.errors import InputError
+from mi_ring.importers.formats import FORMATS, detect
+from mi_ring.importers.frames import require_frames
+from mi_ring.importers.llff import Llff
+from mi_ring.importers.metashape import Metashape
+from mi_ring.importers.middlebury import Middlebury
+from mi_ring.importers.realitycapture import RealityCapture
+from mi_ring.importers.sfmdata import SfmData
+
+SIZE = W, H = 62, 52
+POINTS = np.array([5, -8, 110]) + np.random.default_rng(3).uniform(-4, 4, (40, 3))  # in the world [scene units]
+NAMES = ["a.JPG", "b.png", "c.jpeg"]
+
+
+def cameras():
+    """World-to-camera rotations and translations, OpenCV's axes, of cameras that see the points."""
+    random = np.random.default_rng(7)
+    for R in Rotation.random(3, rng=random).as_matrix():
+        yield R, np.array([1.0, -2.0, 30.0]) + random.uniform(-1, 1, 3) - R @ POINTS.mean(0)
+
+
+def photographs(folder, names=NAMES, size=SIZE):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        Image.new("RGB", size, (9, 8, 7)).save(folder / name)
+    return folder
+
+
+def landed(frame):
+    """Pixels of the points, by our camera's pose and the lens; the first pixel's centre is (0.5, 0.5)."""
+    x = (POINTS - frame.pose[:3, 3]) @ frame.pose[:3, :3]
+    assert x[:, 2].min() > 0
+    pixels = frame.lens.colmap.img_from_cam(x)
+    if frame.lens.is_pinhole:  # also by the camera that the rest of the program sees
+        to_points = POINTS - frame.camera.position
+        along = frame.camera.directions(pixels) * np.linalg.norm(to_points, axis=1, keepdims=True)
+        np.testing.assert_allclose(along, to_points, atol=1e-4)
+    return pixels
+
+
+def taken(source):
+    frames = list(source.frames())
+    require_frames(frames, source.src)
+    return frames
+
+
+# Metashape
+
+CHUNK = Rotation.from_euler("xyz", [20, -70, 130], degrees=True).as_matrix(), np.array([3.0, -1.0, 8.0]), 2.5
+SENSOR = {"f": 70.0, "cx": -2.5, "cy": 1.25}
+BROWN = {"b1": -4.0, "k1": -0.2, "k2": 0.05, "k3": 0.02, "p1": 0.01, "p2": -0.02}
+
+
+def text_of(array):
+    return " ".join(map(repr, np.ravel(array).tolist()))
+
+
+def metashape(folder, terms=SENSOR, kind="frame", where="component", more=""):
+    """Cameras in the frame of a chunk, of which three photographs have one."""
+    turn, shift, scale = CHUNK if where else (np.eye(3), np.zeros(3), 1.0)
+    transform = (f"<transform><rotation locked='0'>{text_of(turn)}</rotation>"
+                 f"<translation>{text_of(shift)}</translation><scale>{scale!r}</scale></transform>")  # fmt: skip
+    own = ""
+    for k, (R, t) in enumerate(cameras()):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn.T @ R.T, turn.T @ (-R.T @ t - shift) / scale
+        own += (f"<camera id='{k}' sensor_id='4' component_id='0' label='{NAMES[k].split('.')[0]}'>"
+                f"<transform>{text_of(pose)}</transform></camera>")  # fmt: skip
+    calibration = "".join(f"<{name}>{value!r}</{name}>" for name, value in terms.items())
+    photographs(folder / "images")
+    (folder / "cameras.xml").write_text(f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1" enabled="true">
+  <sensors next_id="5"><sensor id="4" label="unknown" type="{kind}"><resolution width="{W}" height="{H}"/>
+    <calibration type="{kind}" class="initial"><resolution width="{W}" height="{H}"/><f>99</f></calibration>
+    <calibration type="{kind}" class="adjusted"><resolution width="{W}" height="{H}"/>{calibration}</calibration>
+  </sensor></sensors>
+  {f'<components><component id="0">{transform}</component></components>' if where == "component" else ""}
+  <cameras next_id="9"><group id="0" label="Group 1">{own}</group>
+    <camera id="7" sensor_id="4" label="lost"/>
+  </cameras>{transform if where == "chunk" else ""}{more}
+</chunk></document>""")
+    return folder / "cameras.xml"
+
+
+def agisoft(R, t, kind="frame", f=0.0, cx=0.0, cy=0.0, b1=0.0, b2=0.0, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0):
+    """Appendix D of Metashape's manual."""
+    X, Y, Z = (POINTS @ R.T + t).T
+    x, y = X / Z, Y / Z
+    if kind == "fisheye":
+        r0 = np.sqrt(x**2 + y**2)
+        x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
+    r = np.sqrt(x**2 + y**2)
+    radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6 + k4 * r**8
+    xd = x * radial + (p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y)
+    yd = y * radial + (p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y)
+    return np.stack([W * 0.5 + cx + xd * f + xd * b1 + yd * b2, H * 0.5 + cy + yd * f], 1)
+
+
+@pytest.mark.parametrize(("kind", "terms", "where"), [
+    ("frame", SENSOR, "component"), ("frame", SENSOR | BROWN, "chunk"), ("frame", SENSOR | BROWN, ""),
+    ("fisheye", SENSOR | BROWN | {"k4": 0.03}, "component"),
+])  # fmt: skip
+def test_metashape(tmp_path, kind, terms, where):
+    source = Metashape(metashape(tmp_path, terms, kind, where), Path())
+    frames = taken(source)
+    assert [frame.image.name for frame in frames] == NAMES and source.left_out == {"lost"}
+    for frame, (R, t) in zip(frames, cameras()):
+        np.testing.assert_allclose(landed(frame), agisoft(R, t, kind, **terms), atol=1e-3)
+
+
+def test_metashape_leaves_out_what_is_disabled(tmp_path):
+    path = metashape(tmp_path)
+    path.write_text(path.read_text().replace("label='b'", "label='b' enabled='0'"))
+    source = Metashape(path, Path())
+    assert [frame.image.name for frame in taken(source)] == ["a.JPG", "c.jpeg"] and source.left_out == {"b", "lost"}
+
+
+# RealityCapture
+
+TERMS = {"k1": -0.2, "k2": 0.05, "k3": 0.02, "k4": 0.0, "t1": 0.01, "t2": -0.02}
+FOCAL, CENTRE = 40.0, (-0.04, 0.03)
+
+
+def capturing_reality(R, t, terms, size=SIZE):
+    """RealityCapture XMP Camera Math, with the tangential terms as AliceVision's importer of XMP files has them."""
+    X, Y, Z = (POINTS @ R.T + t).T
+    x, y = X / Z, Y / Z
+    r2 = x**2 + y**2
+    radial = 1 + terms["k1"] * r2 + terms["k2"] * r2**2 + terms["k3"] * r2**3
+    xd = x * radial + terms["t1"] * (r2 + 2 * x**2) + 2 * terms["t2"] * x * y
+    yd = y * radial + terms["t2"] * (r2 + 2 * y**2) + 2 * terms["t1"] * x * y
+    m = np.stack([FOCAL / 36 * xd + CENTRE[0], FOCAL / 36 * yd + CENTRE[1]], 1)
+    return m * max(size) + np.array(size) / 2
+
+
+def sidecars(folder, model="brown3t2", elements=False, **fields):
+    photographs(folder, [*NAMES, "lost.png"])
+    for name, (R, t) in zip(NAMES, cameras()):
+        terms = text_of([*TERMS.values()])
+        given = {"DistortionModel": model, "FocalLength35mm": FOCAL, "Skew": 0, "AspectRatio": 1,
+                 "PrincipalPointU": CENTRE[0], "PrincipalPointV": CENTRE[1], "Rotation": text_of(R),
+                 "Position": text_of(-R.T @ t), "DistortionCoeficients": terms, **fields}  # fmt: skip
+        given = {key: value for key, value in given.items() if value is not None}
+        inside = {"Rotation", "Position", "DistortionCoeficients"} | ({*given} if elements else set())
+        attributes = " ".join(f'xcr:{key}="{value}"' for key, value in given.items() if key not in inside)
+        children = "".join(f"<xcr:{key}>{value}</xcr:{key}>" for key, value in given.items() if key in inside)
+        (folder / name).with_suffix(".xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            f'<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" {attributes}>{children}'
+            "</rdf:Description></rdf:RDF></x:xmpmeta>")  # fmt: skip
+    return folder
+
+
+@pytest.mark.parametrize(("model", "elements", "count"), [
+    ("perspective", False, 0), ("brown3", True, 3), ("brown3t2", False, 6),
+])  # fmt: skip
+def test_realitycapture_sidecars(tmp_path, model, elements, count):
+    source = RealityCapture(sidecars(tmp_path, model, elements), Path())
+    terms = {name: value * (k < count) for k, (name, value) in enumerate(TERMS.items())}
+    frames = taken(source)
+    assert source.left_out == {"lost.png"} and [frame.image.name for frame in frames] == NAMES
+    for frame, (R, t) in zip(frames, cameras()):
+        np.testing.assert_allclose(landed(frame), capturing_reality(R, t, terms), atol=1e-3)
+
+
+def from_angles(yaw, pitch, roll):
+    """World-to-camera: the formula of the makers' article on registration export and camera orientations."""
+    cx, cy, cz = np.cos(np.deg2rad([roll, pitch, yaw]))
+    sx, sy, sz = np.sin(np.deg2rad([roll, pitch, yaw]))
+    return np.array([[cx * cz + sx * sy * sz, -cx * sz + cz * sx * sy, -cy * sx],
+                     [-cy * sz, -cy * cz, -sy],
+                     [cx * sy * sz - cz * sx, cx * cz * sy + sx * sz, -cx * cy]])  # fmt: skip
+
+
+ANGLES = [(170.3, 85.2, -22.7), (-35.0, 60.0, 100.0), (12.0, -40.0, 5.0)]
+
+
+def rig_of_angles():
+    for angles in ANGLES:
+        R = from_angles(*angles)
+        yield R, np.array([1.0, -2.0, 30.0]) - R @ POINTS.mean(0)
+
+
+def csv_table(folder, drop=(), **cells):
+    photographs(folder, [*NAMES, "lost.png"])
+    columns = ["#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", *TERMS]
+    text = io.StringIO()
+    writer = csv.writer(text)
+    kept = [name for name in columns if name.lstrip("#") not in drop]
+    writer.writerow(kept)
+    for name, angles, (R, t) in zip(NAMES, ANGLES, rig_of_angles()):
+        row = dict(zip(columns, [name, *(-R.T @ t), *angles, FOCAL, *CENTRE, *TERMS.values()])) | cells
+        writer.writerow([row[column] for column in kept])
+    (folder / "cameras.csv").write_text(f"#cameras {len(NAMES)}\n{text.getvalue()}", encoding="utf-8-sig")
+    return folder / "cameras.csv"
+
+
+def test_realitycapture_table(tmp_path):
+    source = RealityCapture(csv_table(tmp_path), Path())
+    frames = taken(source)
+    assert source.left_out == {"lost.png"}
+    for frame, (R, t) in zip(frames, rig_of_angles(), strict=True):
+        np.testing.assert_allclose(landed(frame), capturing_reality(R, t, TERMS), atol=1e-3)
+
+
+def test_realitycapture_looks_down_with_the_upper_side_to_y_at_zero_angles(tmp_path):
+    path = csv_table(tmp_path, heading=0, pitch=0, roll=0)
+    (frame, *_) = RealityCapture(path, Path()).frames()
+    np.testing.assert_allclose(frame.camera.forward, [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(frame.camera.up, [0, 1, 0], atol=1e-12)
+
+
+def test_the_longer_side_of_an_upright_photograph_counts(tmp_path):
+    photographs(sidecars(tmp_path), size=(52, 90))
+    for frame, (R, t) in zip(taken(RealityCapture(tmp_path, Path())), cameras()):
+        np.testing.assert_allclose(landed(frame), capturing_reality(R, t, TERMS, (52, 90)), atol=1e-3)
+
+
+# LLFF
+
+
+def llff(folder, edit=lambda array: array, images="images", size=SIZE):
+    rows = []
+    for R, t in cameras():
+        right, down, forward = R
+        hwf = np.array([H, W, 70.0])
+        rows.append([*np.stack([down, right, -forward, -R.T @ t, hwf], 1).ravel(), 1.0, 99.0])
+    photographs(folder / images, size=size)
+    np.save(folder / "poses_bounds.npy", edit(np.array(rows)))
+    return folder
+
+
+@pytest.mark.parametrize(("images", "factor"), [("images", 1), ("images_2", 2)])
+def test_llff(tmp_path, images, factor):
+    size = (W // factor, H // factor)
+    frames = taken(Llff(llff(tmp_path, images=images, size=size), Path()))
+    for frame, (R, t) in zip(frames, cameras(), strict=True):
+        x, y, z = (POINTS @ R.T + t).T
+        pixels = np.stack([70 * x / z + W / 2, 70 * y / z + H / 2], 1) / factor
+        np.testing.assert_allclose(landed(frame), pixels, atol=1e-3)
+
+
+# Middlebury
+
+K = np.array([[70.0, 0, 28.5], [0, 76.0, 27.25], [0, 0, 1]])
+
+
+def middlebury(folder, edit=lambda text: text):
+    lines = [f"{name} {text_of(K)} {text_of(R)} {text_of(t)}" for name, (R, t) in zip(NAMES, cameras())]
+    photographs(folder)
+    (folder / "pot_par.txt").write_text(edit("\n".join(["3", *lines, ""])))
+    return folder
+
+
+def test_middlebury(tmp_path):
+    for frame, (R, t) in zip(taken(Middlebury(middlebury(tmp_path), Path())), cameras(), strict=True):
+        x = (POINTS @ R.T + t) @ K.T
+        np.testing.assert_allclose(landed(frame), x[:, :2] / x[:, 2:] + 0.5, atol=1e-3)  # integers are pixels' centres
+
+
+def test_the_dinosaur_of_middlebury_fills_the_box_of_its_readme(shared):
+    """The hull of the silhouettes, by the recipe of the README, has the bounds that the README states."""
+    folder = shared / "data" / "real" / "middlebury"
+    if not folder.is_dir():
+        pytest.skip("needs Middlebury's dinosaur")
+    low, high = np.array([-0.061897, -0.018874, -0.057845]), np.array([0.010897, 0.068227, 0.015495])
+    steps = 48
+    axes = [np.linspace(a - 0.012, b + 0.012, steps) for a, b in zip(low, high)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    inside, views = np.ones(len(grid), bool), np.zeros(len(grid))
+    good = (folder / "dinoSR_good_silhouette_images.txt").read_text().split()
+    for frame in taken(Middlebury(folder, Path())):
+        if frame.image.name not in good:
+            continue
+        bright = np.asarray(Image.open(frame.image).convert("L")) > 0.12 * 255
+        bright = ndimage.binary_erosion(ndimage.binary_dilation(bright, iterations=10), iterations=7, border_value=1)
+        x = (grid - frame.pose[:3, 3]) @ frame.pose[:3, :3]
+        u, v = np.floor(x[:, :2] / x[:, 2:] * frame.lens.focal + frame.lens.centre).astype(int).T
+        seen = (u >= 0) & (u < frame.size[0]) & (v >= 0) & (v < frame.size[1])
+        inside[seen] &= bright[v[seen], u[seen]]
+        views += seen
+    parts, _ = ndimage.label((inside & (views >= 12)).reshape(3 * [steps]))  # corners that few cameras see remain
+    hull = grid[parts.ravel() == np.bincount(parts[parts > 0]).argmax()]
+    assert (np.abs(hull.max(0) - high) < 0.003).all()
+    assert (np.abs(hull.min(0) - low) < [0.003, 0.009, 0.003]).all()  # nobody looks at the dinosaur's soles
+
+
+# Meshroom and OpenMVG
+
+
+def by_opencv(R, t, focal, centre, terms=(0, 0, 0, 0, 0), fisheye=False):
+    """Pixels whose centres are integers, by the documentation of OpenCV; radial terms, then tangential ones."""
+    X, Y, Z = (POINTS @ R.T + t).T
+    x, y = X / Z, Y / Z
+    r2 = x**2 + y**2
+    if fisheye:
+        theta = np.arctan(np.sqrt(r2))
+        radial = (theta + sum(k * theta ** (2 * n + 3) for n, k in enumerate(terms))) / np.sqrt(r2)
+        return np.stack([x * radial, y * radial], 1) * focal + centre
+    k1, k2, k3, p1, p2 = terms
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    yd = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return np.stack([xd, yd], 1) * focal + centre
+
+
+FX, FY, OFFSET, DISTORTION = 70.0, 76.0, np.array([-2.5, 1.25]), [-0.2, 0.05, 0.02, 0.01, -0.02]
+SENSOR_WIDTH = 23.5
+
+
+def alicevision(folder, version="1.2.14", own=None):
+    """A scene of Meshroom, whose numbers are strings, as its library of JSON writes them."""
+    intrinsic = {
+        "intrinsicId": 5, "width": W, "height": H, "sensorWidth": SENSOR_WIDTH, "type": "pinhole", "locked": 0,
+        "principalPoint": [*OFFSET], "distortionParams": "", "undistortionType": "none",
+    }  # fmt: skip
+    order = tuple(map(int, version.split(".")))
+    if order < (1, 2, 2):
+        intrinsic["pxFocalLength"] = FX if order < (1, 2, 0) else [FX, FY]
+    else:
+        ratio = FX / FY if order < (1, 2, 5) else FY / FX
+        intrinsic |= {"focalLength": FX * SENSOR_WIDTH / W, "pixelRatio": ratio}
+    if order < (1, 2, 1):
+        intrinsic["principalPoint"] = [W / 2 + OFFSET[0], H / 2 + OFFSET[1]]
+    intrinsic |= own or {}
+    top = {"version": version.split("."), "views": [], "intrinsics": [intrinsic], "poses": []}
+    for k, (name, (R, t)) in enumerate(zip(NAMES, cameras())):
+        top["views"].append({"viewId": 10 + k, "poseId": 20 + k, "intrinsicId": 5, "path": f"D:\\photos\\{name}",
+                             "width": W, "height": H, "metadata": ""})  # fmt: skip
+        columns = np.ravel(R, order="F")  # as Eigen's matrices lie in memory
+        transform = {"rotation": columns.tolist(), "center": (-R.T @ t).tolist()}
+        top["poses"].append({"poseId": 20 + k, "pose": {"transform": transform, "locked": 1}})
+    top["views"].append({"viewId": 99, "poseId": 99, "intrinsicId": 5, "path": "/photos/lost.png"})
+    photographs(folder / "images")
+    (folder / "cameras.sfm").write_text(json.dumps(strings(top)))
+    return folder / "cameras.sfm"
+
+
+def strings(value):
+    """As boost::property_tree writes it."""
+    if isinstance(value, dict):
+        return {key: strings(own) for key, own in value.items()}
+    return [strings(own) for own in value] if isinstance(value, list) else str(value)
+
+
+@pytest.mark.parametrize(("version", "own", "terms"), [
+    ("1.0.0", {"type": "brown", "distortionParams": DISTORTION}, DISTORTION),
+    ("1.2.0", {"type": "radial1", "distortionParams": DISTORTION[:1]}, [-0.2, 0, 0, 0, 0]),
+    ("1.2.1", {"type": "radial3", "distortionParams": DISTORTION[:3]}, [-0.2, 0.05, 0.02, 0, 0]),
+    ("1.2.4", {"type": "radial3"}, [0, 0, 0, 0, 0]),
+    ("1.2.5", {"type": "fisheye4", "distortionParams": [0.1, -0.05, 0.02, 0.01]}, [0.1, -0.05, 0.02, 0.01]),
+    ("1.2.14", {"distortionType": "radialk3", "distortionParams": DISTORTION[:3]}, [-0.2, 0.05, 0.02, 0, 0]),
+])  # fmt: skip
+def test_meshroom(tmp_path, version, own, terms):
+    source = SfmData(alicevision(tmp_path, version, own), Path())
+    frames = taken(source)
+    assert source.left_out == {"lost.png"}
+    focal = (FX, FX) if version == "1.0.0" else (FX, FY)
+    for frame, (R, t) in zip(frames, cameras(), strict=True):
+        pixels = by_opencv(R, t, focal, np.array(SIZE) / 2 + OFFSET, terms, own.get("type") == "fisheye4")
+        np.testing.assert_allclose(landed(frame), pixels + 0.5, atol=1e-3)
+
+
+def openmvg(folder, kinds=("pinhole_radial_k3", "pinhole_brown_t2", "fisheye"), nested=True):
+    """A scene of OpenMVG with one camera of each kind, then another of the first kind, whose name is not said again."""
+    fields = {
+        "pinhole": {}, "pinhole_radial_k3": {"disto_k3": DISTORTION[:3]}, "pinhole_brown_t2": {"disto_t2": DISTORTION},
+        "fisheye": {"fisheye": [0.1, -0.05, 0.02, 0.01]},
+    }  # fmt: skip
+    top = {"sfm_data_version": "0.3", "root_path": "/gone", "views": [], "intrinsics": [], "extrinsics": []}
+    seen: list[str] = []
+    for k, (kind, name, (R, t)) in enumerate(zip(kinds, NAMES, cameras())):
+        base = {"width": W, "height": H, "focal_length": FX, "principal_point": (np.array(SIZE) / 2 + OFFSET).tolist()}
+        data = {"value0": base, **fields[kind]} if nested else {**base, **fields[kind]}
+        first = {"polymorphic_name": kind} if kind not in seen else {}
+        seen += [kind] * bool(first)
+        number = seen.index(kind) + 1 + 2**31 * bool(first)
+        top["intrinsics"].append({"key": k, "value": {"polymorphic_id": number, **first,
+                                                      "ptr_wrapper": {"id": 2**31 + 9 + k, "data": data}}})  # fmt: skip
+        view = {"local_path": "", "filename": name, "id_view": k, "id_intrinsic": k, "id_pose": k}
+        top["views"].append({"key": k, "value": {"polymorphic_id": 2**30, "ptr_wrapper": {"id": 2**31, "data": view}}})
+        top["extrinsics"].append({"key": k, "value": {"rotation": R.tolist(), "center": (-R.T @ t).tolist()}})
+    lost = {"filename": "lost.png", "id_intrinsic": 0, "id_pose": 2**32 - 1}
+    top["views"].append({"key": 9, "value": {"polymorphic_id": 2**30, "ptr_wrapper": {"id": 1, "data": lost}}})
+    photographs(folder)
+    (folder / "sfm_data.json").write_text(json.dumps(top))
+    return folder / "sfm_data.json"
+
+
+@pytest.mark.parametrize(("kinds", "nested"), [
+    (("pinhole_radial_k3", "pinhole_brown_t2", "fisheye"), True), (("pinhole", "pinhole_brown_t2", "pinhole"), False),
+])  # fmt: skip
+def test_openmvg(tmp_path, kinds, nested):
+    terms = {"pinhole": [0] * 5, "pinhole_radial_k3": [*DISTORTION[:3], 0, 0], "pinhole_brown_t2": DISTORTION,
+             "fisheye": [0.1, -0.05, 0.02, 0.01]}  # fmt: skip
+    source = SfmData(openmvg(tmp_path, kinds, nested), Path())
+    frames = taken(source)
+    assert source.left_out == {"lost.png"}
+    for frame, kind, (R, t) in zip(frames, kinds, cameras(), strict=True):
+        pixels = by_opencv(R, t, (FX, FX), np.array(SIZE) / 2 + OFFSET, terms[kind], kind == "fisheye")
+        np.testing.assert_allclose(landed(frame), pixels + 0.5, atol=1e-3)
+
+
+# The command
+
+
+def test_the_command_says_what_is_left_out(tmp_path, capsys):
+    path = metashape(tmp_path / "scan", SENSOR | BROWN)
+    convert.main(["metashape", str(path), str(tmp_path / "made.xml")])
+    printed = capsys.readouterr().out
+    assert printed.startswith("1 of 4 photographs left out, without a pose: lost\n3 photographs, ")
+    path.write_text(path.read_text().replace("transform>", "old>"))
+    refused(["metashape", path], "SRC: none of 4 photographs has a pose", tmp_path)
+
+
+def test_masks_flash_and_exposure_are_as_of_colmap(tmp_path):
+    path = metashape(tmp_path)
+    for k, name in enumerate(NAMES):
+        exif = Image.Exif()
+        exif[0x010F] = "maker"
+        exif.get_ifd(0x8769).update({33434: 0.01 * (k + 1), 33437: 2.0, 34855: 100})
+        Image.new("RGB", SIZE).save(tmp_path / "images" / name, exif=exif)
+        Image.new("L", SIZE).save((photographs(tmp_path / "masks", []) / name).with_suffix(".png"))
+    source = Metashape(path, Path(), masks=tmp_path / "masks", flash_offset=(0.3, -0.4, 0.1))
+    for k, (frame, (R, t)) in enumerate(zip(taken(source), cameras(), strict=True)):
+        np.testing.assert_allclose(frame.light.rgb, (k + 1) / 2)
+        np.testing.assert_allclose(frame.light.vector, R.T @ ([0.3, -0.4, 0.1] - t))
+        assert frame.mask.stem == frame.image.stem
+
+
+# What lies in or beside a folder of photographs
+
+WRITERS = {  # in the order in which they count
+    Metashape: metashape, RealityCapture: sidecars, Llff: llff, Middlebury: middlebury, SfmData: alicevision,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_cameras_are_detected(tmp_path, kind):
+    WRITERS[kind](tmp_path / "images" if kind is RealityCapture else tmp_path)
+    folder = tmp_path if kind is Middlebury else tmp_path / "images"
+    source = detect(folder)
+    assert type(source) is kind and len(taken(source)) == 3
+    assert {frame.image.parent for frame in source.frames()} == {folder}
+
+
+def test_of_several_cameras_the_first_kind_counts(tmp_path):
+    photographs(tmp_path)
+    (tmp_path / "broken.xml").write_text("<document><chunk>")
+    (tmp_path / "other.xml").write_text("<scene version='3.0.0'/>")
+    (tmp_path / "a.xmp").write_text("<x:xmpmeta xmlns:x='adobe:ns:meta/'/>")
+    (tmp_path / "list.csv").write_bytes(b"name,x\n\xff")
+    (tmp_path / "cameraInit.sfm").write_text('{"views": []}')
+    assert detect(tmp_path) is None
+    for kind, write in reversed(WRITERS.items()):
+        write(tmp_path)
+        assert type(detect(tmp_path)) is kind
+    (tmp_path / "transforms.json").write_text("{}")
+    assert type(detect(tmp_path)) is FORMATS["transforms"]
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/images.txt").touch()
+    assert type(detect(tmp_path)) is FORMATS["colmap"]
+    assert type(detect(tmp_path / "images")) is FORMATS["colmap"]
+
+
+def test_a_table_is_detected(tmp_path):
+    source = detect(csv_table(tmp_path).parent)
+    assert type(source) is RealityCapture and source.src.name == "cameras.csv"
+
+
+# A user's mistakes
+
+
+def refused(arguments, pattern, folder):
+    out = folder / "out" / "scene.xml"
+    with pytest.raises(InputError, match=pattern) as error:
+        convert.main([*map(str, arguments), str(out)])
+    assert "\n" not in str(error.value) and len(str(error.value)) < 900 and not out.parent.exists()
+
+
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ("<document ", "<documents ", "XML"),
+    ("document", "doc", "is no <document> with a <chunk>"),
+    ('encoding="UTF-8"', 'encoding="KLINGON"', "cannot be read as XML"),
+    ('encoding="UTF-8"', 'encoding="UTF-16"', "cannot be read as XML"),
+    ("label='b'", "label='&#10;gone'", r"no photograph '\\ngone' with any of"),
+    ("label='b'", "", "camera '1': label: is missing"),
+    ("sensor_id='4'", "sensor_id='5'", "sensor_id: is '5'"),
+    ("<f>70.0</f>", "", "sensor '4': f: is missing"),
+    ("<f>70.0</f>", "<f>wide</f>", "f: is .*; must be 1 number"),
+    ("<f>70.0</f>", "<f>nan</f>", "f: has NaN"),
+    ("<f>70.0</f>", "<f>-70</f>", "focal lengths above 0"),
+    ("<f>70.0</f>", "<f>70</f><k4>0.1</k4>", "k4: is 0.1"),
+    ("<f>70.0</f>", "<f>70</f><p3>0.1</p3>", "p3: is 0.1"),
+    ("<f>70.0</f>", "<f>70</f><b2>0.5</b2>", "b2: is 0.5, pixels are sheared"),
+    (f'width="{W}"', f'width="{10**400}"', "must be 1 to 1000000|infinite"),
+    (f'width="{W}"', 'width="61"', "photograph: is 62 x 52 pixels, its camera 61 x 52"),
+    ('type="frame"', 'type="spherical"', "type: is 'spherical'; must be frame or fisheye"),
+    ("calibration", "calibrations", "calibration: is missing"),
+    ("<scale>2.5", "<scale>0", "scale: is 0.0; must be above 0"),
+    ("<rotation locked='0'>", "<rotation locked='0'>1 ", r"rotation: is of shape \(10,\)"),
+])  # fmt: skip
+def test_mistakes_in_metashape(tmp_path, old, new, pattern):
+    path = metashape(tmp_path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    refused(["metashape", path], pattern, tmp_path)
+
+
+def test_a_little_shear_does_not_matter(tmp_path):
+    taken(Metashape(metashape(tmp_path, SENSOR | {"b2": 0.01}), Path()))
+
+
+@pytest.mark.parametrize(("fields", "pattern"), [
+    ({"Rotation": "1 0 0"}, "a.xmp: xcr:Rotation: is of shape"),
+    ({"Position": "1 x 3"}, "xcr:Position: is"),
+    ({"FocalLength35mm": None}, "xcr:FocalLength35mm: is missing"),
+    ({"FocalLength35mm": "inf"}, "xcr:FocalLength35mm: has NaN or inf"),
+    ({"Skew": 0.1}, "xcr:Skew: is 0.1; must be 0"),
+    ({"AspectRatio": 1.1}, "xcr:AspectRatio: is 1.1; must be 1"),
+    ({"DistortionModel": "division"}, "xcr:DistortionModel: is 'division'; must be one of"),
+    ({"DistortionModel": "brown4", "DistortionCoeficients": "0 0 0 1 0 0"}, "k4: is 1.0; must be 0"),
+    ({"DistortionCoeficients": "0 0"}, r"xcr:DistortionCoeficients: is of shape \(2,\); must be 6"),
+    ({"Rotation": None}, "none of 4 photographs has a pose"),
+])  # fmt: skip
+def test_mistakes_in_sidecars(tmp_path, fields, pattern):
+    refused(["realitycapture", sidecars(tmp_path, **fields)], pattern, tmp_path)
+
+
+@pytest.mark.parametrize(("changes", "pattern"), [
+    ({"drop": ["heading"]}, "cameras.csv: column heading: is missing"),
+    ({"heading": "north"}, "camera 1: heading: is north; must be a number"),
+    ({"f": "-3"}, "focal lengths above 0"),
+    ({"k4": 0.1}, "camera 1: k4: is 0.1"),
+    ({"x": "nan"}, "camera 1: x: is nan; must be a number"),
+    ({"#name": "gone.jpg"}, "camera 1: no photograph 'gone.jpg'"),
+    ({"#name": "a\0/b" + 300 * "c"}, "camera 1: no photograph"),
+])  # fmt: skip
+def test_mistakes_in_a_table(tmp_path, changes, pattern):
+    refused(["realitycapture", csv_table(tmp_path, **changes)], pattern, tmp_path)
+
+
+def test_there_is_no_table_and_there_are_no_sidecars(tmp_path):
+    refused(["realitycapture", photographs(tmp_path)], "no XMP sidecars in this folder", tmp_path)
+    refused(["realitycapture", tmp_path / "gone.csv"], "gone.csv: text: no such file", tmp_path)
+    (tmp_path / "empty.csv").touch()
+    refused(["realitycapture", tmp_path / "empty.csv"], "column name: is missing", tmp_path)
+    (tmp_path / "wide.csv").write_text("#name," + 200000 * "x")
+    refused(["realitycapture", tmp_path / "wide.csv"], "cannot be read as a table", tmp_path)
+    (tmp_path / "short.csv").write_text("#name,x,y,alt,heading,pitch,roll,f\na,1\n")
+    refused(["realitycapture", tmp_path / "short.csv"], "camera 1: has 2 columns; must have 8", tmp_path)
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda a: a[:, :15], r"is of shape \(3, 15\); must be N x 17"),
+    (lambda a: a[:2], "has 3 photographs, poses_bounds.npy 2 poses"),
+    (lambda a: a * np.nan, "NaN"),
+    (lambda a: np.array(["a"] * 17)[None], "poses_bounds.npy: "),
+    (lambda a: np.where(a == 70, 0, a), "no scale"),
+    (lambda a: np.where(a == H, 40, a), "is 62 x 52 pixels, which is no scale of the 62 x 40 of pose 0"),
+    (lambda a: np.vstack([a[:1] * 0, a[1:]]), "no scale"),
+])  # fmt: skip
+def test_mistakes_in_poses_bounds(tmp_path, edit, pattern):
+    refused(["llff", llff(tmp_path, edit)], pattern, tmp_path)
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda text: "", "line 1: is ''; must be the number of cameras"),
+    (lambda text: "4" + text[1:], "line 1: is '4'; must be the number of cameras, of which 3 follow"),
+    (lambda text: text.replace("b.png", "d.png"), "no photograph 'd.png'"),
+    (lambda text: text.replace("70.0", "x", 1), "a.JPG: K, R, t: is"),
+    (lambda text: text.replace(" 70.0", "", 1), r"a.JPG: K, R, t: is of shape \(20,\); must be 21"),
+    (lambda text: text.replace("70.0 0.0", "70.0 9.0"), "pixels are sheared"),
+    (lambda text: "\udcff" + text, "cannot be read as text"),
+])  # fmt: skip
+def test_mistakes_in_par_txt(tmp_path, edit, pattern):
+    folder = middlebury(tmp_path, lambda text: text)
+    path = folder / "pot_par.txt"
+    path.write_bytes(edit(path.read_text()).encode("utf-8", "surrogateescape"))
+    refused(["middlebury", folder], pattern, tmp_path)
+
+
+def test_there_are_two_par_txt(tmp_path):
+    (middlebury(tmp_path) / "other_par.txt").touch()
+    refused(["middlebury", tmp_path], "has 2 files", tmp_path)
+
+
+@pytest.mark.parametrize(("own", "pattern"), [
+    ({"type": "3deradial4"}, "the camera is of type '3deradial4'; must be one of"),
+    ({"distortionType": "radialk3pt"}, "the camera is of type 'radialk3pt'"),
+    ({"undistortionType": "3declassicld"}, "undistortionType: is '3declassicld'; must be none"),
+    ({"type": "brown", "distortionParams": [1, 2]}, r"distortionParams: is of shape \(2,\); must be 5 numbers"),
+    ({"focalLength": "long"}, "intrinsic '5': focalLength: is long; must be a number"),
+    ({"pixelRatio": 0}, "pixelRatio: are 23.5 and 0; must be above 0"),
+    ({"width": 10**300, "type": "radial3"}, "must be 1 to 1000000"),
+    ({"principalPoint": None}, "principalPoint: is"),
+    ({"intrinsicId": 6}, r"views\[0\]: intrinsics '5': there are none"),
+])  # fmt: skip
+def test_mistakes_in_meshrooms_intrinsics(tmp_path, own, pattern):
+    refused(["sfmdata", alicevision(tmp_path, own=own)], pattern, tmp_path)
+
+
+def test_photographs_of_a_rig_are_refused(tmp_path):
+    path = alicevision(tmp_path)
+    path.write_text(path.read_text().replace('"poseId": "20",', '"poseId": "20", "isPoseIndependant": "false",', 1))
+    refused(["sfmdata", path], "rigs are not supported", tmp_path)
+
+
+def leaves(value, path=()):
+    """Where the entries of a JSON file are, inner ones too."""
+    for key, own in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield (*path, key)
+        yield from leaves(own, (*path, key))
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("write", [alicevision, lambda folder: alicevision(folder, "1.2.0"), openmvg])
+def test_no_value_in_a_scene_is_a_surprise(tmp_path, write):
+    """Whatever stands where, it is read or refused."""
+    path = write(tmp_path)
+    good = json.loads(path.read_text())
+    surprises = [None, True, -1, 0, 10**400, "x\n" * 99, "a\0/b", "c" * 300, [], [[1], 2], {}, {"a": 1}, 1e300, 0.5]
+    places = [where for where in leaves(good) if not any(isinstance(key, int) and key > 0 for key in where)]
+    outcomes = set()
+    for where in places:
+        for value in [*surprises, json.loads("NaN"), json.loads("Infinity")]:
+            bad = copy.deepcopy(good)
+            inner = bad
+            for key in where[:-1]:
+                inner = inner[key]
+            inner[where[-1]] = value
+            path.write_text(json.dumps(bad))
+            try:
+                taken(SfmData(path, Path()))
+                outcomes.add("read")
+            except InputError as error:
+                outcomes.add("refused")
+                assert "\n" not in str(error), (where, value)
+    assert outcomes == {"read", "refused"} and len(places) > 30
+
+
+@pytest.mark.parametrize("write", [metashape, sidecars])
+def test_no_value_in_xml_is_a_surprise(tmp_path, write):
+    path = write(tmp_path)
+    kind = Metashape if path.is_file() else RealityCapture
+    file = path if path.is_file() else path / "a.xmp"
+    good = ElementTree.fromstring(file.read_text())
+    outcomes = set()
+    for k, element in enumerate(good.iter()):
+        for field in (None, *element.attrib):
+            for value in ("", "x\ny", "-1", "1e999", "1" * 400, "1 2", "0 " * 9, "0 " * 16):
+                bad = copy.deepcopy(good)
+                own = [*bad.iter()][k]
+                if field is None:
+                    own.text = value
+                else:
+                    own.set(field, value)
+                file.write_bytes(ElementTree.tostring(bad))
+                try:
+                    taken(kind(path, Path()))
+                    outcomes.add("read")
+                except InputError as error:
+                    outcomes.add("refused")
+                    assert "\n" not in str(error), (element.tag, field, value)
+    assert outcomes == {"read", "refused"}
