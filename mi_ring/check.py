@@ -1,6 +1,5 @@
 """Say whether a capture is usable, and what is wrong with it: `python -m mi_ring.check SCENE.xml`."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +7,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mi_ring.capture import capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.hull import NoHull
-from mi_ring.metrics.captures import capture_findings, drop_empty, facing, measure, quality_table
-from mi_ring.metrics.mask_agreement import agreements
-from mi_ring.output.capture_sheet import capture_sheet
+from mi_ring.output.inspection import inspect
 from mi_ring.system import command
-from mi_ring.system.files import write_file, writing
 
 
 @dataclass(frozen=True)
@@ -43,37 +37,15 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if there is something to mend."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
-    scene = load_capture(config.scene, masks=config.masks)
+    capture = load_capture(config.scene, masks=config.masks)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")
-    if out.resolve() in {file for sensor in scene.sensors for file in sensor.files}:
+    if out.resolve() in {file for sensor in capture.sensors for file in sensor.files}:
         raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
-    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(scene)]
-    try:
-        center, radius = scene.sphere()
-    except NoHull as error:
-        center, radius = capture.sphere_of_cameras(scene)
-        found += [] if scene.whole else [str(error)]
-    agreement, wrong = agreements(scene)
-    rows = measure(scene, center, radius, agreement)
-    found += wrong or filter(None, [facing(scene, center)])
-    found += capture_findings(scene, rows, center)
-    page = capture_sheet(scene, rows, center, radius)
-    with writing(f"{out}: --out"):
-        out.parent.mkdir(parents=True, exist_ok=True)
-    buffer = io.BytesIO()
-    page.save(buffer, "PNG")
-    write_file(out, buffer.getvalue())
-    print(quality_table(rows))
-    given = sum(mask is not None for mask in scene.masks)
-    if scene.threshold is not None:
-        print("\nMasks: found by brightness, for the room was dark")
-    else:
-        print(f"\nMasks: {given} of {len(rows)} photographs" + ("" if given else "; the start will be a guess"))
-    print("Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius))
-    print("\n".join(f"To mend: {line}" for line in found) or "Nothing to mend found.")
-    print(f"Contact sheet: {out}")
-    return int(bool(found))
+    inspection = inspect(capture)
+    inspection.save(out, "--out")
+    print(f"{inspection.text}\nContact sheet: {out}")
+    return int(bool(inspection.findings))
 
 
 if __name__ == "__main__":

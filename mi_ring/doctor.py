@@ -14,7 +14,8 @@ from mi_ring.version import __version__
 #: Packages that not every machine has ready-made, and what they are needed for.
 OPTIONAL = {
     "gpytoolbox": "starts from the visual hull or a mesh, and mi_ring.evaluate",
-    "pycolmap": "COLMAP's models, and lens distortion in mi_ring.convert",
+    "pycolmap": "mi_ring.photos, COLMAP's models, and lens distortion in mi_ring.convert",
+    "rawpy": "raw photographs in mi_ring.photos",
     "xatlas": "GLB and OBJ, and the object in the report",
 }
 

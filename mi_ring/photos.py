@@ -9,10 +9,11 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from mi_ring import check
+from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.writer import Writer
+from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.folder import find_pictures
 from mi_ring.photogrammetry.motion import Motion, structure_from_motion
 from mi_ring.photogrammetry.scene import windows, write_shot
@@ -79,9 +80,10 @@ def main(arguments: Sequence[str]) -> int:
     finally:
         writer.close()
     print(f"{scene}: {len(taken)} photographs\n")
-    status = check.main([str(scene), "--out", str(config.out / "check.png")])
-    print(f"Now: mi-ring fit {scene}")
-    return status
+    inspection = inspect(load_capture(scene))
+    inspection.save(config.out / "check.png", "DIR")
+    print(f"{inspection.text}\nContact sheet: {config.out / 'check.png'}\nNow: mi-ring fit {scene}")
+    return int(bool(inspection.findings))
 
 
 if __name__ == "__main__":

@@ -92,8 +92,8 @@ class Fit:
         self.autocast = autocast(self.config.precision, self.device)
         self.iteration, self.seconds = 0, 0.0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.crossing = 0.0  #: share of the triangles that cross others, when they were counted last
-        self.calm = 0.0  #: how far the regulariser has weakened: `Iteration.progress`, but for what it was held back
+        self.crossing: float = 0.0  #: share of the triangles that cross others, when they were counted last
+        self.calm: float = 0.0  #: how far the regulariser has weakened: like `progress`, but for holding back
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)

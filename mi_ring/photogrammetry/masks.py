@@ -108,8 +108,9 @@ def grabcut(view: View, coverage: np.ndarray, band: float = BAND) -> np.ndarray:
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
         return coverage
     cv2.setRNGSeed(0)  # of this thread
-    cv2.grabCut(np.ascontiguousarray(view.rgb[..., ::-1]), seed, None, np.zeros((1, 65)), np.zeros((1, 65)), 5,
-                cv2.GC_INIT_WITH_MASK)  # fmt: skip
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    bgr = np.ascontiguousarray(view.rgb[..., ::-1])
+    cv2.grabCut(bgr, seed, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
     return ((seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)).astype(np.uint8)
 
 
@@ -162,11 +163,11 @@ def sharpen(view: View, mask: np.ndarray) -> np.ndarray:
 
 
 def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """(H, W) bool: what looks like the object, touches it and is not in its mask: a rod, a stand, a lamp behind.
+    """(H, W) uint8: what looks like the object, touches it and is not in its mask: a rod, a stand, a lamp behind.
 
     Whether it hides the object cannot be told.
     """
     beside = (guess > 0) & (mask == 0)
     pieces, _ = ndimage.label(beside)
     touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
-    return np.isin(pieces, touching[touching > 0])
+    return np.isin(pieces, touching[touching > 0]).astype(np.uint8)

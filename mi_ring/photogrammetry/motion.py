@@ -21,7 +21,7 @@ ALL_PAIRS = 150  #: photographs up to which each is compared with each
 NEIGHBOURS, KEYS = 12, 40  #: beyond: with so many before and after, and so many of them with each other
 PAIRS_AT_ONCE = 60
 ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
-SURE_CENTRE = 1e-3  #: of the width: a principal point that is not known so well is taken to be the middle
+TEXTURED, MATCHED = 300, 50  #: features of a photograph, and matches of two, from which they are worth something
 
 
 @dataclass
@@ -65,8 +65,8 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
     model = map_incrementally(folder, len(pictures), progress)
     found = model.num_reg_images() if model else 0
     if found < max(3, len(pictures) / 2):
-        raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put together; "
-                         f"{why_not(pictures, folder)}")  # fmt: skip
+        raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put "
+                         f"together: {why_not(folder)}")  # fmt: skip
     adjust(model)
     growing = folder / "sparse.partial"
     growing.mkdir(exist_ok=True)
@@ -149,7 +149,7 @@ def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
 
 
 def adjust(model: Any) -> None:
-    """Bundle adjustment with a robust loss, points that do not fit left out; the principal point where it can be told.
+    """Bundle adjustment with a robust loss, and points that do not fit left out.
 
     Highlights and the flash's shadows move with the camera: features on them are wrong but match, and by least squares
     alone they would bend all cameras.
@@ -197,21 +197,21 @@ def reason_of(picture: Picture, folder: Path) -> str:
     with pycolmap.Database.open(folder / "database.db") as opened:
         image = opened.read_image_with_name(f"{picture.name}.png")
         features = opened.num_keypoints_for_image(image.image_id)
-    if features < 300:
+    if features < TEXTURED:
         return f"{features} features only: out of focus, blurred or too dark"
     return "nothing in it fits the others: it shows something else, or there are too few photographs in between"
 
 
-def why_not(pictures: Sequence[Picture], folder: Path) -> str:
-    """Why photographs could not be put together."""
+def why_not(folder: Path) -> str:
+    """Why photographs could not be put together, and what to do."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(folder / "database.db") as opened:
-        features = [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
-        pairs, geometries = opened.read_two_view_geometries()
-    sharp = np.median(features)
-    inliers = [len(geometry.inlier_matches) for geometry in geometries]
-    still = [g.config == pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC for g in geometries if len(g.inlier_matches) > 50]
-    if sharp < 300:
-        return (f"they have {sharp:.0f} features in the middle: they are out of focus, too dark, or of something without "
-                "texture; put a sheet of `mi-ring board` under the object")  # fmt: skip
-    return "TODO"
+        features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
+        matched = sum(len(geometry.inlier_matches) >= MATCHED for geometry in opened.read_two_view_geometries()[1])
+        count = opened.num_images()
+    if features < TEXTURED:
+        return (f"they have {features:.0f} features each; they are out of focus or too dark, or the object has no "
+                "texture: lay a sheet of `mi-ring board` under it")  # fmt: skip
+    if matched >= 2 * count:
+        return "they fit each other but show everything from one place; walk around the object, 10 degrees at a time"
+    return "they show different things, or too little of the same; photograph one object, 10 degrees at a time"

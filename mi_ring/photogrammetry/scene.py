@@ -88,10 +88,9 @@ def cut_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndar
     scale = np.array(mask.shape[::-1]) / size
     x = ((left + np.arange(width) + 0.5) * scale[0] - 0.5).astype(np.float32)
     y = ((top + np.arange(height) + 0.5) * scale[1] - 0.5).astype(np.float32)
-    grids = np.broadcast_arrays(x, y[:, None])
+    columns, rows = (np.ascontiguousarray(grid) for grid in np.broadcast_arrays(x, y[:, None]))
     object_, unsure = (
-        cv2.remap((mask == value).astype(np.float32), *map(np.ascontiguousarray, grids), cv2.INTER_LINEAR,
-                  borderMode=cv2.BORDER_REPLICATE)
+        cv2.remap((mask == value).astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         for value in (OBJECT, UNSURE)
-    )  # fmt: skip
+    )
     return np.where(object_ > 0.5, OBJECT, np.where(unsure > 0.5, UNSURE, 0)).astype(np.float32)

@@ -41,7 +41,8 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, reac
     near = points[np.linalg.norm(points - center, axis=1) < 2 * reach]
     if len(near) < 50:
         return None
-    random, best = np.random.default_rng(0), (0, None)
+    random, best = np.random.default_rng(0), 0
+    found: Plane | None = None
     thickness = FLAT * float(np.median(np.linalg.norm(cameras - center, axis=1)))
     for _ in range(1000):
         a, b, c = near[random.choice(len(near), 3, replace=False)]
@@ -55,18 +56,17 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, reac
         height = plane.height(near)
         count = int((np.abs(height) < thickness).sum())
         outside = (plane.height(cameras) > 0).mean() > 0.98 and (height > -3 * thickness).mean() > 0.9
-        if outside and count > best[0]:
-            best = count, plane
-    count, plane = best
-    if plane is None or count < FEWEST * len(near):
+        if outside and count > best:
+            best, found = count, plane
+    if found is None or best < FEWEST * len(near):
         return None
     for _ in range(3):
-        members = near[np.abs(plane.height(near)) < thickness]
+        members = near[np.abs(found.height(near)) < thickness]
         middle = members.mean(0)
         normal = np.linalg.svd(members - middle)[2][2]
-        normal *= np.sign(normal @ plane.normal)
-        plane = Plane(normal, float(normal @ middle))
-    return plane
+        normal *= np.sign(normal @ found.normal)
+        found = Plane(normal, float(normal @ middle))
+    return found
 
 
 def not_table(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:

@@ -1,6 +1,6 @@
 """Reduced photographs with their cameras, free of distortion: what the object is looked for in."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -59,7 +59,7 @@ def reduced(picture: Picture, lens: Lens, pose: np.ndarray, longest: int) -> Vie
 
 
 def reduced_all(
-    pictures: list[Picture], cameras: Mapping[str, tuple[Lens, np.ndarray]], longest: int
+    pictures: Sequence[Picture], cameras: Mapping[str, tuple[Lens, np.ndarray]], longest: int
 ) -> list[View]:
     """Those that have a camera."""
     views = []

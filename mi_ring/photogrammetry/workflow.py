@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.images import read_image, write_image
-from mi_ring.importers.colmap import exif_exposure
+from mi_ring.importers.photogrammetry import exif_exposure
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.motion import Motion, Progress
@@ -52,8 +52,8 @@ def rotation_to_z(direction: np.ndarray) -> np.ndarray:
 
 def found_masks(
     pictures: Sequence[Picture], motion: Motion, folder: Path, progress: Progress
-) -> tuple[dict[str, np.ndarray | None], np.ndarray]:
-    """Masks (H, W) uint8 by name, None where they are not sure, and the object's centre (3,).
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Masks (H, W) uint8 by name, but for those that are not sure, and the object's centre (3,).
 
     Masks that `folder` has already are taken as they are; anybody may have painted in them.
     """
@@ -61,31 +61,33 @@ def found_masks(
     kept = folder / "object.json"
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
-        read = {name: read_image(folder / f"{name}.png")[..., 0] if sure else None for name, sure in known["sure"].items()}
-        return read, np.array(known["center"])
+        kept_names = [name for name, good in known["sure"].items() if good]
+        return {name: read_image(folder / f"{name}.png")[..., 0] for name in kept_names}, np.array(known["center"])
     views = reduced_all(pictures, motion.cameras, COARSE)
     guesses = [masks.bright(view) for view in views]
     found = masks.settle(masks.Space.seen_by(views), guesses, progress)
     if found is None or found.quality < SURE:
-        raise InputError(f"{pictures[0].path.parent}: masks: nothing that the flash lights more than the rest was found; "
-                         "bring masks by --masks, or use a dark room")  # fmt: skip
-    result: dict[str, np.ndarray | None] = {}
+        raise InputError(f"{pictures[0].path.parent}: masks: no object was found that the flash lights more than what "
+                         "is around it; bring masks by --masks, or use a darker room")  # fmt: skip
+    result: dict[str, np.ndarray] = {}
+    sure: dict[str, bool] = {}
     by_name = {picture.name: picture for picture in pictures}
     for view, mask, guess, agreed in progress(list(zip(views, found.masks, guesses, found.agreement)), "outlines"):
         large = reduced(by_name[view.name], *motion.cameras[view.name], FINE)
         fine = masks.sharpen(large, mask)
-        maybe = masks.unsure(mask, guess).astype(np.uint8)
-        maybe = cv2.resize(maybe, fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        maybe = cv2.resize(masks.unsure(mask, guess), fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         shades = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
         write_image(shades[..., None], folder / f"{view.name}.png")
-        result[view.name] = shades if agreed >= SURE else None
+        sure[view.name] = agreed >= SURE
+        if sure[view.name]:
+            result[view.name] = shades
     center = found.body.points.mean(0)
-    write_file(kept, json.dumps({"center": center.tolist(), "sure": {n: m is not None for n, m in result.items()}}))
+    write_file(kept, json.dumps({"center": center.tolist(), "sure": sure}))
     return result, center
 
 
 def shots(
-    pictures: Sequence[Picture], motion: Motion, masks_: dict[str, np.ndarray | None], flash: np.ndarray
+    pictures: Sequence[Picture], motion: Motion, masks_: dict[str, np.ndarray], flash: np.ndarray
 ) -> list[Shot]:
     """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units]."""
     exposures = [exif_exposure(picture.path) for picture in pictures]

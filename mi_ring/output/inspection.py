@@ -1,0 +1,54 @@
+"""Whether a capture is usable and what is wrong with it: a table, findings and a contact sheet."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from mi_ring.capture.capture import Capture, sphere_of_cameras
+from mi_ring.geometry.hull import NoHull
+from mi_ring.metrics.captures import capture_findings, drop_empty, facing, measure, quality_table
+from mi_ring.metrics.mask_agreement import agreements
+from mi_ring.output.capture_sheet import capture_sheet
+from mi_ring.system.files import write_file, writing
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What there is to say of a capture."""
+
+    text: str  #: the table of photographs and the findings
+    findings: list[str]  #: what is to be mended
+    page: Image.Image  #: the contact sheet
+
+    def save(self, path: Path, field: str) -> None:
+        """Write the contact sheet as PNG. Raises InputError, about `field`, if it cannot be written."""
+        with writing(f"{path}: {field}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        buffer = io.BytesIO()
+        self.page.save(buffer, "PNG")
+        write_file(path, buffer.getvalue())
+
+
+def inspect(capture: Capture) -> Inspection:
+    """Measure a capture. Empty masks, which are findings, are taken from it."""
+    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(capture)]
+    try:
+        center, radius = capture.sphere()
+    except NoHull as error:
+        center, radius = sphere_of_cameras(capture)
+        found += [] if capture.whole else [str(error)]
+    agreement, wrong = agreements(capture)
+    rows = measure(capture, center, radius, agreement)
+    found += wrong or filter(None, [facing(capture, center)])
+    found += capture_findings(capture, rows, center)
+    page = capture_sheet(capture, rows, center, radius)
+    given = sum(mask is not None for mask in capture.masks)
+    if capture.threshold is not None:
+        masks = "found by brightness, for the room was dark"
+    else:
+        masks = f"{given} of {len(rows)} photographs" + ("" if given else "; the start will be a guess")
+    mend = [f"To mend: {line}" for line in found] or ["Nothing to mend found."]
+    place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius)
+    return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *mend]), found, page)

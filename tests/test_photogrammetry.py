@@ -1,0 +1,278 @@
+"""From photographs to a capture, piece by piece: pictures, masks, the table, crops."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mi_ring.capture.scenefile import load_element
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.importers.writer import Writer
+from mi_ring.photogrammetry import masks, table
+from mi_ring.photogrammetry.folder import Picture, find_pictures
+from mi_ring.photogrammetry.motion import Motion, pairs_to_match
+from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, windows, write_shot
+from mi_ring.photogrammetry.views import View, camera_of, reduced
+from mi_ring.rendering.lights import Light
+
+CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid
+LENS = Lens("PINHOLE", (160, 120), (170.0, 176.0, 77.0, 64.0))
+
+
+def pose_at(position, target, roll=0.0):
+    """Camera-to-world (4, 4), OpenCV's axes, z up but for the roll [deg]."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    pose[:3, 3] = position
+    return pose
+
+
+def poses(count, seed=0, lowest=15, highest=65, away=18.0):
+    """Hand-held all around."""
+    random = np.random.default_rng(seed)
+    for k in range(count):
+        turn, tilt = 2 * np.pi * k / count, np.radians(random.uniform(lowest, highest))
+        d = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+        position, target = CENTER + random.uniform(0.9, 1.1) * away * d, CENTER + random.uniform(-0.6, 0.6, 3)
+        yield pose_at(position, target, random.uniform(-9, 9))
+
+
+def rays_of(camera):
+    width, height = camera.size
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+    return camera.directions(pixels)
+
+
+def hit_ellipsoid(camera):
+    """Distance along the rays of all pixels (H·W,), infinite where they miss, and cosines."""
+    d, o = rays_of(camera) / AXES, (camera.position - CENTER) / AXES
+    a, b, c = (d * d).sum(1), d @ o, o @ o - 1
+    inside = b * b - a * c
+    t = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
+    normal = (o + np.where(np.isfinite(t), t, 0)[:, None] * d) / AXES
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return t, -(normal * rays_of(camera)).sum(1)
+
+
+def view(name, pose, rgb):
+    camera = camera_of(LENS, pose)
+    height, width = LENS.size[::-1]
+    return View(name, rgb.reshape(height, width, 3).astype(np.uint8), np.ones((height, width), bool), camera)
+
+
+def in_a_dim_room(pose, random):
+    """The ellipsoid lit by a flash, a lamp in the background somewhere, noise; and its mask."""
+    camera = camera_of(LENS, pose)
+    t, cosine = hit_ellipsoid(camera)
+    object_ = np.isfinite(t)
+    shade = np.where(object_, 60 + 150 * np.clip(cosine, 0, 1), 22)[:, None] * np.array([1.0, 0.9, 0.7])
+    rgb = (shade + random.normal(0, 3, shade.shape)).reshape(*LENS.size[::-1], 3)
+    x, y = random.integers(10, 150), random.integers(10, 110)
+    lamp = np.zeros(rgb.shape[:2], np.uint8)
+    cv2.circle(lamp, (int(x), int(y)), 6, 1, -1)
+    rgb[(lamp > 0) & ~object_.reshape(lamp.shape)] = 250
+    return rgb.clip(0, 255), object_.reshape(lamp.shape)
+
+
+def test_masks_of_a_dim_room_with_lamps():
+    random = np.random.default_rng(3)
+    views, true = [], []
+    for k, pose in enumerate(poses(24)):
+        rgb, mask = in_a_dim_room(pose, random)
+        views.append(view(str(k), pose, rgb))
+        true.append(mask)
+    guesses = [masks.bright(v) for v in views]
+    assert min(masks.overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
+    found = masks.settle(masks.Space.seen_by(views), guesses, lambda things, *_: things)
+    assert min(masks.overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
+    assert found.quality > 0.9
+    np.testing.assert_allclose(found.body.points.mean(0), CENTER, atol=0.15)
+
+
+def test_nothing_in_common_is_no_object():
+    random = np.random.default_rng(0)
+    views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
+    guesses = [np.zeros((120, 160), np.uint8) for _ in views]
+    for guess in guesses:
+        x, y = random.integers(0, 150, 2)
+        guess[y : y + 8, x : x + 8] = 1
+    assert masks.settle(masks.Space.seen_by(views), guesses, lambda things, *_: things) is None
+
+
+def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
+    mask, guess = np.zeros((2, 40, 60), np.uint8)
+    mask[10:20, 20:40] = guess[10:20, 20:40] = 1
+    guess[20:40, 28:32] = guess[2:6, 2:6] = 1
+    expected = np.zeros((40, 60), np.uint8)
+    expected[20:40, 28:32] = 1
+    np.testing.assert_array_equal(masks.unsure(mask, guess), expected)
+
+
+def on_a_table(pose, random, gain):
+    """The ellipsoid over a table of many colours, lit by a flash with a cone, a little room light; and its mask."""
+    camera = camera_of(LENS, pose)
+    t, cosine = hit_ellipsoid(camera)
+    rays = rays_of(camera)
+    height = CENTER[2] - AXES[2]
+    away = (height - camera.position[2]) / rays[:, 2]
+    place = camera.position + away[:, None] * rays
+    pattern = 0.45 + 0.3 * np.sin(1.7 * place[:, :1] + [0, 1, 2]) * np.cos(2.3 * place[:, 1:2] + [2, 0, 1])
+    cone = (rays @ camera.forward) ** 3
+    object_ = np.isfinite(t)
+    distance, facing = np.where(object_, t, away), np.where(object_, cosine, -rays[:, 2])
+    albedo = np.where(object_[:, None], [0.5, 0.42, 0.36], pattern)
+    radiance = gain * albedo * (cone * np.clip(facing, 0, 1) * (18 / distance) ** 2 + 0.03)[:, None]
+    encoded = 255 * np.clip(radiance, 0, 1) ** (1 / 2.2)
+    encoded[away < 0] = 0
+    mask = object_.reshape(LENS.size[::-1])
+    return (encoded + random.normal(0, 2, encoded.shape)).clip(0, 255), mask
+
+
+def test_what_stands_on_a_table_differs_from_it():
+    random = np.random.default_rng(1)
+    views, true = [], []
+    for k, pose in enumerate(poses(20, lowest=30)):
+        rgb, mask = on_a_table(pose, random, random.uniform(0.8, 1.2))
+        views.append(view(str(k), pose, rgb))
+        true.append(mask)
+    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    space = masks.Space.seen_by(views)
+    guesses = table.not_table(views, plane, space.center, space.axis[-1])
+    assert np.median([masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
+
+
+def test_the_plane_under_an_object():
+    random = np.random.default_rng(2)
+    turn = Rotation.from_euler("xyz", [30, -50, 20], degrees=True).as_matrix()
+    sheet = np.c_[random.uniform(-5, 5, (400, 2)), random.normal(0, 0.01, 400)]
+    object_ = np.abs(random.normal(size=(250, 3))) * [1, 1, 2]
+    cameras = np.array([[8, 0, 9], [-3, 8, 7], [0, -9, 6.0]])
+    points = np.concatenate([sheet, object_]) @ turn.T + CENTER
+    plane = table.find_plane(points, cameras @ turn.T + CENTER, CENTER, 4.0)
+    np.testing.assert_allclose(plane.normal, turn[:, 2], atol=0.01)
+    assert abs(plane.height(CENTER)) < 0.02
+    assert table.find_plane(random.normal(size=(300, 3)), cameras, np.zeros(3), 4.0) is None
+    axes = plane.axes()
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)
+
+
+def test_pairs_of_few_photographs_are_all_and_of_many_are_near_ones_and_some():
+    assert pairs_to_match(5) == list(itertools.combinations(range(5), 2))
+    pairs = set(pairs_to_match(1000))
+    assert {(k, k + 1) for k in range(999)} <= pairs and len(pairs) < 15000
+    assert (0, 500) in pairs or (0, 975) in pairs  # the way round is closed
+
+
+def test_a_motion_in_another_frame_shows_points_at_the_same_pixels():
+    random = np.random.default_rng(4)
+    points = CENTER + random.normal(size=(9, 3))
+    cameras = {str(k): (LENS, pose) for k, pose in enumerate(poses(3))}
+    motion = Motion(cameras, points, np.zeros((9, 3), np.uint8), [[]] * 9, 0.3, {})
+    turn = Rotation.from_euler("xyz", [10, 80, -40], degrees=True).as_matrix()
+    moved = motion.moved(2.5, turn, np.array([1.0, -2, 3]))
+    for name in cameras:
+        local = (np.linalg.inv(m.cameras[name][1]) @ np.c_[m.points, np.ones(9)].T for m in (motion, moved))
+        before, after = (LENS.colmap.img_from_cam(points[:3].T) for points in local)
+        np.testing.assert_allclose(before, after, atol=1e-9)
+
+
+def picture(path, pixels):
+    Image.fromarray(pixels).save(path)
+    return Picture(path)
+
+
+def test_pictures_of_a_folder(tmp_path):
+    random = np.random.default_rng(0)
+    with pytest.raises(InputError, match="FOLDER: no such folder"):
+        find_pictures(tmp_path / "none")
+    for k in range(8):
+        picture(tmp_path / f"{k}.JPG", random.integers(0, 255, (6, 9, 3), np.uint8))
+    (tmp_path / "notes.txt").write_text("no photograph")
+    (tmp_path / "3.dng").write_bytes(b"the raw one of the same shot")
+    found = find_pictures(tmp_path)
+    assert [p.path.name for p in found] == ["0.JPG", "1.JPG", "2.JPG", "3.dng", *(f"{k}.JPG" for k in range(4, 8))]
+    assert found[0].size == (9, 6) and found[0].pixels.shape == (6, 9, 3)
+    with pytest.raises(InputError, match=r"3.dng: cannot be read as raw photograph"):
+        _ = found[3].pixels
+    for k in range(4):
+        (tmp_path / f"{k}.JPG").unlink()
+    with pytest.raises(InputError, match=r"has 5 photographs .* at least 8 are needed"):
+        find_pictures(tmp_path)
+
+
+def test_grey_pictures_are_means_of_whole_blocks(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (13, 31, 3), np.uint8)
+    grey = picture(tmp_path / "a.png", pixels).grey(10)
+    assert grey.shape == (3, 7)
+    weights = np.array([0.299, 0.587, 0.114])
+    expected = (pixels[:12, :28] @ weights).reshape(3, 4, 7, 4).mean((1, 3))
+    np.testing.assert_allclose(grey, expected, atol=1.5)
+
+
+def shot(tmp_path, name, lens, pose, mask):
+    pixels = np.random.default_rng(0).integers(60, 200, (lens.size[1], lens.size[0], 3), np.uint8)
+    pixels = cv2.GaussianBlur(pixels, (0, 0), 3)
+    light = Light("point", pose[:3, 3], np.full(3, 2.0))
+    return Shot(picture(tmp_path / f"{name}.png", pixels), lens, pose, mask, light)
+
+
+def test_crops_are_of_one_size_hold_the_object_and_see_the_same(tmp_path):
+    """Of a lens with distortion: what a point of the object looks like is what the photograph has there."""
+    lens = Lens("SIMPLE_RADIAL", (160, 120), (150.0, 77.0, 64.0, -0.15))
+    shots = []
+    for k, pose in enumerate(poses(4, away=24.0)):
+        mask = np.zeros((60, 80), np.uint8)
+        t, _ = hit_ellipsoid(camera_of(Lens("PINHOLE", (80, 60), (75, 75, 38.5, 32)), pose))
+        mask.ravel()[np.isfinite(t)] = OBJECT
+        mask[:6, :8] = UNSURE
+        shots.append(shot(tmp_path, str(k), lens, pose, mask))
+    cut = windows(shots)
+    assert len({(w.width, w.height) for w in cut}) == 1
+    assert cut[0].width * cut[0].height < 0.6 * 160 * 120
+    writer = Writer(tmp_path / "capture/scene.xml")
+    try:
+        for one, window in zip(shots, cut):
+            element = write_shot(writer, one, window)
+            sensor = load_element(element)
+            np.testing.assert_allclose(sensor.camera.position, one.pose[:3, 3], rtol=1e-5)
+            rows, columns = np.nonzero(one.mask == OBJECT)
+            extent = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]]) * 2
+            assert (extent[0] >= [window.left, window.top]).all()
+            assert (extent[1] <= [window.left + window.width, window.top + window.height]).all()
+            local = np.array([0.05, -0.04, 1.0])  # a ray, in the camera's axes
+            distorted = lens.colmap.img_from_cam(local[None])[0]
+            camera = sensor.camera
+            straight = camera.focal * local[:2] + camera.centre
+            taken = np.array(Image.open(writer.staging / f"images/{one.picture.name}.png")).astype(float)
+            there, here = (
+                cv2.remap(pixels.astype(np.float32), *np.float32(place - 0.5)[:, None], cv2.INTER_LINEAR)
+                for pixels, place in ((one.picture.pixels, distorted), (taken, straight))
+            )
+            np.testing.assert_allclose(here, there, atol=2.5)
+            white = np.array(Image.open(writer.staging / f"masks/{one.picture.name}.png"))
+            assert set(np.unique(white)) == {0, 255}
+    finally:
+        writer.close()
+
+
+def test_a_reduced_photograph_has_a_camera_that_sees_the_same(tmp_path):
+    lens = Lens("SIMPLE_RADIAL", (160, 120), (150.0, 77.0, 64.0, -0.15))
+    pixels = np.zeros((120, 160, 3), np.uint8)
+    local = np.array([0.2, -0.15, 1.0])
+    column, row = lens.colmap.img_from_cam(local[None])[0]
+    cv2.circle(pixels, (round((column - 0.5) * 16), round((row - 0.5) * 16)), 64, (255, 255, 255), -1, cv2.LINE_AA, 4)
+    small = reduced(picture(tmp_path / "a.png", pixels), lens, np.eye(4), 80)
+    assert small.rgb.shape == (60, 80, 3)
+    weight = small.rgb.sum(-1).astype(float)
+    y, x = np.mgrid[:60, :80] + 0.5
+    found = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+    np.testing.assert_allclose(found, small.camera.focal * local[:2] + small.camera.centre, atol=0.1)
