@@ -10,7 +10,7 @@ from test_hull import ball, silhouettes
 
 from mi_ring import check
 from mi_ring.geometry import hull
-from mi_ring.metrics import mask_agreement
+from mi_ring.metrics import captures, mask_agreement
 from mi_ring.system import command
 
 
@@ -179,15 +179,33 @@ def test_one_exposure_that_is_wrong(broken_capture, tmp_path, capsys):
     assert status == 1 and re.search(r"To mend: 007.png: is 0.0\d+ times as bright as the others", text), text
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda image: np.clip(image.astype(int) * 3, 0, 255).astype(np.uint8), "of the object is over-exposed"),
-    (lambda image: np.maximum(image, 70), "the room was not dark"),
-])  # fmt: skip
-def test_exposure_and_background(change, words, broken_capture, tmp_path, capsys):
+def test_over_exposed(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
-    edit_images(path, change)
+    edit_images(path, lambda image: np.clip(image.astype(int) * 3, 0, 255).astype(np.uint8))
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and words in text, text
+    assert status == 1 and "of the object is over-exposed" in text, text
+
+
+def test_a_bright_background_harms_nothing_with_masks_and_is_an_error_without(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_images(path, lambda image: np.maximum(image, 70))
+    status, text = run(path, tmp_path, capsys)
+    assert status == 0 and "room" not in text, text
+    for masks in ("none", "given"):
+        path.write_text(re.sub(r'<string name="mask"[^>]*>', "", path.read_text()))
+        status, text = run(path, tmp_path, capsys, "--masks", masks)
+        assert status == 1 and "To mend: no masks, and the background is not dark" in text and "mi-ring photos" in text
+
+
+def test_light_of_the_room_is_told_from_the_falloff():
+    """What an object of uneven albedo looks like at 24 distances, with and without a light that stays."""
+    random = np.random.default_rng(6)
+    received = 1 / random.uniform(0.8, 1.4, 24) ** 2
+    albedo = random.normal(0.5, 0.01, 24)
+    for room in (0.0, 0.15):
+        share = captures.room_light(albedo * (received + room) / received, received)
+        assert share == pytest.approx(room / (np.median(received) + room), abs=0.05)
+    assert captures.room_light(albedo * 1.15, np.ones(24)) == 0  # all from one distance
 
 
 def test_without_masks(broken_capture, tmp_path, capsys):

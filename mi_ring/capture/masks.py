@@ -10,15 +10,12 @@ from mi_ring.capture.decoding import decode
 from mi_ring.images import box_filter
 
 
-def find_masks(capture: Capture) -> None:
-    """Give the photographs masks of what is brighter than a dark room, if it was dark when they were taken.
-
-    Such a mask shows what the light reaches of the object; the rest of the object may be as dark as the room.
-    """
+def dark_threshold(capture: Capture) -> float | None:
+    """Radiance above which a pixel is not the dark room behind the object; None if the room was not dark."""
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
-        return
+        return None
     floor = values[values > 0].min()
     split = float(np.exp(threshold_otsu(np.log(np.maximum(values, floor)))))
     dark, bright = values[values <= split], values[values > split]
@@ -26,9 +23,19 @@ def find_masks(capture: Capture) -> None:
     # Above the noise of the dark: of what is not near to anything bright.
     apart = [image[scipy.ndimage.maximum_filter(image, 7) <= split] for image in some]
     if not sum(map(len, apart)) or np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
-        return
+        return None
     noise = float(np.quantile(np.concatenate(apart), 0.999))
-    capture.threshold = max(4 * noise, 1e-3 * float(np.median(bright)))
+    return max(4 * noise, 1e-3 * float(np.median(bright)))
+
+
+def find_masks(capture: Capture) -> None:
+    """Give the photographs masks of what is brighter than a dark room, if it was dark when they were taken.
+
+    Such a mask shows what the light reaches of the object; the rest of the object may be as dark as the room.
+    """
+    capture.threshold = dark_threshold(capture)
+    if capture.threshold is None:
+        return
     largest = []
     for k in range(len(capture)):
         seen = brightness(capture, k) > capture.threshold

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.stats import theilslopes
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.masks import dark_threshold
 from mi_ring.geometry.hull import WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 
@@ -91,6 +93,20 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
     return f"{', '.join(np.array(capture.names)[away][:5])}: looking away from the object" if away.any() else None
 
 
+def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
+    """Share of a light on the object that does not fall off as the photographs' own do, at least; 0 if none is found.
+
+    Of each photograph (n,): how bright the object is for the light that it gets, and that light. If the room adds to
+    it the object is too bright where it gets little.
+    """
+    if len(received) < 12 or received.max() < 1.5 * received.min():
+        return 0.0
+    level = brightness * received
+    _, _, _, steepest = theilslopes(level, received)
+    rest = np.median(level - steepest * received)
+    return float(max(0.0, rest / np.median(level)))
+
+
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
     """What is to be mended, each in one line."""
     found: list[str] = []
@@ -102,6 +118,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
     found += filter(None, [units(capture, center)])
+    received = capture.photographs.lights.irradiance(center).mean(1)
     lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind
     typical = np.median([row.brightness for row in lit]) if lit else 1.0
     for row in lit:
@@ -111,11 +128,17 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     for name, limit, text in (
         ("clipped", CLIPPED, "of the object is over-exposed; expose less"),
         ("dark", DARK, "of the object is black: under-exposed, or unlit"),
-        ("background", AMBIENT, "of the object's brightness is in the background: the room was not dark"),
     ):
         shares = [value for row in rows if (value := getattr(row, name)) is not None]
         if shares and np.median(shares) > limit:
             found.append(f"{np.median(shares):.0%} {text}")
+    if all(mask is None for mask in capture.masks) and dark_threshold(capture) is None:
+        found.append("no masks, and the background is not dark, for which a fit would take it: give masks, or have "
+                     "them found by mi-ring photos")  # fmt: skip
+    share = room_light(np.array([row.brightness for row in lit]), received[[row in lit for row in rows]])
+    if share > AMBIENT:
+        found.append(f"{share:.0%} of the light on the object is the room's, by how little darker the object gets "
+                     "where the flash is farther: darken the room, or go nearer")  # fmt: skip
     views = len({sensor.camera.to_world.tobytes() for sensor in capture.sensors})
     if views < 8:
         found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")

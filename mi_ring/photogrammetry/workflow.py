@@ -15,7 +15,8 @@ from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.motion import Motion, Progress
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
-from mi_ring.photogrammetry.views import reduced, reduced_all
+from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table
+from mi_ring.photogrammetry.views import View, reduced, reduced_all
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 
@@ -64,11 +65,12 @@ def found_masks(
         kept_names = [name for name, good in known["sure"].items() if good]
         return {name: read_image(folder / f"{name}.png")[..., 0] for name in kept_names}, np.array(known["center"])
     views = reduced_all(pictures, motion.cameras, COARSE)
-    guesses = [masks.bright(view) for view in views]
-    found = masks.settle(masks.Space.seen_by(views), guesses, progress)
-    if found is None or found.quality < SURE:
-        raise InputError(f"{pictures[0].path.parent}: masks: no object was found that the flash lights more than what "
-                         "is around it; bring masks by --masks, or use a darker room")  # fmt: skip
+    space = masks.Space.seen_by(views)
+    plane = find_plane(motion.points, np.stack([v.camera.position for v in views]), space.center, space.axis[-1])
+    found, guesses = find_object(views, space, plane, progress)
+    if found is None:
+        raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
+                         "nor one that the flash lights more than what is around it")  # fmt: skip
     result: dict[str, np.ndarray] = {}
     sure: dict[str, bool] = {}
     by_name = {picture.name: picture for picture in pictures}
@@ -84,6 +86,23 @@ def found_masks(
     center = found.body.points.mean(0)
     write_file(kept, json.dumps({"center": center.tolist(), "sure": sure}))
     return result, center
+
+
+def find_object(
+    views: Sequence[View], space: masks.Space, plane: Plane | None, progress: Progress
+) -> tuple[masks.Found | None, list[np.ndarray]]:
+    """Masks by what differs from the table, if there is one, else by brightness; and the guesses they grew from."""
+    ways = []
+    if plane:
+        above = plane.height(space.grid) > 2 * FLAT * np.linalg.norm(views[0].camera.position - space.center)
+        ways.append((lambda: not_table(views, plane, space.center, space.axis[-1]), above))
+    ways.append((lambda: [masks.bright(view) for view in views], np.ones(len(space.grid), bool)))
+    for guess, allowed in ways:
+        space.allowed, guesses = allowed, guess()
+        found = masks.settle(space, guesses, progress)
+        if found and found.quality >= SURE:
+            return found, guesses
+    return None, []
 
 
 def shots(
