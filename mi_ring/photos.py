@@ -17,7 +17,7 @@ from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.folder import find_pictures
 from mi_ring.photogrammetry.motion import Motion, structure_from_motion
 from mi_ring.photogrammetry.scene import windows, write_shot
-from mi_ring.photogrammetry.workflow import found_masks, require_same_photographs, shots, upright
+from mi_ring.photogrammetry.workflow import cameras_beside, find_object, require_same_photographs, shots, upright
 from mi_ring.system import command
 from mi_ring.system.files import writing
 
@@ -48,9 +48,9 @@ def progress(things: Iterable, what: str, total: int | None = None) -> Iterable:
 def cameras_report(motion: Motion) -> str:
     """What structure from motion has found."""
     count, failed = len(motion.cameras), motion.failed
+    how = f"by {len(motion.points)} points, reprojection error {motion.error:.2f} px" if motion.error else "as given"
     return "\n".join([
-        f"Cameras: {count} of {count + len(failed)} photographs, by {len(motion.points)} points, reprojection error "
-        f"{motion.error:.2f} px",
+        f"Cameras: {count} of {count + len(failed)} photographs, {how}",
         *(f"  without: {name}: {why}" for name, why in failed.items()),
     ])  # fmt: skip
 
@@ -67,11 +67,11 @@ def main(arguments: Sequence[str]) -> int:
         config.out.mkdir(parents=True, exist_ok=True)
     work = config.out / "work"
     require_same_photographs(pictures, work)
-    motion = structure_from_motion(pictures, work, progress)
+    motion = cameras_beside(pictures) or structure_from_motion(pictures, work, progress)
     print(cameras_report(motion))
-    masks, center = found_masks(pictures, motion, work / "masks", progress)
-    motion = upright(motion, center)
-    taken = shots(pictures, motion, masks, np.array(config.flash_offset))
+    found = find_object(pictures, motion, work / "masks", progress)
+    motion = upright(motion, found.center, found.up)
+    taken = shots(pictures, motion, found, np.array(config.flash_offset))
     root, writer = scene_element([]), Writer(scene)
     try:
         for shot, window in progress(list(zip(taken, windows(taken))), "writing"):

@@ -176,7 +176,7 @@ def test_a_motion_in_another_frame_shows_points_at_the_same_pixels():
     random = np.random.default_rng(4)
     points = CENTER + random.normal(size=(9, 3))
     cameras = {str(k): (LENS, pose) for k, pose in enumerate(poses(3))}
-    motion = Motion(cameras, points, np.zeros((9, 3), np.uint8), [[]] * 9, 0.3, {})
+    motion = Motion(cameras, points, 0.3, {})
     turn = Rotation.from_euler("xyz", [10, 80, -40], degrees=True).as_matrix()
     moved = motion.moved(2.5, turn, np.array([1.0, -2, 3]))
     for name in cameras:

@@ -35,7 +35,8 @@ LOG_EVERY = 5  #: iterations between entries of the log
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing"}
 CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
 CROSSING_EVERY = 20  #: iterations between counts of them
-RETREAT, STRONGEST = 2.0, -0.3  #: how fast it strengthens then, for one that it weakens by, and how far, in `calm`
+RETREAT, CATCH_UP = 2.0, 3.0  #: how fast it strengthens then, and weakens afterwards, for one by which it would
+LAG = 0.6  #: how far `calm` may stay behind `progress`
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -242,7 +243,9 @@ class Fit:
         if it.number % CROSSING_EVERY == 0:
             self.crossing = float(crossing_triangles(it.vertices.cpu().numpy(), it.faces).mean())
         step = 1 / self.iterations
-        self.calm = max(STRONGEST, self.calm - RETREAT * step) if self.crossing > CROSSING else self.calm + step
+        self.calm += -RETREAT * step if self.crossing > CROSSING else CATCH_UP * step
+        progress = it.number / self.iterations
+        self.calm = min(max(self.calm, progress - LAG), progress)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.

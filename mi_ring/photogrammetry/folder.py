@@ -130,6 +130,21 @@ def focal_35mm(pictures: Sequence[Picture]) -> float | None:
     return None
 
 
+def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
+    """(N,) by EXIF, 1 for the one in the middle; all 1 unless all photographs say."""
+    exposures = []
+    for picture in pictures:
+        exif = exif_of(picture.path)
+        tags = ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber
+        try:
+            seconds, iso, number = (float(np.ravel(exif[tag])[0]) for tag in tags)
+            exposures.append(seconds * iso / number**2)
+        except (KeyError, TypeError, ValueError, ZeroDivisionError):
+            exposures.append(np.nan)
+    found = np.array(exposures)
+    return found / np.median(found) if np.isfinite(found).all() and (found > 0).all() else np.ones(len(found))
+
+
 def exif_of(path: Path) -> dict:
     """EXIF data about the exposure, empty where there are none."""
     try:
@@ -137,5 +152,5 @@ def exif_of(path: Path) -> dict:
             need("pillow_heif", f"{path}").register_heif_opener()
         with Image.open(path) as image:
             return dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
-    except OSError:  # a raw format that Pillow does not know
+    except (OSError, SyntaxError):  # damaged, or a raw format that Pillow does not know
         return {}

@@ -30,9 +30,7 @@ class Motion:
 
     cameras: dict[str, tuple[Lens, np.ndarray]]  #: lens and camera-to-world pose (4, 4), OpenCV's axes
     points: np.ndarray  #: (N, 3)
-    colors: np.ndarray  #: (N, 3) uint8
-    seen_by: list[list[str]]  #: of each point, the photographs that show it
-    error: float  #: mean reprojection error [px of the photographs]
+    error: float | None  #: mean reprojection error [px of the photographs], if it is known
     failed: dict[str, str]  #: photographs without a camera, and why
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Motion":
@@ -135,7 +133,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
     """The largest `pycolmap.Reconstruction` that the matches give; None if there is none."""
     pycolmap = need("pycolmap", "structure from motion")
-    options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=True)
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     bar = iter(progress(range(count), "cameras", count))
     for _ in range(2):  # the pair that it begins with
         next(bar, None)
@@ -168,7 +166,7 @@ def adjust(model: Any) -> None:
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
     """In terms of the photographs as they were taken."""
     by_file = {f"{picture.name}.png": picture for picture in pictures}
-    cameras, names, scales = {}, {}, []
+    cameras, scales = {}, []
     for k in model.reg_image_ids():
         image = model.images[k]
         picture = by_file.get(image.name)
@@ -179,16 +177,21 @@ def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
         (f, cx, cy, radial), pose = own.params, np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         lens = Lens("SIMPLE_RADIAL", picture.size, (scale * f, scale * cx, scale * cy, radial))
-        cameras[picture.name], names[k] = (lens, pose), picture.name
+        cameras[picture.name] = lens, pose
         scales.append(scale)
-    points = list(model.points3D.values())
     failed = {p.name: reason_of(p, folder) for p in pictures if p.name not in cameras}
-    return Motion(
-        dict(sorted(cameras.items())), np.array([p.xyz for p in points]).reshape(-1, 3),
-        np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        [[names[e.image_id] for e in p.track.elements if e.image_id in names] for p in points],
-        float(model.compute_mean_reprojection_error() * np.mean(scales)), failed,
-    )  # fmt: skip
+    error = float(model.compute_mean_reprojection_error() * np.mean(scales))
+    return Motion(dict(sorted(cameras.items())), points_of(model), error, failed)
+
+
+def points_of(model: Any) -> np.ndarray:
+    """The points (N, 3) of a `pycolmap.Reconstruction`."""
+    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+
+
+def model_points(folder: Path) -> np.ndarray:
+    """The points (N, 3) of a model in COLMAP's format."""
+    return points_of(need("pycolmap", f"{folder}").Reconstruction(folder))
 
 
 def reason_of(picture: Picture, folder: Path) -> str:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.images import read_image, write_image
-from mi_ring.importers.photogrammetry import exif_exposure
+from mi_ring.importers.colmap import Colmap
+from mi_ring.importers.formats import detect
 from mi_ring.photogrammetry import masks
-from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.motion import Motion, Progress
+from mi_ring.photogrammetry.folder import Picture, relative_exposures
+from mi_ring.photogrammetry.motion import Motion, Progress, model_points
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
 from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table
 from mi_ring.photogrammetry.views import View, reduced, reduced_all
@@ -22,7 +24,7 @@ from mi_ring.system.files import write_file
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, FINE = 600, 1200  #: pixels at most along the pictures that masks are found in, and that outlines are
-DIM = 3.0  #: albedo that lights of unknown intensity are made to imply: more than all, which tells that they are
+DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
 
 
 
@@ -37,11 +39,30 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
     write_file(known, json.dumps(listed))
 
 
-def upright(motion: Motion, center: np.ndarray) -> Motion:
-    """Moved so that the object's `center` (3,) is the origin and the photographs' mean up is z; 1 is how far it is."""
+def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
+    """The cameras that lie beside the photographs in the format of another tool; None if there are none."""
+    source = detect(pictures[0].path.parent)
+    if source is None:
+        return None
+    frames = {frame.image.stem: frame for frame in source.frames()}
+    cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
+    failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
+    if len(cameras) < len(failed):
+        raise InputError(f"{source.src}: has cameras for {len(cameras)} of {len(pictures)} photographs; move it away "
+                         "to have cameras found in the photographs")  # fmt: skip
+    model = Colmap.model(source.src)
+    points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
+    return Motion(cameras, points, None, failed)
+
+
+def upright(motion: Motion, center: np.ndarray, up: np.ndarray | None) -> Motion:
+    """Moved so that the object's `center` (3,) is the origin and `up` is z, by default the photographs' mean up.
+
+    The unit is the median distance from the cameras to the object.
+    """
     poses = np.stack([pose for _, pose in motion.cameras.values()])
     scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
-    up = -poses[:, :3, 1].mean(0)
+    up = -poses[:, :3, 1].mean(0) if up is None else up
     rotation = rotation_to_z(up / np.linalg.norm(up)) if np.linalg.norm(up) > 0.1 else np.eye(3)
     return motion.moved(scale, rotation, -scale * rotation @ center)
 
@@ -51,10 +72,17 @@ def rotation_to_z(direction: np.ndarray) -> np.ndarray:
     return Rotation.align_vectors([[0, 0, 1.0]], [direction])[0].as_matrix()
 
 
-def found_masks(
-    pictures: Sequence[Picture], motion: Motion, folder: Path, progress: Progress
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Masks (H, W) uint8 by name, but for those that are not sure, and the object's centre (3,).
+class Object(NamedTuple):
+    """The object as the photographs show it."""
+
+    masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, but for those that are not sure
+    center: np.ndarray  #: (3,)
+    level: float  #: its mean radiance, 1 = full scale
+    up: np.ndarray | None  #: (3,) the normal of the table that it stands on, if there is one
+
+
+def find_object(pictures: Sequence[Picture], motion: Motion, folder: Path, progress: Progress) -> Object:
+    """The object and its masks.
 
     Masks that `folder` has already are taken as they are; anybody may have painted in them.
     """
@@ -62,33 +90,36 @@ def found_masks(
     kept = folder / "object.json"
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
-        kept_names = [name for name, good in known["sure"].items() if good]
-        return {name: read_image(folder / f"{name}.png")[..., 0] for name in kept_names}, np.array(known["center"])
+        masks_ = {name: read_image(folder / f"{name}.png")[..., 0] for name in known["sure"]}
+        return Object(masks_, np.array(known["center"]), known["level"], known["up"] and np.array(known["up"]))
     views = reduced_all(pictures, motion.cameras, COARSE)
     space = masks.Space.seen_by(views)
     plane = find_plane(motion.points, np.stack([v.camera.position for v in views]), space.center, space.axis[-1])
-    found, guesses = find_object(views, space, plane, progress)
+    found, guesses = settle_any(views, space, plane, progress)
     if found is None:
         raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
                          "nor one that the flash lights more than what is around it")  # fmt: skip
-    result: dict[str, np.ndarray] = {}
-    sure: dict[str, bool] = {}
+    sure: dict[str, np.ndarray] = {}
     by_name = {picture.name: picture for picture in pictures}
     for view, mask, guess, agreed in progress(list(zip(views, found.masks, guesses, found.agreement)), "outlines"):
         large = reduced(by_name[view.name], *motion.cameras[view.name], FINE)
+        by_name[view.name].close()
         fine = masks.sharpen(large, mask)
         maybe = cv2.resize(masks.unsure(mask, guess), fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         shades = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
         write_image(shades[..., None], folder / f"{view.name}.png")
-        sure[view.name] = agreed >= SURE
-        if sure[view.name]:
-            result[view.name] = shades
-    center = found.body.points.mean(0)
-    write_file(kept, json.dumps({"center": center.tolist(), "sure": sure}))
-    return result, center
+        if agreed >= SURE:
+            sure[view.name] = shades
+    levels = [view.linear[mask > 0].mean() for view, mask in zip(views, found.masks) if mask.any()]
+    result = Object(sure, found.body.points.mean(0), float(np.median(levels)), plane and plane.normal)
+    write_file(kept, json.dumps({
+        "sure": list(sure), "center": result.center.tolist(), "level": result.level,
+        "up": None if result.up is None else result.up.tolist(),
+    }))  # fmt: skip
+    return result
 
 
-def find_object(
+def settle_any(
     views: Sequence[View], space: masks.Space, plane: Plane | None, progress: Progress
 ) -> tuple[masks.Found | None, list[np.ndarray]]:
     """Masks by what differs from the table, if there is one, else by brightness; and the guesses they grew from."""
@@ -105,18 +136,16 @@ def find_object(
     return None, []
 
 
-def shots(
-    pictures: Sequence[Picture], motion: Motion, masks_: dict[str, np.ndarray], flash: np.ndarray
-) -> list[Shot]:
-    """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units]."""
-    exposures = [exif_exposure(picture.path) for picture in pictures]
-    known = [exposure for exposure in exposures if exposure]
+def shots(pictures: Sequence[Picture], motion: Motion, object_: Object, flash: np.ndarray) -> list[Shot]:
+    """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units].
+
+    How strong it is, is not known, and made to be so weak that fits see that it is not.
+    """
+    strength = np.pi * object_.level / DIM
     result = []
-    for picture, exposure in zip(pictures, exposures):
-        if picture.name not in motion.cameras:
-            continue
-        lens, pose = motion.cameras[picture.name]
-        relative = exposure / np.median(known) if exposure and len(known) == len(pictures) else 1.0
-        light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], np.full(3, relative / DIM))
-        result.append(Shot(picture, lens, pose, masks_.get(picture.name), light))
+    for picture, exposure in zip(pictures, relative_exposures(pictures)):
+        if picture.name in motion.cameras:
+            lens, pose = motion.cameras[picture.name]
+            light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], np.full(3, exposure * strength))
+            result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
     return result
