@@ -18,6 +18,7 @@ import os
 import re
 import sys
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mi_ring.system import llvm
@@ -63,9 +64,9 @@ def __dir__() -> list[str]:
 
 
 def _command_looked_for() -> str | None:
-    """The command but the doctor, of which Python is about to import the module: `python -m mi_ring.fit …`."""
+    """The command, of which Python is about to import the module: `python -m mi_ring.fit …`."""
     names = sys.orig_argv if sys.argv[:1] == ["-m"] else ()
-    return next(filter(re.compile(r"mi_ring\.(?!doctor)\w+").fullmatch, names), None)
+    return next(filter(re.compile(r"mi_ring\.\w+").fullmatch, names), None)
 
 
 def _prepare_mitsuba() -> None:
@@ -74,6 +75,7 @@ def _prepare_mitsuba() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     llvm.prepare()
     problem = llvm.missing()
+    command = _command_looked_for()
     if llvm.has_atomic():  # else Mitsuba cannot be imported
         import drjit as dr
         import mitsuba as mi
@@ -92,10 +94,10 @@ def _prepare_mitsuba() -> None:
             register(None, str(mi.variant()))
         else:
             mi.set_variant("scalar_rgb" if problem else "llvm_ad_rgb")
-    elif command := _command_looked_for():  # which could not even be imported
+    elif command and command != "mi_ring.doctor":  # which could not even be imported
         print(f"{command}: {problem}", file=sys.stderr)
         sys.exit(2)
-    if problem:
+    if problem and not command and Path(sys.argv[0]).stem != "mi-ring":  # commands say so themselves
         warnings.warn(problem, stacklevel=3)
 
 

@@ -72,7 +72,8 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
         path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 at byte {error.start} ({error.reason}); convert it") from error
+        what = f"is not UTF-8 at byte {error.start} ({error.reason})"
+        raise InputError(f"{path}: {what}; give the XML file of a scene, in UTF-8") from error
     except RuntimeError as error:
         raise InputError(f"{path}: {reason(error)}") from error
     sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
@@ -99,4 +100,5 @@ def reason(error: RuntimeError) -> str:
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
         text = text.split("Error: ", 1)[-1]
-    return " ".join(text.split())
+    advice = "; give the XML file of a scene" if "No document element found" in text else ""
+    return " ".join(text.split()) + advice
