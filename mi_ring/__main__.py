@@ -13,7 +13,9 @@ from mi_ring.system.command import run
 from mi_ring.version import __version__
 
 #: Modules of the package; the first line of each says what the command does and ends in how it is called.
-COMMANDS = ("example", "photos", "convert", "check", "fit", "render", "export", "evaluate", "validate", "doctor")
+COMMANDS = (
+    "example", "board", "photos", "convert", "check", "fit", "render", "export", "evaluate", "validate", "doctor",
+)  # fmt: skip
 
 
 def summary(name: str) -> tuple[str, str]:

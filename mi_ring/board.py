@@ -1,0 +1,45 @@
+"""Write a sheet of markers, to be printed and put under the object: `python -m mi_ring.board FILE`."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from mi_ring.errors import InputError
+from mi_ring.photogrammetry.board import DOTS, page
+from mi_ring.system import command
+from mi_ring.system.files import require_place, write_file
+
+
+@dataclass(frozen=True)
+class BoardConfig:
+    """Write a sheet of markers, to be printed and put under the object: it tells scale, cameras and white."""
+
+    file: Positional[Annotated[Path, arg(metavar="FILE")]]
+    """File to write, .pdf or .png."""
+    paper: Literal["a4", "letter"] = "a4"
+    """Size of the paper."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    config = command.parse(BoardConfig, arguments, "mi_ring.board", needs_llvm=False)
+    file, kind = config.file, config.file.suffix.lower()
+    if kind not in (".pdf", ".png"):
+        raise InputError(f"{file}: FILE: ends in {kind or 'nothing'}; must end in .pdf or .png")
+    require_place(file)
+    buffer, dpi = io.BytesIO(), 25.4 * DOTS
+    sheet = page(config.paper)
+    if kind == ".pdf":
+        sheet.save(buffer, "PDF", resolution=dpi, title="mi_ring board")
+    else:
+        sheet.save(buffer, "PNG", dpi=(dpi, dpi))
+    write_file(file, buffer.getvalue())
+    print(f'{file}\nPrint it at 100 % ("actual size") and measure: five squares must be 100 mm long.')
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.board", main)

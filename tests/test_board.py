@@ -1,0 +1,250 @@
+"""The sheet of markers: its page, and what photographs of it tell."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mi_ring import board as command
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.photogrammetry.board import DOTS, Board, Sighting, align, calibrate, page, white
+
+MIDDLE = Lens("SIMPLE_RADIAL", (480, 360), (520.0, 240.0, 180.0, -0.06))
+ASIDE = Lens("SIMPLE_RADIAL", (480, 360), (520.0, 251.0, 172.0, -0.06))
+PAPER = np.array([0.8, 0.7, 0.5])  #: its colour under the lamp, linear
+
+
+def pose_at(turn, tilt, away, roll, target):
+    """Camera-to-world, OpenCV's axes, from angles [deg] about the sheet and the distance [mm]."""
+    turn, tilt = np.radians([turn, tilt])
+    back = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    right = np.cross([0, 0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(right, back), -back], 1)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    assert np.linalg.det(pose[:3, :3]) > 0
+    pose[:3, 3] = np.array([*target, 0]) + away * back
+    return pose
+
+
+def poses(count):
+    random = np.random.default_rng(4)
+    for k in range(count):
+        yield pose_at(360 * k / count + 20, random.uniform(40, 70), random.uniform(330, 420),
+                      random.uniform(-15, 15), random.uniform(-20, 20, 2))  # fmt: skip
+
+
+def photograph(lens, pose):
+    """(H, W, 3) uint8: the page on black, sampled 4 × 4 times a pixel, blurred, with noise, in the paper's colour."""
+    width, height = lens.size
+    x, y = np.meshgrid((np.arange(4 * width) + 0.5) / 4, (np.arange(4 * height) + 0.5) / 4)
+    if lens not in RAYS:
+        local = lens.colmap.cam_from_img(np.stack([x, y], -1).reshape(-1, 2))
+        RAYS[lens] = np.column_stack([local, np.ones(len(local))])
+    rays = RAYS[lens] @ pose[:3, :3].T
+    hit = pose[:3, 3] - pose[2, 3] / rays[:, 2:] * rays
+    sheet = np.array(page("a4")).astype(np.float32)
+    sheet = cv2.resize(sheet, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    place = hit[:, :2] * [1, -1] * DOTS / 2 + np.array(sheet.shape[::-1]) / 2 - 0.5
+    place = place.reshape(4 * height, 4 * width, 2).astype(np.float32)
+    shown = cv2.remap(sheet, place, None, cv2.INTER_LINEAR, borderValue=0)
+    shown = cv2.GaussianBlur(cv2.resize(shown, lens.size, interpolation=cv2.INTER_AREA), (0, 0), 0.6)
+    rgb = 255 * (0.06 + 0.94 * shown[..., None] * PAPER) ** (1 / 2.2)
+    random = np.random.default_rng(int(1e3 * abs(pose[0, 3])))
+    return (rgb + random.normal(0, 2, rgb.shape)).clip(0, 255).round().astype(np.uint8)
+
+
+RAYS = {}
+
+
+def truth(lens, pose, points):
+    """Where a camera sees points (n, 3), and are they in front of it?"""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    assert (local[:, 2] > 0).all()
+    return lens.colmap.img_from_cam(local)
+
+
+@pytest.fixture(scope="module")
+def aside():
+    """Cameras and what is found in their photographs, by name; the lens's principal point is not in the middle."""
+    cameras = {f"{k:02}": (ASIDE, pose) for k, pose in enumerate(poses(7))}
+    return cameras, {name: Board().detect(photograph(*camera)) for name, camera in cameras.items()}
+
+
+def test_corners_are_found_where_they_are(aside):
+    cameras, sightings = aside
+    errors = []
+    for name, (lens, pose) in cameras.items():
+        sighting = sightings[name]
+        assert len(sighting.ids) > 60 and (sighting.points[:, 2] == 0).all()
+        errors.append(sighting.pixels - truth(lens, pose, sighting.points))
+    errors = np.concatenate(errors)
+    assert np.abs(errors.mean(0)).max() < 0.03  # a convention that is half a pixel off
+    assert np.sqrt((errors**2).sum(1).mean()) < 0.1 and np.quantile(np.linalg.norm(errors, axis=1), 0.95) < 0.15
+
+
+def test_the_frame_has_the_printed_side_up():
+    """By OpenCV's own way: the first corner is at the top left of the page as it is read."""
+    sheet = np.array(page("letter"), np.uint8) * 255
+    sighting = Board(40.0).detect(sheet)
+    assert sighting.ids.tolist() == list(range(96))
+    np.testing.assert_allclose(sighting.points[[0, 7, 88]], [[-140, 220, 0], [140, 220, 0], [-140, -220, 0]])
+    middle = np.array(sheet.shape[::-1]) / 2
+    exact = middle + sighting.points[:, :2] * [1, -1] * DOTS / 2
+    np.testing.assert_allclose(sighting.pixels, exact, atol=1.0)  # where the margins are odd
+    shift = (sighting.pixels - exact).mean(0)
+    np.testing.assert_allclose(sighting.pixels - shift, exact, atol=0.01)
+
+
+def test_large_photographs_are_as_exact_as_small_ones(aside):
+    """Found in the reduced picture, refined in the large one, its size no multiple of the reduction."""
+    lens = Lens("PINHOLE", (2251, 1403), (2400.0, 2400.0, 1101.5, 707.0))
+    pose = pose_at(70, 60, 520, 5, (3, 8))
+    sheet = cv2.resize(np.array(page("a4"), np.uint8) * 255, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    H = np.array([[lens.params[0], 0, lens.params[2]], [0, lens.params[1], lens.params[3]], [0, 0, 1]])
+    H = H @ np.linalg.inv(pose)[:3, [0, 1, 3]]
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    place = np.array([[7, 0, sheet.shape[1] / 2], [0, -7, sheet.shape[0] / 2], [0, 0, 1]])
+    picture = cv2.warpPerspective(sheet, half @ H @ np.linalg.inv(half @ place), lens.size, flags=cv2.INTER_LINEAR)
+    sighting = Board().detect(cv2.GaussianBlur(picture, (0, 0), 1.2))
+    exact = (np.column_stack([sighting.points[:, :2], np.ones(len(sighting.ids))])) @ H.T
+    errors = sighting.pixels - exact[:, :2] / exact[:, 2:]
+    assert len(errors) > 80 and np.abs(errors).max() < 0.15 and np.abs(errors.mean(0)).max() < 0.02
+
+
+def test_nothing_and_a_strip_are_no_sighting():
+    random = np.random.default_rng(0)
+    assert Board().detect(random.integers(0, 255, (200, 300, 3)).astype(np.uint8)) is None
+    sheet = np.array(page("a4"), np.uint8) * 255
+    top = (sheet.shape[0] - 13 * 20 * DOTS) // 2
+    strip = np.full_like(sheet, 255)
+    strip[top : top + 2 * 20 * DOTS] = sheet[top : top + 2 * 20 * DOTS]  # two rows of squares: one of corners
+    assert Board().detect(strip) is None
+    strip[: top + 3 * 20 * DOTS] = sheet[: top + 3 * 20 * DOTS]
+    assert len(Board().detect(strip).ids) == 16
+
+
+def test_the_sheet_alone_gives_the_cameras():
+    cameras = {f"{k:02}": (MIDDLE, pose) for k, pose in enumerate(poses(8))}
+    sightings = {name: Board().detect(photograph(*camera)) for name, camera in cameras.items()}
+    ids, points, pixels = sightings["03"]
+    bent = pixels + 30 * np.sin(pixels[:, ::-1] / 40)  # of a sheet that is not flat
+    sightings["03"] = Sighting(ids, points, bent)
+    lens, found, errors = calibrate(sightings, MIDDLE.size)
+    assert found.keys() == errors.keys() == sightings.keys() - {"03"} and max(errors.values()) < 0.2
+    assert lens.model == "SIMPLE_RADIAL" and lens.centre == (240, 180)
+    assert lens.focal[0] == pytest.approx(520, rel=0.005)
+    assert lens.params[3] == pytest.approx(-0.06, abs=0.01)
+    for name, pose in found.items():
+        true = cameras[name][1]
+        assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.01 * np.linalg.norm(true[:3, 3])
+        np.testing.assert_allclose(pose[:3, :3], true[:3, :3], atol=0.01)
+        assert pose[2, 3] > 0 and np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+
+
+def test_two_photographs_are_too_few(aside):
+    two = dict(list(aside[1].items())[:2])
+    with pytest.raises(InputError, match="2 photographs show enough"):
+        calibrate(two, ASIDE.size)
+
+
+def moved(cameras, scale, rotation, shift):
+    """In another frame."""
+    result = {}
+    for name, (lens, pose) in cameras.items():
+        there = np.eye(4)
+        there[:3, :3] = rotation @ pose[:3, :3]
+        there[:3, 3] = scale * rotation @ pose[:3, 3] + shift
+        result[name] = lens, there
+    return result
+
+
+def test_the_sheet_gives_cameras_their_scale_and_frame(aside):
+    cameras, sightings = aside
+    turn = Rotation.from_euler("xyz", [130, -40, 75], degrees=True).as_matrix()
+    elsewhere = moved(cameras, 0.013, turn, np.array([5.0, -3.0, 8.0]))
+    lens, wrong = elsewhere["02"]
+    wrong = wrong.copy()
+    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("xyz", [3, -4, 5], degrees=True).as_matrix()
+    elsewhere["02"] = lens, wrong
+    found = align(sightings | {"without camera": sightings["00"]}, elsewhere)
+    assert found.scale == pytest.approx(1 / 0.013, rel=1e-3)
+    np.testing.assert_allclose(found.rotation, turn.T, atol=1e-3)
+    centres = np.array([elsewhere[name][1][:3, 3] for name in cameras])
+    np.testing.assert_allclose(found(centres), [pose[:3, 3] for _, pose in cameras.values()], atol=0.4)
+    assert found.corners > 60 and 0 < found.rms < 0.1
+
+
+def test_a_sheet_that_was_moved_is_refused(aside):
+    cameras, sightings = aside
+    with pytest.raises(InputError, match="show 0 of its corners together"):
+        align({"00": sightings["00"]}, cameras)
+    mixed = {}
+    for name, (ids, _, pixels) in sightings.items():
+        order = np.random.default_rng(2).permutation(96)  # the same in all: corners are in space, but elsewhere
+        mixed[name] = Sighting(order[ids], Board().points[order[ids]], pixels)
+    with pytest.raises(InputError, match="mm off"):
+        align(mixed, cameras)
+
+
+def test_white_is_the_papers_colour(aside):
+    cameras, sightings = aside
+    picture = photograph(*cameras["00"])
+    linear = ((picture / 255.0) ** 2.2).astype(np.float32)
+    np.testing.assert_allclose(white(linear, sightings["00"]), 0.06 + 0.94 * PAPER, rtol=0.04)
+    few = Sighting(*(part[:6] for part in sightings["00"]))
+    assert white(linear, few) is None
+
+
+def test_white_is_asked_of_white_squares_only():
+    """Markers in red, black squares in green: none of it must be seen."""
+    sheet = np.array(page("a4"))
+    sighting = Board().detect(sheet.astype(np.uint8) * 255)
+    picture = np.zeros((*sheet.shape, 3), np.float32)
+    picture[sheet] = [0.3, 0.6, 0.9]
+    for ids in (sighting.ids, sighting.ids[:16], sighting.ids[40:56]):
+        part = Sighting(ids, sighting.points[ids], sighting.pixels[ids])
+        np.testing.assert_allclose(white(picture, part), [0.3, 0.6, 0.9], rtol=1e-6)
+
+
+@pytest.mark.parametrize("paper, size", [("a4", (210, 297)), ("letter", (215.9, 279.4))])
+def test_the_page_is_true_to_scale(paper, size, tmp_path, capsys):
+    file = tmp_path / "new" / "sheet.pdf"
+    command.main([str(file), "--paper", paper])
+    assert str(file) in capsys.readouterr().out
+    text = file.read_bytes()
+    box = [float(v) for v in re.search(rb"/MediaBox \[(.*?)\]", text)[1].split()]
+    np.testing.assert_allclose(np.array(box[2:]) * 25.4 / 72, size, atol=0.05)  # [mm]
+    width, height = (int(re.search(rb"/%s (\d+)" % key, text)[1]) for key in (b"Width", b"Height"))
+    drawn = [float(v) for v in re.search(rb"q ([\d.]+) 0(?:\.0+)? 0(?:\.0+)? ([\d.]+) ", text).groups()]
+    np.testing.assert_allclose(drawn, box[2:], rtol=1e-5)
+    assert b"CCITTFaxDecode" in text  # without loss
+
+    command.main([str(file.with_suffix(".PNG")), "--paper", paper])
+    with Image.open(file.with_suffix(".PNG")) as picture:
+        assert picture.size == (width, height)
+        dots = np.array(picture.info["dpi"]) / 25.4
+        sheet = np.array(picture)
+    np.testing.assert_allclose(dots, width / (box[2] * 25.4 / 72), rtol=1e-5)
+    top = np.flatnonzero(~sheet.all(1))[0]
+    row = np.flatnonzero(np.diff(sheet[top + 5].astype(int)))  # through the black squares of the first row
+    squares = row[np.append(True, np.diff(row) > 10 * dots[0])]
+    np.testing.assert_allclose((squares[5:] - squares[:-5]) / dots[0], 100, rtol=1e-4)
+    assert row[0] > 8 * dots[0] and top > 8 * dots[1]  # what a printer leaves white
+    below = np.flatnonzero(~sheet.all(1))[-1]
+    assert (below - top) / dots[1] > 260.5 and (len(sheet) - below) / dots[1] > 4  # the line to read
+
+
+@pytest.mark.parametrize("name, what", [("sheet.jpg", "ends in .jpg; must end in .pdf or .png"),
+                                        ("sheet", "ends in nothing; must"),
+                                        ("file.txt/sheet.pdf", "cannot be written")])  # fmt: skip
+def test_what_cannot_be_written_is_one_line(name, what, tmp_path):
+    (tmp_path / "file.txt").touch()
+    with pytest.raises(InputError, match=what) as stop:
+        command.main([str(tmp_path / name)])
+    assert "\n" not in str(stop.value)
