@@ -14,10 +14,19 @@ from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
+from mi_ring.photogrammetry.board import SQUARE, align
 from mi_ring.photogrammetry.folder import find_pictures
-from mi_ring.photogrammetry.motion import Motion, structure_from_motion
+from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.scene import windows, write_shot
-from mi_ring.photogrammetry.workflow import cameras_beside, find_object, require_same_photographs, shots, upright
+from mi_ring.photogrammetry.table import Plane
+from mi_ring.photogrammetry.workflow import (
+    find_cameras,
+    find_object,
+    find_sheet,
+    require_same_photographs,
+    shots,
+    upright,
+)
 from mi_ring.system import command
 from mi_ring.system.files import writing
 
@@ -38,6 +47,14 @@ class PhotosConfig:
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the flash from the lens, in the camera's axes (x right, y down, z forward) [mm with a sheet; else the unit is
     the median distance from the cameras to the object]."""
+    turntable: bool = False
+    """Did the object turn, with the sheet under it, while camera and flash stood?"""
+    square_mm: float = SQUARE
+    """How long a square of the printed sheet is, measured with a ruler over several of them."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.square_mm < np.inf:
+            raise InputError(f"--square-mm: is {self.square_mm}, must be above 0")
 
 
 def progress(things: Iterable, what: str, total: int | None = None) -> Iterable:
@@ -67,11 +84,19 @@ def main(arguments: Sequence[str]) -> int:
         config.out.mkdir(parents=True, exist_ok=True)
     work = config.out / "work"
     require_same_photographs(pictures, work)
-    motion = cameras_beside(pictures) or structure_from_motion(pictures, work, progress)
+    sheet = find_sheet(pictures, config.square_mm, work, progress)
+    motion, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
     print(cameras_report(motion))
-    found = find_object(pictures, motion, work / "masks", progress)
-    motion = upright(motion, found.center, found.up)
-    taken = shots(pictures, motion, found, np.array(config.flash_offset))
+    if sheet:
+        moved = align(sheet.sightings, motion.cameras)
+        motion = motion.moved(moved.scale, moved.rotation, moved.shift)
+        plane = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+        print(f"Sheet: in {len(sheet.sightings)} photographs, {moved.corners} corners, {moved.rms:.2g} mm off")
+    else:
+        print("Sheet: none seen, so that the scale is unknown")
+    found = find_object(pictures, motion, plane, work / "masks", progress)
+    motion = motion if sheet else upright(motion, found.center, found.up)
+    taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     root, writer = scene_element([]), Writer(scene)
     try:
         for shot, window in progress(list(zip(taken, windows(taken))), "writing"):

@@ -16,7 +16,7 @@ from mi_ring.system.optional import need
 
 #: Features are looked for in pictures of so many pixels at most, and so many of them. An evenly lit, smooth object has
 #: few strong ones: weak ones are let in, and what they are worth is told by geometry.
-LONGEST, FEATURES, PEAK = 1600, 8192, 0.003
+LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
 ALL_PAIRS = 150  #: photographs up to which each is compared with each
 NEIGHBOURS, KEYS = 12, 40  #: beyond: with so many before and after, and so many of them with each other
 PAIRS_AT_ONCE = 60

@@ -14,8 +14,9 @@ from mi_ring.images import read_image, write_image
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.photogrammetry import masks
+from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, relative_exposures
-from mi_ring.photogrammetry.motion import Motion, Progress, model_points
+from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
 from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table
 from mi_ring.photogrammetry.views import View, reduced, reduced_all
@@ -24,6 +25,8 @@ from mi_ring.system.files import write_file
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, FINE = 600, 1200  #: pixels at most along the pictures that masks are found in, and that outlines are
+FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
+PAPER = 0.8  #: albedo of white paper
 DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
 
 
@@ -37,22 +40,6 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
         raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, or "
                          "give another DIR")  # fmt: skip
     write_file(known, json.dumps(listed))
-
-
-def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
-    """The cameras that lie beside the photographs in the format of another tool; None if there are none."""
-    source = detect(pictures[0].path.parent)
-    if source is None:
-        return None
-    frames = {frame.image.stem: frame for frame in source.frames()}
-    cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
-    failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
-    if len(cameras) < len(failed):
-        raise InputError(f"{source.src}: has cameras for {len(cameras)} of {len(pictures)} photographs; move it away "
-                         "to have cameras found in the photographs")  # fmt: skip
-    model = Colmap.model(source.src)
-    points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
-    return Motion(cameras, points, None, failed)
 
 
 def upright(motion: Motion, center: np.ndarray, up: np.ndarray | None) -> Motion:
@@ -72,6 +59,94 @@ def rotation_to_z(direction: np.ndarray) -> np.ndarray:
     return Rotation.align_vectors([[0, 0, 1.0]], [direction])[0].as_matrix()
 
 
+class Sheet(NamedTuple):
+    """What photographs show of the printed sheet."""
+
+    sightings: dict[str, Sighting]  #: by the photograph's name
+    white: dict[str, np.ndarray]  #: (3,) linear colour of the paper, by the photograph's name
+
+    def strengths(self, motion: Motion) -> dict[str, np.ndarray]:
+        """Intensities (3,) of lights at the cameras that make the paper as bright as it is, by the photograph's name.
+
+        `motion` is in the frame of the sheet. They are those of the flash, and of the exposure and white balance.
+        """
+        found = {}
+        for name in self.white.keys() & motion.cameras.keys():
+            way = motion.cameras[name][1][:3, 3] - self.sightings[name].points.mean(0)
+            away = np.linalg.norm(way)
+            found[name] = np.pi * self.white[name] / PAPER * away**3 / max(way[2], 1e-9)
+        return found
+
+
+def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progress: Progress) -> Sheet | None:
+    """Where photographs show the sheet, whose squares measure so much [mm]; None if fewer than three do."""
+    kept = folder / "sheet.json"
+    if kept.exists():
+        known = json.loads(kept.read_text("utf-8"))
+    else:
+        known, board = {}, Board(1.0)
+        for picture in progress(pictures, "sheet"):
+            if sighting := board.detect(picture.srgb()):
+                paper = white(picture.linear(), sighting)
+                known[picture.name] = [a.tolist() for a in sighting] + [None if paper is None else paper.tolist()]
+            picture.close()
+        write_file(kept, json.dumps(known))
+    sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, _) in known.items()}
+    if len(sightings) < FEWEST_SIGHTINGS:
+        return None
+    return Sheet(sightings, {name: np.array(paper) for name, (*_, paper) in known.items() if paper})
+
+
+def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
+    """The cameras that lie beside the photographs in the format of another tool; None if there are none."""
+    source = detect(pictures[0].path.parent)
+    if source is None:
+        return None
+    frames = {frame.image.stem: frame for frame in source.frames()}
+    cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
+    failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
+    if len(cameras) < len(failed):
+        raise InputError(f"{source.src}: has cameras for {len(cameras)} of {len(pictures)} photographs; move it away "
+                         "to have cameras found in the photographs")  # fmt: skip
+    model = Colmap.model(source.src)
+    points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
+    return Motion(cameras, points, None, failed)
+
+
+def find_cameras(
+    pictures: Sequence[Picture], sheet: Sheet | None, turntable: bool, folder: Path, progress: Progress
+) -> Motion:
+    """Cameras: those that lie beside the photographs, else from structure from motion, else from the sheet.
+
+    On a turntable structure from motion would take the room that stands still for the object.
+    """
+    if turntable:
+        if sheet is None:
+            raise InputError(f"{pictures[0].path.parent}: --turntable: the sheet of `mi-ring board` must turn with the "
+                             "object; fewer than three photographs show it")  # fmt: skip
+        return cameras_of_sheet(pictures, sheet)
+    if beside := cameras_beside(pictures):
+        return beside
+    try:
+        return structure_from_motion(pictures, folder, progress)
+    except InputError:
+        if sheet is None or len(sheet.sightings) < len(pictures) / 2:
+            raise
+        return cameras_of_sheet(pictures, sheet)
+
+
+def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
+    """Cameras from the sheet alone, in its frame [mm]: of objects without texture, and on turntables."""
+    sizes = [picture.size for picture in pictures]
+    size = max(set(sizes), key=sizes.count)
+    names = {picture.name for picture in pictures if picture.size == size}
+    lens, poses, errors = calibrate({n: s for n, s in sheet.sightings.items() if n in names}, size)
+    why = "does not show enough of the sheet, or is of another size"
+    failed = {picture.name: why for picture in pictures if picture.name not in poses}
+    cameras = {name: (lens, pose) for name, pose in poses.items()}
+    return Motion(cameras, np.zeros((0, 3)), float(np.mean(list(errors.values()))), failed)
+
+
 class Object(NamedTuple):
     """The object as the photographs show it."""
 
@@ -81,8 +156,10 @@ class Object(NamedTuple):
     up: np.ndarray | None  #: (3,) the normal of the table that it stands on, if there is one
 
 
-def find_object(pictures: Sequence[Picture], motion: Motion, folder: Path, progress: Progress) -> Object:
-    """The object and its masks.
+def find_object(
+    pictures: Sequence[Picture], motion: Motion, plane: Plane | None, folder: Path, progress: Progress
+) -> Object:
+    """The object and its masks. `plane`: the table's, if it is known.
 
     Masks that `folder` has already are taken as they are; anybody may have painted in them.
     """
@@ -94,7 +171,9 @@ def find_object(pictures: Sequence[Picture], motion: Motion, folder: Path, progr
         return Object(masks_, np.array(known["center"]), known["level"], known["up"] and np.array(known["up"]))
     views = reduced_all(pictures, motion.cameras, COARSE)
     space = masks.Space.seen_by(views)
-    plane = find_plane(motion.points, np.stack([v.camera.position for v in views]), space.center, space.axis[-1])
+    if plane is None:
+        positions = np.stack([view.camera.position for view in views])
+        plane = find_plane(motion.points, positions, space.center, space.axis[-1])
     found, guesses = settle_any(views, space, plane, progress)
     if found is None:
         raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
@@ -136,16 +215,19 @@ def settle_any(
     return None, []
 
 
-def shots(pictures: Sequence[Picture], motion: Motion, object_: Object, flash: np.ndarray) -> list[Shot]:
+def shots(
+    pictures: Sequence[Picture], motion: Motion, object_: Object, flash: np.ndarray, sheet: Sheet | None
+) -> list[Shot]:
     """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units].
 
-    How strong it is, is not known, and made to be so weak that fits see that it is not.
+    The sheet tells how strong it is. Without one that is not known, and it is made so weak that fits see that it isn't.
     """
-    strength = np.pi * object_.level / DIM
+    known = sheet.strengths(motion) if sheet else {}
+    usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM)
     result = []
     for picture, exposure in zip(pictures, relative_exposures(pictures)):
         if picture.name in motion.cameras:
             lens, pose = motion.cameras[picture.name]
-            light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], np.full(3, exposure * strength))
+            light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], known.get(picture.name, exposure * usual))
             result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
     return result
