@@ -179,6 +179,16 @@ def test_no_masks_are_found_in_a_bright_room(broken_capture):
     assert scene.threshold is None and scene.masks == [None] * 12
 
 
+def test_a_room_is_lit_where_more_is_seen_than_the_object(small_capture, broken_capture):
+    assert not loading.load_capture(small_capture).lit_room
+    path, _ = broken_capture
+    for image in (path.parent / "images").iterdir():
+        pixels = images.read_image(image)
+        images.write_image(np.maximum(pixels, 40), image)
+    assert loading.load_capture(path).lit_room
+    assert not loading.load_capture(path, masks="none").lit_room  # without masks nobody knows
+
+
 def test_a_photograph_that_the_light_missed_gets_no_mask(broken_capture):
     path, _ = broken_capture
     missed = np.zeros((40, 56, 3), np.uint8)

@@ -24,7 +24,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting import checkpoint, optimizers, session, start, terms
 from mi_ring.fitting.config import PRESETS, Config
-from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.fit import LAG, Fit
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
@@ -593,6 +593,32 @@ def test_regulariser_is_relaxed_and_nothing_else():
     it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04), calm=0.5))
     assert terms.default_terms["velocity"].schedule(it) == pytest.approx(0.2)
     assert all(term.schedule is None for name, term in terms.default_terms.items() if name != "velocity")
+
+
+def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up():
+    ball = trimesh.creation.icosphere(2)
+    two = ball + trimesh.creation.icosphere(2).apply_translation([0.5, 0, 0])
+    state = SimpleNamespace(iterations=100, crossing=0.0, calm=0.0)
+
+    def go(number, mesh):
+        vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
+        Fit.hold(state, SimpleNamespace(number=number, vertices=vertices, faces=faces))
+
+    for number in range(1, 41):
+        go(number, ball)
+    assert state.calm == pytest.approx(0.4) and state.crossing == 0
+    for number in range(41, 61):
+        go(number, two)
+    assert state.crossing > 0.05  # counted in the last iteration of them
+    for number in range(61, 66):
+        go(number, two)
+    assert state.calm == pytest.approx(0.59 - 0.02 - 5 * 0.02)
+    for number in range(66, 80):
+        go(number, two)
+    assert state.calm == pytest.approx(0.79 - LAG)
+    for number in range(80, 100):
+        go(number, ball)
+    assert state.calm == pytest.approx(0.79 - LAG + 20 * 0.03)
 
 
 def test_help_names_every_option(capsys):

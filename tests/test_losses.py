@@ -100,3 +100,14 @@ def test_pixels_that_say_nothing_have_no_part_in_the_mask_loss():
     coverage, mask = torch.tensor([[[0.5, 1.0, 0.0]]]), torch.tensor([[[0.0, 0.0, 0.0]]])
     valid = torch.tensor([[[True, False, True]]])
     assert terms.mask_loss(coverage, mask, 0.1, valid).item() == pytest.approx(0.25 / 3)
+
+
+def test_pixels_that_say_nothing_have_no_part_in_the_colour_loss():
+    predicted, observed = torch.rand(1, 2, 3, 3), torch.rand(1, 2, 3, 3)
+    telling = torch.tensor([[[True, False, True], [False, False, True]]])
+    clipped = torch.zeros(1, 2, 3, 3, dtype=torch.bool)
+    loss = terms.rgb_loss(predicted, observed, clipped, 0.5, "l1", telling)
+    expected = sum(
+        float((predicted - observed)[0, y, x].abs().sum()) / 0.5 for y in range(2) for x in range(3) if telling[0, y, x]
+    )
+    assert loss.item() == pytest.approx(expected / 18, rel=1e-5)
