@@ -1,6 +1,5 @@
 """The printed sheet of markers: its page, where photographs show it, and what that tells: scale, cameras, white."""
 
-import itertools
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
@@ -73,7 +72,9 @@ class Board:
         corner = np.arange((COLUMNS - 1) * (ROWS - 1))
         x, y = corner % (COLUMNS - 1) + 1 - COLUMNS / 2, ROWS / 2 - 1 - corner // (COLUMNS - 1)
         self.points = square * np.stack([x, y, 0 * x], 1)  #: (96, 3) of all corners
-        self.detector = cv2.aruco.CharucoDetector(charuco())
+        params = cv2.aruco.CharucoParameters()
+        params.tryRefineMarkers = True  # small ones are read where the others say that they are
+        self.detector = cv2.aruco.CharucoDetector(charuco(), params)
 
     def detect(self, picture: np.ndarray) -> Sighting | None:
         """Where a photograph (H, W, 3) or (H, W) uint8 shows the sheet; None where it shows too little of it."""
@@ -178,9 +179,9 @@ def align(sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, P
     keep = consistent(found, true)
     for _ in range(3):
         scale, rotation, shift = umeyama(found[keep], true[keep])
-        off = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
-        keep = off <= max(4 * float(np.median(off)), 1e-6 * np.ptp(true))
-    rms, width = float(np.sqrt(np.mean(off[keep] ** 2))), float(np.ptp(true[keep], 0).max())
+        away = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
+        keep = away <= max(4 * float(np.median(away)), 1e-6 * np.ptp(true))
+    rms, width = float(np.sqrt(np.mean(away[keep] ** 2))), float(np.ptp(true[keep], 0).max())
     if keep.sum() < FEWEST or not rms < FIT * width:
         raise InputError(f"sheet of markers: its corners are {rms:.2g} mm off in {width:.0f} mm; is it flat, did it "
                          "stay in its place, and is there only one?")  # fmt: skip
@@ -193,7 +194,7 @@ def triangulate(
     """Of each corner that two photographs or more agree on: where it is for the cameras (3,), and on the sheet (3,)."""
     rays: dict[int, list[tuple[np.ndarray, np.ndarray, float]]] = {}  # origins, directions, what they may be off
     places: dict[int, np.ndarray] = {}
-    for name in sightings.keys() & cameras.keys():
+    for name in filter(cameras.__contains__, sightings):
         (lens, pose), sighting = cameras[name], sightings[name]
         local = np.column_stack([lens.colmap.cam_from_img(sighting.pixels), np.ones(len(sighting.ids))])
         directions = local / np.linalg.norm(local, axis=1, keepdims=True) @ pose[:3, :3].T
@@ -204,7 +205,7 @@ def triangulate(
     random = np.random.default_rng(0)
     for corner in sorted(rays):
         origins, directions, allowed = (np.array(a) for a in zip(*rays[corner]))
-        pairs = np.array(list(itertools.combinations(range(len(origins)), 2))).reshape(-1, 2)
+        pairs = np.stack(np.triu_indices(len(origins), 1), 1)
         pairs = random.permutation(pairs[np.linalg.norm(np.cross(*directions[pairs.T]), axis=1) > 0.02])[:100]
         if not len(pairs):
             continue
