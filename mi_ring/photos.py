@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -20,6 +20,7 @@ from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.scene import windows, write_shot
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
+    Hints,
     find_cameras,
     find_object,
     find_sheet,
@@ -49,6 +50,12 @@ class PhotosConfig:
     the median distance from the cameras to the object]."""
     turntable: bool = False
     """Did the object turn, with the sheet under it, while camera and flash stood?"""
+    masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
+    """auto: find masks; alpha: the photographs' alpha channels; rembg: by the package of that name, if it is installed;
+    else a folder of masks, each called like its photograph with .png added, or instead of its suffix."""
+    box: tuple[float, float, float, float, float, float] | None = None
+    """Lowest and highest x, y and z of the object, XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, in the frame of the sheet [mm], to
+    cut off what belongs to it in the photographs but should not."""
     square_mm: float = SQUARE
     """How long a square of the printed sheet is, measured with a ruler over several of them."""
 
@@ -85,6 +92,8 @@ def main(arguments: Sequence[str]) -> int:
     work = config.out / "work"
     require_same_photographs(pictures, work)
     sheet = find_sheet(pictures, config.square_mm, work, progress)
+    if config.box and not sheet:
+        raise InputError(f"--box: is in the frame of the sheet of `mi-ring board`, which {config.folder} does not show")
     motion, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
     print(cameras_report(motion))
     if sheet:
@@ -94,7 +103,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"Sheet: in {len(sheet.sightings)} photographs, {moved.corners} corners, {moved.rms:.2g} mm off")
     else:
         print("Sheet: none seen, so that the scale is unknown")
-    found = find_object(pictures, motion, plane, work / "masks", progress)
+    hints = Hints(plane, config.box, config.masks)
+    found = find_object(pictures, motion, hints, work / "masks", progress)
     motion = motion if sheet else upright(motion, found.center, found.up)
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     root, writer = scene_element([]), Writer(scene)

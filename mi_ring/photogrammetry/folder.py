@@ -89,6 +89,27 @@ class Picture:
         value = np.arange(np.iinfo(rgb.dtype).max + 1, dtype=np.float32) / np.iinfo(rgb.dtype).max
         return (value if self.encoding == "linear" else srgb_to_linear(value))[rgb]
 
+    def mask(self, source: str | Path) -> np.ndarray | None:
+        """The object as the user brings it, (H, W) uint8, 255 the object; None if this photograph has none.
+
+        `source`: "alpha", the channel of the photograph itself; "rembg", what that package thinks; else a folder with
+        masks called like the photographs. Raises InputError if one cannot be had or is of another size.
+        """
+        if source == "alpha":
+            alpha = self.pixels[:, :, 3] if self.pixels.shape[2] == 4 else None
+            return None if alpha is None else (alpha // (np.iinfo(alpha.dtype).max // 255)).astype(np.uint8)
+        if source == "rembg":
+            return np.array(need("rembg", "--masks rembg").remove(Image.fromarray(self.srgb()), only_mask=True))
+        names = (f"{self.path.name}.png", f"{self.name}.png")
+        file = next((f for name in names if (f := Path(source) / name).is_file()), None)
+        if file is None:
+            return None
+        mask = read_as(file, "mask", read_image)[:, :, 0]
+        if mask.shape[::-1] != self.size:
+            sizes = *mask.shape[::-1], *self.size
+            raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
+        return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
+
     def close(self) -> None:
         """Let go of the pixels."""
         self.__dict__.pop("pixels", None)

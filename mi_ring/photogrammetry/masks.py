@@ -69,6 +69,13 @@ class Space:
         half = np.median([min(camera.size) / 2 / camera.focal.max() for camera in cameras])
         return cls(views, center, 1.2 * float(np.median(np.linalg.norm(origins - center, axis=1)) * half))
 
+    @classmethod
+    def of(cls, views: Sequence[View], space: "Space") -> "Space":
+        """The same for other views."""
+        result = cls(views, space.center, float(space.axis[-1]))
+        result.allowed = space.allowed
+        return result
+
     def vote(self, masks: Sequence[np.ndarray]) -> Body | None:
         """The largest piece of what most masks (H, W) call object; None if there is nothing."""
         yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
@@ -155,11 +162,14 @@ def settle(space: Space, guesses: Sequence[np.ndarray], progress: Progress) -> F
     return Found(masks, body, [overlap(m, body.coverage(view)) for m, view in zip(masks, space.views)])
 
 
+def resized(mask: np.ndarray, view: View) -> np.ndarray:
+    """A mask of another size as large as the view: (H, W) bool."""
+    return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
+
+
 def sharpen(view: View, mask: np.ndarray) -> np.ndarray:
     """The outline of a mask of another size, found anew in a larger picture: (H, W) uint8."""
-    height, width = view.shown.shape
-    large = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return grabcut(view, (large > 0.5).astype(np.uint8), FINE_BAND)
+    return grabcut(view, resized(mask, view).astype(np.uint8), FINE_BAND)
 
 
 def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:

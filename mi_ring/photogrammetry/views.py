@@ -58,6 +58,18 @@ def reduced(picture: Picture, lens: Lens, pose: np.ndarray, longest: int) -> Vie
     return View(picture.name, straight, shown > 0, camera)
 
 
+def reduced_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
+    """A mask (H, W) uint8 of a photograph, as `reduced` has the photograph: (h, w) uint8, 1 where it is above half."""
+    scale = -(-max(lens.size) // longest)
+    window = whole(lens, scale)
+    small = cv2.resize(mask[: window.height * scale, : window.width * scale], (window.width, window.height),
+                       interpolation=cv2.INTER_AREA)  # fmt: skip
+    if not lens.is_pinhole:
+        places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
+        small = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
+    return (small > 127).astype(np.uint8)
+
+
 def reduced_all(
     pictures: Sequence[Picture], cameras: Mapping[str, tuple[Lens, np.ndarray]], longest: int
 ) -> list[View]:

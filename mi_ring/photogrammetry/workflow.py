@@ -19,7 +19,7 @@ from mi_ring.photogrammetry.folder import Picture, relative_exposures
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
 from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table
-from mi_ring.photogrammetry.views import View, reduced, reduced_all
+from mi_ring.photogrammetry.views import View, reduced, reduced_all, reduced_mask
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 
@@ -156,10 +156,18 @@ class Object(NamedTuple):
     up: np.ndarray | None  #: (3,) the normal of the table that it stands on, if there is one
 
 
+class Hints(NamedTuple):
+    """What is known of the object beforehand."""
+
+    plane: Plane | None = None  #: of the table
+    box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
+    masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
+
+
 def find_object(
-    pictures: Sequence[Picture], motion: Motion, plane: Plane | None, folder: Path, progress: Progress
+    pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress
 ) -> Object:
-    """The object and its masks. `plane`: the table's, if it is known.
+    """The object and its masks.
 
     Masks that `folder` has already are taken as they are; anybody may have painted in them.
     """
@@ -171,31 +179,69 @@ def find_object(
         return Object(masks_, np.array(known["center"]), known["level"], known["up"] and np.array(known["up"]))
     views = reduced_all(pictures, motion.cameras, COARSE)
     space = masks.Space.seen_by(views)
+    if hints.box:
+        low, high = np.reshape(hints.box, (3, 2)).T
+        space.allowed = ((space.grid >= low) & (space.grid <= high)).all(1)
+    plane = hints.plane
     if plane is None:
         positions = np.stack([view.camera.position for view in views])
         plane = find_plane(motion.points, positions, space.center, space.axis[-1])
-    found, guesses = settle_any(views, space, plane, progress)
-    if found is None:
-        raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
-                         "nor one that the flash lights more than what is around it")  # fmt: skip
-    sure: dict[str, np.ndarray] = {}
-    by_name = {picture.name: picture for picture in pictures}
-    for view, mask, guess, agreed in progress(list(zip(views, found.masks, guesses, found.agreement)), "outlines"):
-        large = reduced(by_name[view.name], *motion.cameras[view.name], FINE)
-        by_name[view.name].close()
-        fine = masks.sharpen(large, mask)
-        maybe = cv2.resize(masks.unsure(mask, guess), fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-        shades = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
-        write_image(shades[..., None], folder / f"{view.name}.png")
-        if agreed >= SURE:
-            sure[view.name] = shades
-    levels = [view.linear[mask > 0].mean() for view, mask in zip(views, found.masks) if mask.any()]
-    result = Object(sure, found.body.points.mean(0), float(np.median(levels)), plane and plane.normal)
+    shown = [picture for picture in pictures if picture.name in motion.cameras]
+    if hints.masks == "auto":
+        body, shades = searched(shown, motion, views, space, plane, progress)
+    else:
+        body, shades = brought(shown, motion, space, hints.masks, progress)
+    for name, mask in shades.items():
+        write_image(mask[..., None], folder / f"{name}.png")
+    small = {view.name: masks.resized(shades[view.name] == OBJECT, view) for view in views if view.name in shades}
+    levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
+    result = Object(shades, body.points.mean(0), float(np.median(levels)), plane and plane.normal)
     write_file(kept, json.dumps({
-        "sure": list(sure), "center": result.center.tolist(), "level": result.level,
+        "sure": list(shades), "center": result.center.tolist(), "level": result.level,
         "up": None if result.up is None else result.up.tolist(),
     }))  # fmt: skip
     return result
+
+
+def brought(
+    pictures: Sequence[Picture], motion: Motion, space: masks.Space, source: str | Path, progress: Progress
+) -> tuple[masks.Body, dict[str, np.ndarray]]:
+    """What the user's masks say the object is, and these masks by name, as `Object` has them."""
+    shades = {}
+    for picture in progress(pictures, "masks"):
+        mask = picture.mask(source)
+        picture.close()
+        if mask is not None:
+            shades[picture.name] = OBJECT * reduced_mask(mask, motion.cameras[picture.name][0], FINE)
+    if len(shades) < len(pictures) / 2:
+        raise InputError(f"--masks: {source}: has masks for {len(shades)} of {len(pictures)} photographs; they must be "
+                         "called like the photographs, with .png added or instead of the suffix")  # fmt: skip
+    space = masks.Space.of([view for view in space.views if view.name in shades], space)
+    body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views])
+    if body is None:
+        raise InputError(f"--masks: {source}: no point in space is inside most of these masks; are they of these "
+                         "photographs?")  # fmt: skip
+    return body, shades
+
+
+def searched(
+    pictures: Sequence[Picture], motion: Motion, views: Sequence[View], space: masks.Space, plane: Plane | None,
+    progress: Progress,
+) -> tuple[masks.Body, dict[str, np.ndarray]]:  # fmt: skip
+    """The object and masks of all photographs but those that are not sure, found in the photographs."""
+    found, guesses = settle_any(views, space, plane, progress)
+    if found is None:
+        raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
+                         "nor one that the flash lights more than what is around it; give --masks")  # fmt: skip
+    shades = {}
+    found_of = zip(pictures, found.masks, guesses, found.agreement)
+    for picture, mask, guess, agreed in progress(found_of, "outlines", len(pictures)):
+        if agreed >= SURE:
+            fine = masks.sharpen(reduced(picture, *motion.cameras[picture.name], FINE), mask)
+            maybe = cv2.resize(masks.unsure(mask, guess), fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+            shades[picture.name] = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
+            picture.close()
+    return found.body, shades
 
 
 def settle_any(
@@ -205,8 +251,8 @@ def settle_any(
     ways = []
     if plane:
         above = plane.height(space.grid) > 2 * FLAT * np.linalg.norm(views[0].camera.position - space.center)
-        ways.append((lambda: not_table(views, plane, space.center, space.axis[-1]), above))
-    ways.append((lambda: [masks.bright(view) for view in views], np.ones(len(space.grid), bool)))
+        ways.append((lambda: not_table(views, plane, space.center, space.axis[-1]), space.allowed & above))
+    ways.append((lambda: [masks.bright(view) for view in views], space.allowed))
     for guess, allowed in ways:
         space.allowed, guesses = allowed, guess()
         found = masks.settle(space, guesses, progress)
