@@ -24,7 +24,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting import checkpoint, optimizers, session, start, terms
 from mi_ring.fitting.config import PRESETS, Config
-from mi_ring.fitting.fit import LAG, Fit
+from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
@@ -598,27 +598,29 @@ def test_regulariser_is_relaxed_and_nothing_else():
 def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up():
     ball = trimesh.creation.icosphere(2)
     two = ball + trimesh.creation.icosphere(2).apply_translation([0.5, 0, 0])
-    state = SimpleNamespace(iterations=100, crossing=0.0, calm=0.0)
+    stages = [SimpleNamespace(last=40), SimpleNamespace(last=200)]
+    state = SimpleNamespace(iterations=200, stages=stages, crossing=0.0, calm=0.0, held=0)
 
-    def go(number, mesh):
-        vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
-        Fit.hold(state, SimpleNamespace(number=number, vertices=vertices, faces=faces))
+    def go(numbers, mesh):
+        for number in numbers:
+            vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
+            Fit.hold(state, SimpleNamespace(number=number, vertices=vertices, faces=faces))
 
-    for number in range(1, 41):
-        go(number, ball)
-    assert state.calm == pytest.approx(0.4) and state.crossing == 0
-    for number in range(41, 61):
-        go(number, two)
-    assert state.crossing > 0.05  # counted in the last iteration of them
-    for number in range(61, 66):
-        go(number, two)
-    assert state.calm == pytest.approx(0.59 - 0.02 - 5 * 0.02)
-    for number in range(66, 80):
-        go(number, two)
-    assert state.calm == pytest.approx(0.79 - LAG)
-    for number in range(80, 100):
-        go(number, ball)
-    assert state.calm == pytest.approx(0.79 - LAG + 20 * 0.03)
+    go(range(1, 41), two)
+    assert state.calm == pytest.approx(0.2) and state.held == 0  # limbs that grow cross in passing
+    go(range(41, 61), ball)
+    assert state.calm == pytest.approx(0.2 - 19 * 0.01 + 0.015)  # it was still crossing when last counted
+    go(range(61, 81), two)
+    assert state.held == 1 and state.crossing > 0.05
+    go(range(81, 160), two)
+    assert state.calm == pytest.approx(-0.3)
+    go(range(160, 181), ball)
+    assert state.calm == pytest.approx(-0.3 + 21 * 0.015)
+    go(range(181, 201), two)
+    assert state.held == 2 and state.calm == pytest.approx(0.015 + 19 * 0.015 - 0.01)
+    state.crossing = 0.0
+    go([201], ball)
+    assert state.calm == pytest.approx(0.29 + 0.0075)
 
 
 def test_help_names_every_option(capsys):

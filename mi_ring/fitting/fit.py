@@ -36,7 +36,7 @@ RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage",
 CROSSING = 5e-4  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
 CROSSING_EVERY = 20  #: iterations between counts of them
 STRONGEST = -0.3  #: the least `calm`
-RETREAT, CATCH_UP = 2.0, 3.0  #: how fast it strengthens then, and weakens after the first time, for one by which it would
+RETREAT, CATCH_UP = 2.0, 3.0  #: how fast it strengthens then, and weakens after the first time; 1 is as planned
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
