@@ -33,10 +33,11 @@ from mi_ring.system.machine import autocast, device
 LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing"}
-CROSSING = 5e-4  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
+CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
 CROSSING_EVERY = 20  #: iterations between counts of them
 STRONGEST = -0.3  #: the least `calm`
-RETREAT, CATCH_UP = 2.0, 3.0  #: how fast it strengthens then, and weakens after the first time; 1 is as planned
+RETREAT, CATCH_UP = 2.0, 3.0  #: how fast the regulariser strengthens then, and weakens afterwards; 1 is as planned
+LATE = 0.6  #: progress after which a surface that crosses itself says that the regulariser is too weak
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -95,7 +96,7 @@ class Fit:
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.crossing: float = 0.0  #: share of the triangles that cross others, when they were counted last
         self.calm: float = 0.0  #: how far the regulariser has weakened: like `progress`, but for holding back
-        self.held = 0  # how many times
+        self.held = False  # did it cross itself late?
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
@@ -239,17 +240,17 @@ class Fit:
     def hold(self, it: Iteration) -> None:
         """Let the regulariser weaken as the fit goes on; hold it and strengthen it while the surface crosses itself.
 
-        Where photographs disagree with the model a weak one lets the surface fold. Limbs that grow cross in passing:
-        in the first stage that does not count, and afterwards the regulariser catches up, each time more slowly.
+        Where photographs disagree with the model a weak one lets the surface fold. Limbs that grow cross in passing,
+        early: afterwards the regulariser catches up with its plan. Where they cross late it does not.
         """
-        step, late = 1 / self.iterations, it.number > self.stages[0].last or len(self.stages) == 1
+        step = 1 / self.iterations
         if it.number % CROSSING_EVERY == 0:
-            before, self.crossing = self.crossing, float(crossing_triangles(it.vertices.cpu().numpy(), it.faces).mean())
-            self.held += late and self.crossing > CROSSING >= before
-        if late and self.crossing > CROSSING:
+            self.crossing = float(crossing_triangles(it.vertices.cpu().numpy(), it.faces).mean())
+            self.held |= self.crossing > CROSSING and it.progress > LATE
+        if self.crossing > CROSSING:
             self.calm = max(STRONGEST, self.calm - RETREAT * step)
         else:
-            self.calm = min(it.number * step, self.calm + max(1.0, CATCH_UP / max(1, self.held)) * step)
+            self.calm = min(it.number * step, self.calm + (1.0 if self.held else CATCH_UP) * step)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.

@@ -153,12 +153,15 @@ def adjust(model: Any) -> None:
     alone they would bend all cameras.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # which mapping has changed
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
+    config = pycolmap.BundleAdjustmentConfig()
+    for k in model.reg_image_ids():
+        config.add_image(k)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
-        pycolmap.bundle_adjustment(model, options)
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
             break
 
