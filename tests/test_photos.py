@@ -1,0 +1,143 @@
+"""The command that makes a capture of a folder of photographs, and the stages of its way."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from test_photogrammetry import CENTER, LENS, hit_ellipsoid, in_a_dim_room, poses
+
+from mi_ring import photos
+from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
+from mi_ring.photogrammetry.board import Sighting
+from mi_ring.photogrammetry.folder import Picture, relative_exposures
+from mi_ring.photogrammetry.motion import Motion
+from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.workflow import PAPER, Sheet, upright
+from mi_ring.system import command
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Photographs of an ellipsoid in a dim room with lamps, and their cameras as transforms.json."""
+    random, frames = np.random.default_rng(3), []
+    (tmp_path / "photographs").mkdir()
+    (fx, fy), (cx, cy) = LENS.focal, LENS.centre
+    for k, pose in enumerate(poses(20)):
+        rgb, _ = in_a_dim_room(pose, random)
+        Image.fromarray(rgb.astype(np.uint8)).save(tmp_path / f"photographs/{k:02}.png")
+        frames.append({"file_path": f"{k:02}.png", "transform_matrix": (pose @ OPENGL).tolist()})
+    top = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 160, "h": 120, "frames": frames}
+    (tmp_path / "photographs/transforms.json").write_text(json.dumps(top))
+    return tmp_path / "photographs"
+
+
+def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
+    out = tmp_path / "capture"
+    assert photos.main([str(folder), str(out), "--flash-offset", "0.1", "-0.05", "0"]) == 0
+    text = capsys.readouterr().out
+    assert "Cameras: 20 of 20 photographs, as given" in text and "Nothing to mend found" in text
+    capture = load_capture(out / "scene.xml")
+    assert len(capture) == 20 and all(mask is not None for mask in capture.masks)
+    center, radius = capture.sphere()
+    np.testing.assert_allclose(center, 0, atol=0.02)
+    assert 1.0 < 18 * radius / 2.5 < 1.7  # of the ellipsoid's mean axis; the unit is the distance of the cameras
+    distances = [np.linalg.norm(sensor.camera.position) for sensor in capture.sensors]
+    assert np.median(distances) == pytest.approx(1, abs=0.02)
+    camera, light = capture.sensors[3].camera, capture.photographs.lights.positions()[3]
+    local = camera.to_world[:3, :3].T @ (light - camera.position)
+    np.testing.assert_allclose(local, [-0.1, 0.05, 0], atol=1e-5)  # Mitsuba's axes
+    assert capture.reflectance(np.zeros(3), capture.exposure()) * np.pi > 1.5  # not known: interreflection is left out
+    with pytest.raises(InputError, match="exists already"):
+        photos.main([str(folder), str(out)])
+    (out / "scene.xml").unlink()
+    for name in ("images", "masks", "valid"):
+        for file in (out / name).glob("*"):
+            file.unlink()
+    before = {file: file.stat().st_mtime_ns for file in (out / "work/masks").iterdir()}
+    assert photos.main([str(folder), str(out)]) == 0  # from what is in work/
+    assert before == {file: file.stat().st_mtime_ns for file in (out / "work/masks").iterdir()}
+    (folder / "07.png").unlink()
+    (out / "scene.xml").unlink()
+    with pytest.raises(InputError, match="work: is of other photographs"):
+        photos.main([str(folder), str(out)])
+
+
+def test_masks_that_the_user_brings(folder, tmp_path):
+    brought = tmp_path / "masks"
+    brought.mkdir()
+    for k, pose in enumerate(poses(20)):
+        mask = np.isfinite(hit_ellipsoid(camera_of(LENS, pose))[0]).reshape(120, 160)
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(brought / f"{k:02}.png.png")
+    assert photos.main([str(folder), str(tmp_path / "capture"), "--masks", str(brought)]) == 0
+    capture = load_capture(tmp_path / "capture/scene.xml")
+    first = next(poses(20))
+    inside = np.isfinite(hit_ellipsoid(camera_of(LENS, first))[0]).sum()
+    assert (capture.masks[0] > 127).sum() == inside
+    for file in list(brought.iterdir())[8:]:
+        file.unlink()
+    with pytest.raises(InputError, match=r"--masks: .*masks: has masks for 8 of 20 photographs"):
+        photos.main([str(folder), str(tmp_path / "other"), "--masks", str(brought)])
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["nowhere", "out"], "nowhere: FOLDER: no such folder"),
+    (["{folder}", "out", "--square-mm", "0"], "--square-mm: is 0"),
+    (["{folder}", "out", "--turntable"], "--turntable: the sheet"),
+    (["{folder}", "out", "--box", "0", "1", "0", "1", "0", "1"], "--box: is in the frame of the sheet"),
+])  # fmt: skip
+def test_mistakes_of_the_user(arguments, words, folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.photos", photos.main, [a.format(folder=folder) for a in arguments])
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert stop.value.code == 2 and words in message
+
+
+def test_the_sheet_tells_how_strong_the_flash_is():
+    """Paper of that albedo under a light of known strength is as bright as Lambert's law says."""
+    pose = np.eye(4)
+    pose[:3, 3] = [30.0, -40.0, 300.0]
+    rgb = np.array([2e5, 1.5e5, 1e5])
+    place = np.array([10.0, 20.0, 0.0])
+    way = pose[:3, 3] - place
+    radiance = PAPER / np.pi * rgb * (way[2] / np.linalg.norm(way)) / (way @ way)
+    around = np.array([[9, 9, 0], [-9, 9, 0], [9, -9, 0], [-9, -9, 0.0]])
+    sighting = Sighting(np.arange(4), place + around, np.zeros((4, 2)))
+    sheet = Sheet({"a": sighting}, {"a": radiance})
+    np.testing.assert_allclose(sheet.strengths(Motion({"a": (LENS, pose)}, np.zeros((0, 3)), None, {}))["a"], rgb)
+
+
+def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin():
+    turn = Rotation.from_euler("xyz", [70, 20, -30], degrees=True).as_matrix()
+    cameras = {}
+    for k, pose in enumerate(poses(12)):
+        turned = np.eye(4)
+        turned[:3, :3], turned[:3, 3] = turn @ pose[:3, :3], turn @ pose[:3, 3]
+        cameras[str(k)] = LENS, turned
+    motion = Motion(cameras, (turn @ CENTER)[None], None, {})
+    moved = upright(motion, turn @ CENTER, None)
+    np.testing.assert_allclose(moved.points, 0, atol=1e-9)
+    heights = [pose[2, 3] for _, pose in moved.cameras.values()]
+    distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
+    assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
+    exact = upright(motion, turn @ CENTER, turn[:, 2])
+    for (_, pose), before in zip(exact.cameras.values(), poses(12)):
+        assert pose[2, 1] == pytest.approx(before[2, 1])  # how much the photograph's down is the world's up
+
+
+def test_exposures_of_exif(tmp_path):
+    pictures = []
+    for k, seconds in enumerate((0.01, 0.02, 0.02, 0.05)):
+        image = Image.new("RGB", (8, 6))
+        exif = image.getexif()
+        exif.get_ifd(0x8769).update({33434: seconds, 34855: 100, 33437: 4.0})
+        image.save(tmp_path / f"{k}.jpg", exif=exif)
+        pictures.append(Picture(tmp_path / f"{k}.jpg"))
+    np.testing.assert_allclose(relative_exposures(pictures), [0.5, 1, 1, 2.5], rtol=1e-3)
+    Image.new("RGB", (8, 6)).save(tmp_path / "none.jpg")
+    np.testing.assert_array_equal(relative_exposures([*pictures, Picture(tmp_path / "none.jpg")]), np.ones(5))
