@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
-from scipy.stats import theilslopes
+from scipy import ndimage, stats
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.masks import dark_threshold
@@ -102,7 +101,7 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
     level = brightness * received
-    _, _, _, steepest = theilslopes(level, received)
+    _, _, _, steepest = stats.theilslopes(level, received)
     rest = np.median(level - steepest * received)
     return float(max(0.0, rest / np.median(level)))
 
