@@ -105,9 +105,12 @@ def main(arguments: Sequence[str]) -> int:
         print("Sheet: none seen, so that the scale is unknown")
     hints = Hints(plane, config.box, config.masks)
     found = find_object(pictures, motion, hints, work / "masks", progress)
-    motion = motion if sheet else upright(motion, found.center, found.up)
+    plane = found.plane
+    if not sheet:
+        motion, plane = upright(motion, found.center, plane)
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
-    root, writer = scene_element([]), Writer(scene)
+    ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
+    root, writer = scene_element([], ground), Writer(scene)
     try:
         for shot, window in progress(list(zip(taken, windows(taken))), "writing"):
             root.append(write_shot(writer, shot, window))

@@ -11,8 +11,13 @@ from conftest import AXES, CENTER
 
 from mi_ring import images
 from mi_ring.capture import capture, decoding, loading
+from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
 from mi_ring.rendering import bridge
+from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.system.files import write_state
 
 
 def test_srgb_decoding_is_the_standards():
@@ -239,6 +244,19 @@ def test_sphere_of_the_xml_wins(broken_capture):
     )
     center, radius = loading.load_capture(path).sphere()
     assert center.tolist() == [1, 2, 3] and radius == 4.5
+
+
+def test_a_fit_keeps_the_ground_of_the_xml(broken_capture, tmp_path):
+    path, edit = broken_capture
+    edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"/><point name="ground" x="1" y="2" z="-3"/>'
+         '<vector name="up" x="0" y="3" z="4"/>')  # fmt: skip
+    capture = loading.load_capture(path)
+    np.testing.assert_allclose(capture.shape.ground, [[1, 2, -3], [0, 0.6, 0.8]], atol=1e-6)
+    ring = Fit(capture, Config(iterations=2, levels=(1,), widths=(32,), shares=(1.0,))).ring
+    write_state(ring_state(ring), tmp_path / "ring.pt")
+    np.testing.assert_allclose(load_fit(tmp_path).ground, capture.shape.ground, atol=1e-6)
+    text = fitted_scene_xml(path, tmp_path, 3, ring.bsdf).decode()
+    assert "ring.pt" in text and "ground" not in text and '"up"' not in text
 
 
 def test_exposure_and_reflectance_follow_the_lamp(small_capture):

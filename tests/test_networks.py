@@ -182,6 +182,23 @@ def test_start_surface_is_the_domain(seed):
     assert moved.max() < 0.02 * 50  # 2 % of the radius
 
 
+def test_nothing_is_below_the_ground():
+    """What is above stays where it is; what is below lies on the plane, straight above."""
+    up = torch.tensor([2.0, -1.0, 2.0]) / 3
+    place = torch.tensor([9.0, 4.0, -1.0])
+    torch.manual_seed(3)
+    ring = Ring([10.0, -4.0, 7.0], 50.0, ground=torch.stack([place, up]))
+    free = Ring(ring.center, 50.0, networks=(ring.shape_net, ring.brdf_net))
+    s, _ = Sphere().sample(3)
+    with torch.no_grad():
+        before, after = free.surface(s), ring.surface(s)
+    height = (before - place) @ up
+    assert 0.1 < (height < 0).float().mean() < 0.9
+    assert ring.state_dict()["ground"].shape == (2, 3)
+    torch.testing.assert_close(after, before - height.clamp(max=0)[:, None] * up)
+    assert ((after - place) @ up)[height < 0].abs().max() < 2e-5
+
+
 def test_brdf_net_predicts_positive_reflectance_and_roughness_below_one():
     net = BRDFNet(scale=7.0)
     for parameter in net.parameters():
@@ -194,6 +211,7 @@ def test_brdf_net_predicts_positive_reflectance_and_roughness_below_one():
 
 def test_brdf_net_keeps_the_ranges_of_other_parameters():
     """Begins where it is told to, stays between low and high, colours apart from numbers."""
+    torch.manual_seed(0)
     tint, colour = Parameter("tint", 1, -0.5, 2.0, 1.5), Parameter("colour", 3, 0.2, 0.7)
     net = BRDFNet(50.0, [tint, colour, Parameter("haze", 1, 1.0, math.inf)])
     net.output.weight.data.zero_()

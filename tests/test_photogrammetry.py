@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 from mi_ring.capture.scenefile import load_element
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
+from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import masks, table
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.motion import Motion, pairs_to_match
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, windows, write_shot
-from mi_ring.photogrammetry.views import View, camera_of, reduced
+from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
 from mi_ring.rendering.lights import Light
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid
@@ -91,7 +92,7 @@ def test_masks_of_a_dim_room_with_lamps():
         true.append(mask)
     guesses = [masks.bright(v) for v in views]
     assert min(masks.overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
-    found = masks.settle(masks.Space.seen_by(views), guesses, lambda things, *_: things)
+    found = masks.settle(masks.Space.seen_by(views), guesses, masks.nothing(views), lambda things, *_: things)
     assert min(masks.overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
     assert found.quality > 0.9
     np.testing.assert_allclose(found.body.points.mean(0), CENTER, atol=0.15)
@@ -104,7 +105,7 @@ def test_nothing_in_common_is_no_object():
     for guess in guesses:
         x, y = random.integers(0, 150, 2)
         guess[y : y + 8, x : x + 8] = 1
-    assert masks.settle(masks.Space.seen_by(views), guesses, lambda things, *_: things) is None
+    assert masks.settle(masks.Space.seen_by(views), guesses, masks.nothing(views), lambda things, *_: things) is None
 
 
 def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
@@ -145,8 +146,49 @@ def test_what_stands_on_a_table_differs_from_it():
         true.append(mask)
     plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     space = masks.Space.seen_by(views)
-    guesses = table.not_table(views, plane, space.center, space.axis[-1])
+    guesses = table.not_table(views, plane, space.center, space.reach)
     assert np.median([masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
+    sure = table.patterns(views, plane, CENTER, 5.0)
+    assert max((s & t).sum() for s, t in zip(sure, true)) < 0.01 * np.mean([t.sum() for t in true])
+    assert np.mean([s.sum() for s in sure]) > 0.1 * sure[0].size
+
+
+def test_the_pattern_of_the_table_is_known_again_in_a_shadow():
+    random = np.random.default_rng(4)
+    known = np.log(random.uniform(0.05, 0.9, (20, 24))).repeat(6, 0).repeat(6, 1)
+    seen = known + random.normal(0, 0.1, known.shape)
+    seen[:, 40:110] -= 2.5  # shadow
+    seen[60:90, 60:100] = np.log(0.3) + random.normal(0, 0.1, (30, 40))  # something of one colour on it
+    known[105:] = np.nan
+    sure = table.alike(seen, known)
+    assert sure[10:45, 55:95].mean() > 0.9
+    assert sure[60:90, 60:100].mean() < 0.05
+    assert not sure[100:].any()
+
+
+def test_masks_that_others_contradict_are_left_open():
+    coverage = np.zeros((40, 60), np.uint8)
+    coverage[10:30, 20:40] = 1
+    mask = coverage.copy()
+    mask[15:25, 38:50], mask[18:22, 25:30] = 1, 0  # a shadow, and a hole
+    found = masks.disputed(mask, coverage, 2.0)
+    assert found[16:24, 43:50].all() and found[18:22, 25:30].all()
+    assert found.sum() < 10 * 12 + 4 * 5 + 10
+
+
+def test_a_window_about_the_object_and_back():
+    lens = Lens("PINHOLE", (1600, 1200), (1700.0, 1760.0, 770.0, 640.0))
+    mask = np.zeros((120, 160), np.uint8)
+    mask[30:60, 90:110] = 1  # 200 x 300 pixels
+    window = around(lens, mask, 100)
+    assert window.scale == 3 and window.width < 150 and window.height < 180
+    row, column = window.top + 3 * np.arange(window.height) + 1.5, window.left + 3 * np.arange(window.width) + 1.5
+    inside = (np.abs(row - 450) < 150)[:, None] & (np.abs(column - 1000) < 100)
+    back = pasted(inside.astype(np.uint8), lens, window)
+    assert back.shape == (400, 533)
+    rows, columns = np.nonzero(back)
+    np.testing.assert_allclose([rows.min(), rows.max() + 1, columns.min(), columns.max() + 1],
+                               [100, 200, 300, 366.7], atol=1.1)  # fmt: skip
 
 
 def test_the_plane_under_an_object():
@@ -270,9 +312,10 @@ def test_a_reduced_photograph_has_a_camera_that_sees_the_same(tmp_path):
     local = np.array([0.2, -0.15, 1.0])
     column, row = lens.colmap.img_from_cam(local[None])[0]
     cv2.circle(pixels, (round((column - 0.5) * 16), round((row - 0.5) * 16)), 64, (255, 255, 255), -1, cv2.LINE_AA, 4)
-    small = reduced(picture(tmp_path / "a.png", pixels), lens, np.eye(4), 80)
-    assert small.rgb.shape == (60, 80, 3)
-    weight = small.rgb.sum(-1).astype(float)
-    y, x = np.mgrid[:60, :80] + 0.5
-    found = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
-    np.testing.assert_allclose(found, small.camera.focal * local[:2] + small.camera.centre, atol=0.1)
+    for window, shape in ((whole_of(lens, 80), (60, 80, 3)), (Window(61, 17, 45, 38, 2), (38, 45, 3))):
+        small = reduced(picture(tmp_path / "a.png", pixels), lens, np.eye(4), window)
+        assert small.rgb.shape == shape
+        weight = small.rgb.sum(-1).astype(float)
+        y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+        found = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+        np.testing.assert_allclose(found, small.camera.focal * local[:2] + small.camera.centre, atol=0.1)

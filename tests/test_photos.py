@@ -14,6 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.photogrammetry.board import Sighting
 from mi_ring.photogrammetry.folder import Picture, relative_exposures
 from mi_ring.photogrammetry.motion import Motion
+from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.views import camera_of
 from mi_ring.photogrammetry.workflow import PAPER, Sheet, upright
 from mi_ring.system import command
@@ -120,12 +121,16 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
         turned[:3, :3], turned[:3, 3] = turn @ pose[:3, :3], turn @ pose[:3, 3]
         cameras[str(k)] = LENS, turned
     motion = Motion(cameras, (turn @ CENTER)[None], None, {})
-    moved = upright(motion, turn @ CENTER, None)
+    moved, none = upright(motion, turn @ CENTER, None)
     np.testing.assert_allclose(moved.points, 0, atol=1e-9)
     heights = [pose[2, 3] for _, pose in moved.cameras.values()]
     distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
     assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
-    exact = upright(motion, turn @ CENTER, turn[:, 2])
+    assert none is None
+    low = Plane(turn[:, 2], float(turn[:, 2] @ turn @ (CENTER - [0, 0, 3])))  # 3 below the object's middle
+    exact, plane = upright(motion, turn @ CENTER, low)
+    np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-9)
+    assert plane.offset * 18 == pytest.approx(-3, rel=0.1)  # the cameras are 18 away, now 1
     for (_, pose), before in zip(exact.cameras.values(), poses(12)):
         assert pose[2, 1] == pytest.approx(before[2, 1])  # how much the photograph's down is the world's up
 

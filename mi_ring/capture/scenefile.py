@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
+from mi_ring.plugins.shapenet import FOR_FITS
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import relative_to
 
@@ -36,11 +37,17 @@ def photograph_element(
     return element
 
 
-def scene_element(photographs: Iterable[Element]) -> Element:
-    """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`."""
+def scene_element(photographs: Iterable[Element], ground: np.ndarray | None = None) -> Element:
+    """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`.
+
+    `ground` (2, 3): a point on the table that the object stands on, and the table's normal.
+    """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
     shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
+    if ground is not None:
+        for tag, name, (x, y, z) in zip(("point", "vector"), ("ground", "up"), ground):
+            ElementTree.SubElement(shape, tag, name=name, x=numbers(x), y=numbers(y), z=numbers(z))
     ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
     root.extend(photographs)
     return root
@@ -124,7 +131,7 @@ def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -
     for element in list(shape):
         if element.get("name") in ("weights", "to_world"):
             raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
-        if element.get("name") in ("weights", "subdivisions", "domain", "center", "radius"):
+        if element.get("name") in ("weights", "subdivisions", *FOR_FITS):
             shape.remove(element)
     shape.remove(old_bsdf)
     shape.append(ElementTree.fromstring(bsdf))

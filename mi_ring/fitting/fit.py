@@ -119,7 +119,7 @@ class Fit:
                     raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
             networks[1].set_parameters(parameters, scale)
         ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                    networks)  # fmt: skip
+                    networks, capture.shape.ground)  # fmt: skip
         require_networks(ring)
         regularised = self.terms.get("velocity") is default_terms["velocity"] and config.weights["velocity"]
         if regularised and not hasattr(ring.shape_net, "velocity"):

@@ -21,8 +21,7 @@ from mi_ring.photogrammetry.views import View
 SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
 AGREE = 0.9  #: share of those that must call it object
 RESOLUTION = 96  #: voxels along an edge of the space that is looked at
-BAND = 0.04  #: of the object's size: GrabCut decides so far inside and outside the votes' outline
-FINE_BAND = 0.015  #: the same, of the larger pictures in the end
+BAND = 0.04  #: of the object's size: GrabCut decides so far inside the votes' outline, and somewhat further outside
 ROUNDS, SETTLED = 6, 0.995  #: at most; or when so much of the masks' union is the same as before
 DARKEST = 1e-3  #: radiance below which nothing is told
 
@@ -46,19 +45,28 @@ class Body:
         pixel, inside = view.places(points)
         mask = np.zeros(view.shown.shape, np.uint8)
         mask[pixel[inside, 1], pixel[inside, 0]] = 1
-        distance = np.median(np.linalg.norm(points - view.camera.position, axis=1))
-        return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.spacing * view.camera.focal.mean() / distance + 1))
+        return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.pixels(view) + 1))
+
+    def pixels(self, view: View) -> float:
+        """How wide a voxel is in a view."""
+        away = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
+        return float(self.spacing * view.camera.focal.mean() / away)
 
 
 class Space:
     """The voxels about the point that the cameras look at, and where each view has them."""
 
     def __init__(self, views: Sequence[View], center: np.ndarray, reach: float) -> None:
-        self.views, self.center = views, center
+        self.views, self.center, self.reach = views, center, reach
         self.axis = np.linspace(-reach, reach, RESOLUTION)
         grid = np.stack(np.meshgrid(*[self.axis] * 3, indexing="ij"), -1).reshape(-1, 3) + center
         self.allowed = np.ones(len(grid), bool)  #: may it be the object?
         self.grid = grid.astype(np.float32)
+
+    @property
+    def distance(self) -> float:
+        """The middle one of the cameras'."""
+        return float(np.median([np.linalg.norm(view.camera.position - self.center) for view in self.views]))
 
     @classmethod
     def seen_by(cls, views: Sequence[View]) -> "Space":
@@ -70,11 +78,10 @@ class Space:
         return cls(views, center, 1.2 * float(np.median(np.linalg.norm(origins - center, axis=1)) * half))
 
     @classmethod
-    def of(cls, views: Sequence[View], space: "Space") -> "Space":
-        """The same for other views."""
-        result = cls(views, space.center, float(space.axis[-1]))
-        result.allowed = space.allowed
-        return result
+    def about(cls, views: Sequence[View], body: Body) -> "Space":
+        """Somewhat larger than what has been found."""
+        low, high = body.points.min(0), body.points.max(0)
+        return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + body.spacing)
 
     def vote(self, masks: Sequence[np.ndarray]) -> Body | None:
         """The largest piece of what most masks (H, W) call object; None if there is nothing."""
@@ -98,22 +105,30 @@ def disk(radius: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
+def nothing(views: Sequence[View]) -> list[np.ndarray]:
+    """Empty masks."""
+    return [np.zeros(view.shown.shape, np.uint8) for view in views]
+
+
 def bright(view: View) -> np.ndarray:
     """(H, W) uint8: what is nearer to the flash than the rest, by Otsu's threshold of the photograph's log radiance."""
     log = np.log(np.maximum(view.linear.max(-1), DARKEST))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def grabcut(view: View, coverage: np.ndarray, band: float = BAND) -> np.ndarray:
-    """(H, W) uint8: the object's outline near that of its coverage (H, W), within a `band` of its size."""
+def grabcut(view: View, coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(H, W) uint8: the object's outline near that of its coverage (H, W).
+
+    `background` (H, W) uint8 is what surely is not the object.
+    """
     size = np.sqrt(max(1, int(coverage.sum())))
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[cv2.dilate(coverage, disk(1.5 * band * size)) > 0] = cv2.GC_PR_BGD
+    seed[cv2.dilate(coverage, disk(1.5 * BAND * size)) > 0] = cv2.GC_PR_BGD
     seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[cv2.erode(coverage, disk(band * size)) > 0] = cv2.GC_FGD
-    seed[~view.shown] = cv2.GC_BGD
+    seed[cv2.erode(coverage, disk(BAND * size)) > 0] = cv2.GC_FGD
+    seed[~view.shown | (background > 0)] = cv2.GC_BGD
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
-        return coverage
+        return coverage & (background == 0)
     cv2.setRNGSeed(0)  # of this thread
     models = np.zeros((1, 65)), np.zeros((1, 65))
     bgr = np.ascontiguousarray(view.rgb[..., ::-1])
@@ -141,10 +156,12 @@ class Found:
         return float(np.quantile(self.agreement, 0.2))
 
 
-def settle(space: Space, guesses: Sequence[np.ndarray], progress: Progress) -> Found | None:
+def settle(
+    space: Space, guesses: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], progress: Progress
+) -> Found | None:
     """Masks from a first guess of each (H, W): votes and GrabCut in turn until nothing changes.
 
-    None if the guesses have nothing in common.
+    `backgrounds` (H, W): what surely is not the object. None if the guesses have nothing in common.
     """
     body, masks = space.vote(guesses), list(guesses)
     if body is None:
@@ -152,7 +169,7 @@ def settle(space: Space, guesses: Sequence[np.ndarray], progress: Progress) -> F
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number in range(ROUNDS):
             before, covered = masks, [body.coverage(view) for view in space.views]
-            found = pool.map(grabcut, space.views, covered)
+            found = pool.map(grabcut, space.views, covered, backgrounds)
             masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
             body = space.vote(masks)
             if body is None:
@@ -167,9 +184,13 @@ def resized(mask: np.ndarray, view: View) -> np.ndarray:
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def sharpen(view: View, mask: np.ndarray) -> np.ndarray:
-    """The outline of a mask of another size, found anew in a larger picture: (H, W) uint8."""
-    return grabcut(view, resized(mask, view).astype(np.uint8), FINE_BAND)
+def disputed(mask: np.ndarray, coverage: np.ndarray, pixels: float) -> np.ndarray:
+    """(H, W) uint8: where a mask and what all say together, the coverage of voxels so wide, are not of one mind.
+
+    Mostly a shadow that one mask takes for the object.
+    """
+    wide, narrow = cv2.dilate(coverage, disk(pixels)), cv2.erode(coverage, disk(pixels))
+    return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
 def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:

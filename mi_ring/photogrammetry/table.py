@@ -14,6 +14,9 @@ FEWEST = 0.15  #: share of the points that a table has at least
 TEXELS = 320  #: across the table's picture
 SIGNIFICANT = 4.0  #: a pixel that differs from the table by so many times the usual is something else
 LEAST = 0.2  #: and by so much of its log radiance
+DARKEST = 2e-3  #: radiance below which nothing is told
+#: Where a photograph has the table's pattern: correlation in a window [px], and the pattern's least contrast in it.
+CORRELATED, WINDOW, CONTRAST = 0.8, 15, 0.15
 
 
 class Plane(NamedTuple):
@@ -69,56 +72,105 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, reac
     return found
 
 
-def not_table(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Of each view (H, W) uint8 what differs from the table as the others show it.
+class Ground:
+    """The part of a plane about its point below `center`, as a square of texels `reach` times 4 wide."""
 
-    All views are laid onto the plane, where the table looks alike from everywhere, but for how it is lit: a smooth
-    function of place, found for each photograph. What stands on it does not.
+    def __init__(self, plane: Plane, center: np.ndarray, reach: float) -> None:
+        self.axes, self.width = plane.axes(), 4 * reach
+        self.foot = center - plane.height(center) * plane.normal
+        line = np.linspace(-0.5, 0.5, TEXELS)
+        self.u, self.v = (grid.ravel() for grid in np.meshgrid(line, line))
+        across = self.u[:, None] * self.axes[0] + self.v[:, None] * self.axes[1]
+        self.points = self.foot + self.width * across  #: (TEXELS², 3)
+
+    def seen_by(self, view: View, texels: np.ndarray) -> np.ndarray:
+        """Texels (TEXELS², …) as a view shows them (H, W, …); NaN, or False, beyond."""
+        height, width = view.shown.shape
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+        rays = view.camera.directions(pixels)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            away = (self.foot - view.camera.position) @ self.axes[2] / (rays @ self.axes[2])
+        hit = view.camera.position + away[:, None] * rays - self.foot
+        place = (hit @ self.axes[:2].T / self.width + 0.5) * TEXELS
+        known = (away > 0) & ((place >= 0) & (place < TEXELS)).all(1)
+        column, row = np.where(known[:, None], place, 0).astype(int).T
+        shown = texels[row * TEXELS + column]
+        shown[~known] = False if shown.dtype == bool else np.nan
+        return shown.reshape(height, width, *texels.shape[1:])
+
+
+def laid(ground: Ground, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """How each view has the table (views, TEXELS², 3), and the table (TEXELS², 3): log radiance, NaN where not shown.
+
+    The table looks alike from everywhere, but for how it is lit: a smooth function of place, found for each view.
     """
-    axes = plane.axes()
-    foot = center - plane.height(center) * plane.normal
-    line = np.linspace(-2 * reach, 2 * reach, TEXELS)
-    u, v = np.meshgrid(line, line)
-    ground = (foot + u[..., None] * axes[0] + v[..., None] * axes[1]).reshape(-1, 3)
-    x, y = (u / (2 * reach)).ravel(), (v / (2 * reach)).ravel()
+    x, y = 2 * ground.u, 2 * ground.v
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
-    laid, places = [], []
-    for view in views:
-        pixel, inside = view.places(ground)
-        log = np.log(np.maximum(view.linear, 2e-3))
-        laid.append(np.where(inside[:, None], log[pixel[:, 1], pixel[:, 0]], np.nan).astype(np.float32))
-        places.append(pixel)
-    stack = np.stack(laid)
+    stack = np.empty((len(views), len(ground.points), 3), np.float32)
+    for own, view in zip(stack, views):
+        pixel, inside = view.places(ground.points)
+        own[:] = np.where(inside[:, None], log_radiance(view)[pixel[:, 1], pixel[:, 0]], np.nan)
     for _ in range(3):  # the table's colours and how each photograph is lit, in turn
-        table = np.nanmedian(stack, 0)
-        for k, own in enumerate(stack):
-            difference = (own - table).mean(1)
-            known = np.isfinite(difference)
-            for _ in range(2):
-                light = np.linalg.lstsq(smooth[known], difference[known], rcond=None)[0]
-                rest = difference - smooth @ light
-                known = np.isfinite(rest) & (np.abs(rest) < 2 * np.nanmedian(np.abs(rest)) + 1e-3)
-            stack[k] = own - (smooth @ light)[:, None]
-    table = np.nanmedian(stack, 0)
-    result = []
+        table = median(stack)
+        for own in stack:
+            own -= (smooth @ lighting(own - table, smooth))[:, None]
+    return stack, median(stack)
+
+
+def log_radiance(view: View) -> np.ndarray:
+    """(H, W, 3)"""
+    return np.log(np.maximum(view.linear, DARKEST))
+
+
+def median(stack: np.ndarray) -> np.ndarray:
+    """Of what is known of the first axis; NaN where nothing is. Much faster than `np.nanmedian`."""
+    middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
+    return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
+
+
+def not_table(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Of each view (H, W) uint8 what differs from the table as the others show it: what stands on it."""
+    ground, result = Ground(plane, center, reach), []
+    stack, table = laid(ground, views)
     for view, own in zip(views, stack):
         rest = np.abs(own - table).max(1)
-        usual = np.nanmedian(rest)
-        other = (rest > max(LEAST, SIGNIFICANT * usual)).reshape(TEXELS, TEXELS)
-        result.append(back(view, other & np.isfinite(rest).reshape(other.shape), foot, axes, reach))
+        other = rest > max(LEAST, SIGNIFICANT * float(np.nanmedian(rest)))
+        mask = cv2.medianBlur(ground.seen_by(view, other).astype(np.uint8), 5)
+        result.append(ndimage.binary_fill_holes(mask).astype(np.uint8))
     return result
 
 
-def back(view: View, other: np.ndarray, foot: np.ndarray, axes: np.ndarray, reach: float) -> np.ndarray:
-    """What was found on the plane, as the view shows it: (H, W) uint8, without specks and with holes filled."""
-    height, width = view.shown.shape
-    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-    rays = view.camera.directions(pixels)
-    away = (foot - view.camera.position) @ axes[2] / (rays @ axes[2])
-    hit = view.camera.position + away[:, None] * rays - foot
-    column, row = (((hit @ axis) / (4 * reach) + 0.5) * TEXELS for axis in axes[:2])
-    known = (away > 0) & (np.abs(column - TEXELS / 2) < TEXELS / 2) & (np.abs(row - TEXELS / 2) < TEXELS / 2)
-    column, row = (np.where(known, a, 0).astype(int) for a in (column, row))
-    mask = (known & other[row, column]).reshape(height, width).astype(np.uint8)
-    mask = cv2.medianBlur(mask, 5)
-    return ndimage.binary_fill_holes(mask).astype(np.uint8)
+def patterns(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Of each view (H, W) uint8 what surely is the table, for the pattern that the others show there is in it."""
+    ground = Ground(plane, center, reach)
+    table = laid(ground, views)[1].mean(1)
+    return [alike(log_radiance(view).mean(-1), ground.seen_by(view, table)) for view in views]
+
+
+def lighting(difference: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Coefficients of `smooth` (N, 6), that a photograph's difference from the table (N, 3) is; few may be wrong."""
+    mean = difference.mean(1)
+    known = np.isfinite(mean)
+    for _ in range(2):
+        light = np.linalg.lstsq(smooth[known], mean[known], rcond=None)[0]
+        rest = mean - smooth @ light
+        known = np.isfinite(rest) & (np.abs(rest) < 2 * np.nanmedian(np.abs(rest)) + 1e-3)
+    return light
+
+
+def alike(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """(H, W) uint8: where the log radiance seen (H, W) has the pattern of the table (H, W), NaN where that is unknown.
+
+    However it is lit, shadows included: by the correlation of both in a window.
+    """
+    known = np.isfinite(table)
+    table = np.where(known, table, 0).astype(np.float32)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return cv2.blur(values.astype(np.float32), (WINDOW, WINDOW))
+
+    a, b = seen - mean(seen), table - mean(table)
+    power = np.sqrt(np.maximum(mean(a * a), 1e-9)), np.sqrt(np.maximum(mean(b * b), 1e-9))
+    correlated = mean(a * b) > CORRELATED * power[0] * power[1]
+    sure = correlated & (power[1] > CONTRAST) & (mean(known) == 1)
+    return cv2.erode(sure.astype(np.uint8), np.ones((WINDOW // 2, WINDOW // 2), np.uint8))

@@ -1,6 +1,5 @@
 """Reduced photographs with their cameras, free of distortion: what the object is looked for in."""
 
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -10,8 +9,10 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import srgb_to_linear
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.frames import MITSUBA
-from mi_ring.importers.undistortion import distorted, whole
+from mi_ring.importers.undistortion import Window, distorted, whole
 from mi_ring.photogrammetry.folder import Picture
+
+ROOM = 0.3  #: of the object's size, left around it in the pictures that its outlines are found in
 
 
 class View(NamedTuple):
@@ -43,40 +44,55 @@ def camera_of(lens: Lens, pose: np.ndarray) -> Camera:
     return Camera(pose @ MITSUBA, np.array(lens.focal), np.array(lens.centre), lens.size)
 
 
-def reduced(picture: Picture, lens: Lens, pose: np.ndarray, longest: int) -> View:
-    """A photograph of at most so many pixels, its distortion undone."""
-    rgb = picture.srgb()
-    scale = -(-max(lens.size) // longest)
+def reduced(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> View:
+    """A part of a photograph, its distortion undone."""
+    rgb, scale = picture.srgb(), window.scale
     camera = camera_of(lens, pose).shrunk(scale)
     width, height = camera.size
     small = cv2.resize(rgb[: height * scale, : width * scale], (width, height), interpolation=cv2.INTER_AREA)
-    if lens.is_pinhole:
-        return View(picture.name, small, np.ones((height, width), bool), camera)
-    places = ((distorted(lens, whole(lens, scale)) + 0.5) / scale - 0.5).astype(np.float32)
+    corner = np.array([window.left, window.top]) / scale
+    camera = Camera(camera.to_world, camera.focal, camera.centre - corner, (window.width, window.height))
+    places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
     straight = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
     shown = cv2.remap(np.ones((height, width), np.uint8), places[1], places[0], cv2.INTER_NEAREST)
     return View(picture.name, straight, shown > 0, camera)
 
 
+def whole_of(lens: Lens, longest: int) -> Window:
+    """All of the picture, in so many pixels at most."""
+    return whole(lens, -(-max(lens.size) // longest))
+
+
+def around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
+    """What a mask (h, w) of the whole picture covers, in about so many pixels, with room around it."""
+    rows, columns = np.nonzero(mask)
+    size = np.array(lens.size)
+    unit = size / mask.shape[::-1]
+    low, high = (np.array([end(columns), end(rows)]) * unit for end in (np.min, np.max))
+    extent = float((high - low).max() + unit.max())
+    scale = max(1, round(extent / pixels))
+    low = np.clip(low - ROOM * extent, 0, size - 1).astype(int)
+    high = np.clip(high + ROOM * extent, low + scale, size).astype(int)
+    (left, top), (width, height) = low.tolist(), ((high - low) // scale).tolist()
+    return Window(left, top, width, height, scale)
+
+
+def pasted(mask: np.ndarray, lens: Lens, window: Window) -> np.ndarray:
+    """A mask of a window as one of the whole picture, equally reduced; 0 around it."""
+    full = np.zeros((lens.size[1] // window.scale, lens.size[0] // window.scale), mask.dtype)
+    left, top = window.left // window.scale, window.top // window.scale
+    part = full[top : top + mask.shape[0], left : left + mask.shape[1]]
+    part[:] = mask[: part.shape[0], : part.shape[1]]
+    return full
+
+
 def reduced_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
     """A mask (H, W) uint8 of a photograph, as `reduced` has the photograph: (h, w) uint8, 1 where it is above half."""
-    scale = -(-max(lens.size) // longest)
-    window = whole(lens, scale)
+    window = whole_of(lens, longest)
+    scale = window.scale
     small = cv2.resize(mask[: window.height * scale, : window.width * scale], (window.width, window.height),
                        interpolation=cv2.INTER_AREA)  # fmt: skip
     if not lens.is_pinhole:
         places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
         small = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
     return (small > 127).astype(np.uint8)
-
-
-def reduced_all(
-    pictures: Sequence[Picture], cameras: Mapping[str, tuple[Lens, np.ndarray]], longest: int
-) -> list[View]:
-    """Those that have a camera."""
-    views = []
-    for picture in pictures:
-        if picture.name in cameras:
-            views.append(reduced(picture, *cameras[picture.name], longest))
-            picture.close()
-    return views

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,13 +17,14 @@ from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, relative_exposures
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
-from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table
-from mi_ring.photogrammetry.views import View, reduced, reduced_all, reduced_mask
+from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table, patterns
+from mi_ring.photogrammetry.views import around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
-COARSE, FINE = 600, 1200  #: pixels at most along the pictures that masks are found in, and that outlines are
+COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
+CLOSE = 400  #: along the object, in the pictures that its outlines are found in
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
 PAPER = 0.8  #: albedo of white paper
 DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
@@ -42,16 +42,17 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
     write_file(known, json.dumps(listed))
 
 
-def upright(motion: Motion, center: np.ndarray, up: np.ndarray | None) -> Motion:
-    """Moved so that the object's `center` (3,) is the origin and `up` is z, by default the photographs' mean up.
+def upright(motion: Motion, center: np.ndarray, plane: Plane | None) -> tuple[Motion, Plane | None]:
+    """Moved so that the object's `center` (3,) is the origin, and z the table's normal or the photographs' mean up.
 
     The unit is the median distance from the cameras to the object.
     """
     poses = np.stack([pose for _, pose in motion.cameras.values()])
     scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
-    up = -poses[:, :3, 1].mean(0) if up is None else up
+    up = plane.normal if plane else -poses[:, :3, 1].mean(0)
     rotation = rotation_to_z(up / np.linalg.norm(up)) if np.linalg.norm(up) > 0.1 else np.eye(3)
-    return motion.moved(scale, rotation, -scale * rotation @ center)
+    table = plane and Plane(rotation @ plane.normal, scale * (plane.offset - float(center @ plane.normal)))
+    return motion.moved(scale, rotation, -scale * rotation @ center), table
 
 
 def rotation_to_z(direction: np.ndarray) -> np.ndarray:
@@ -153,7 +154,7 @@ class Object(NamedTuple):
     masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, but for those that are not sure
     center: np.ndarray  #: (3,)
     level: float  #: its mean radiance, 1 = full scale
-    up: np.ndarray | None  #: (3,) the normal of the table that it stands on, if there is one
+    plane: Plane | None  #: of the table that it stands on, if there is one
 
 
 class Hints(NamedTuple):
@@ -162,6 +163,16 @@ class Hints(NamedTuple):
     plane: Plane | None = None  #: of the table
     box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
     masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
+
+    def allow(self, points: np.ndarray, distance: float) -> np.ndarray:
+        """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras."""
+        allowed = np.ones(len(points), bool)
+        if self.plane:
+            allowed &= self.plane.height(points) > 2 * FLAT * distance
+        if self.box:
+            low, high = np.reshape(self.box, (3, 2)).T
+            allowed &= ((points >= low) & (points <= high)).all(1)
+        return allowed
 
 
 def find_object(
@@ -176,47 +187,51 @@ def find_object(
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
         masks_ = {name: read_image(folder / f"{name}.png")[..., 0] for name in known["sure"]}
-        return Object(masks_, np.array(known["center"]), known["level"], known["up"] and np.array(known["up"]))
-    views = reduced_all(pictures, motion.cameras, COARSE)
+        plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
+        return Object(masks_, np.array(known["center"]), known["level"], plane)
+    shown = [picture for picture in pictures if picture.name in motion.cameras]
+    views = []
+    for picture in progress(shown, "reading"):
+        lens, pose = motion.cameras[picture.name]
+        views.append(reduced(picture, lens, pose, whole_of(lens, COARSE)))
+        picture.close()
     space = masks.Space.seen_by(views)
-    if hints.box:
-        low, high = np.reshape(hints.box, (3, 2)).T
-        space.allowed = ((space.grid >= low) & (space.grid <= high)).all(1)
     plane = hints.plane
     if plane is None:
         positions = np.stack([view.camera.position for view in views])
-        plane = find_plane(motion.points, positions, space.center, space.axis[-1])
-    shown = [picture for picture in pictures if picture.name in motion.cameras]
+        plane = find_plane(motion.points, positions, space.center, space.reach)
     if hints.masks == "auto":
-        body, shades = searched(shown, motion, views, space, plane, progress)
+        body, shades, plane = searched(shown, motion, space, hints._replace(plane=plane), progress)
     else:
-        body, shades = brought(shown, motion, space, hints.masks, progress)
+        body, shades = brought(shown, motion, space, hints, progress)
+    plane = hints.plane or plane
     for name, mask in shades.items():
         write_image(mask[..., None], folder / f"{name}.png")
     small = {view.name: masks.resized(shades[view.name] == OBJECT, view) for view in views if view.name in shades}
     levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
-    result = Object(shades, body.points.mean(0), float(np.median(levels)), plane and plane.normal)
+    result = Object(shades, body.points.mean(0), float(np.median(levels)), plane)
     write_file(kept, json.dumps({
         "sure": list(shades), "center": result.center.tolist(), "level": result.level,
-        "up": None if result.up is None else result.up.tolist(),
+        "plane": plane and [plane.normal.tolist(), plane.offset],
     }))  # fmt: skip
     return result
 
 
 def brought(
-    pictures: Sequence[Picture], motion: Motion, space: masks.Space, source: str | Path, progress: Progress
+    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, progress: Progress
 ) -> tuple[masks.Body, dict[str, np.ndarray]]:
     """What the user's masks say the object is, and these masks by name, as `Object` has them."""
-    shades = {}
+    source, shades = hints.masks, {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(source)
         picture.close()
         if mask is not None:
-            shades[picture.name] = OBJECT * reduced_mask(mask, motion.cameras[picture.name][0], FINE)
+            shades[picture.name] = OBJECT * reduced_mask(mask, motion.cameras[picture.name][0], BROUGHT)
     if len(shades) < len(pictures) / 2:
         raise InputError(f"--masks: {source}: has masks for {len(shades)} of {len(pictures)} photographs; they must be "
                          "called like the photographs, with .png added or instead of the suffix")  # fmt: skip
-    space = masks.Space.of([view for view in space.views if view.name in shades], space)
+    space = masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
+    space.allowed = hints.allow(space.grid, space.distance)
     body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views])
     if body is None:
         raise InputError(f"--masks: {source}: no point in space is inside most of these masks; are they of these "
@@ -225,40 +240,51 @@ def brought(
 
 
 def searched(
-    pictures: Sequence[Picture], motion: Motion, views: Sequence[View], space: masks.Space, plane: Plane | None,
-    progress: Progress,
-) -> tuple[masks.Body, dict[str, np.ndarray]]:  # fmt: skip
-    """The object and masks of all photographs but those that are not sure, found in the photographs."""
-    found, guesses = settle_any(views, space, plane, progress)
-    if found is None:
+    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, progress: Progress
+) -> tuple[masks.Body, dict[str, np.ndarray], Plane | None]:
+    """The object and masks of all photographs but those that are not sure, and the table if there is one.
+
+    First in whole photographs, reduced; then closer to what was found.
+    """
+    body, plane = find_body(space, hints, progress)
+    if body is None:
         raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
                          "nor one that the flash lights more than what is around it; give --masks")  # fmt: skip
+    views, windows = [], {}
+    for picture, far in progress(list(zip(pictures, space.views)), "reading"):
+        lens, pose = motion.cameras[picture.name]
+        windows[picture.name] = around(lens, body.coverage(far), CLOSE)
+        views.append(reduced(picture, lens, pose, windows[picture.name]))
+        picture.close()
+    space = masks.Space.about(views, body)
+    space.allowed = hints._replace(plane=plane).allow(space.grid, space.distance)
+    tables = patterns(views, plane, space.center, space.reach) if plane else masks.nothing(views)
+    found = masks.settle(space, [body.coverage(view) for view in views], tables, progress)
+    if found is None:
+        raise InputError(f"{pictures[0].path.parent}: masks: those of the photographs do not agree; give --masks")
     shades = {}
-    found_of = zip(pictures, found.masks, guesses, found.agreement)
-    for picture, mask, guess, agreed in progress(found_of, "outlines", len(pictures)):
+    for view, mask, agreed in zip(views, found.masks, found.agreement):
         if agreed >= SURE:
-            fine = masks.sharpen(reduced(picture, *motion.cameras[picture.name], FINE), mask)
-            maybe = cv2.resize(masks.unsure(mask, guess), fine.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-            shades[picture.name] = np.where(fine > 0, OBJECT, np.where(maybe, UNSURE, 0)).astype(np.uint8)
-            picture.close()
-    return found.body, shades
+            if plane:  # beside the object there are shadows
+                maybe = masks.disputed(mask, found.body.coverage(view), found.body.pixels(view))
+            else:
+                maybe = masks.unsure(mask, masks.bright(view))
+            shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
+            shades[view.name] = pasted(shade, motion.cameras[view.name][0], windows[view.name])
+    return found.body, shades, plane
 
 
-def settle_any(
-    views: Sequence[View], space: masks.Space, plane: Plane | None, progress: Progress
-) -> tuple[masks.Found | None, list[np.ndarray]]:
-    """Masks by what differs from the table, if there is one, else by brightness; and the guesses they grew from."""
-    ways = []
+def find_body(space: masks.Space, hints: Hints, progress: Progress) -> tuple[masks.Body | None, Plane | None]:
+    """The object by what differs from the table that it stands on, and the table; else by brightness, and None."""
+    views, plane, nothing = space.views, hints.plane, masks.nothing(space.views)
     if plane:
-        above = plane.height(space.grid) > 2 * FLAT * np.linalg.norm(views[0].camera.position - space.center)
-        ways.append((lambda: not_table(views, plane, space.center, space.axis[-1]), space.allowed & above))
-    ways.append((lambda: [masks.bright(view) for view in views], space.allowed))
-    for guess, allowed in ways:
-        space.allowed, guesses = allowed, guess()
-        found = masks.settle(space, guesses, progress)
+        space.allowed = hints.allow(space.grid, space.distance)
+        found = masks.settle(space, not_table(views, plane, space.center, space.reach), nothing, progress)
         if found and found.quality >= SURE:
-            return found, guesses
-    return None, []
+            return found.body, plane
+    space.allowed = hints._replace(plane=None).allow(space.grid, space.distance)
+    found = masks.settle(space, [masks.bright(view) for view in views], nothing, progress)
+    return (found.body if found and found.quality >= SURE else None), None
 
 
 def shots(

@@ -7,6 +7,8 @@ from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 
+FOR_FITS = "center", "radius", "domain", "ground", "up"  #: what says where a fit starts; finished ones have it in them
+
 
 class ShapeNetMesh(mi.Mesh):
     """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
@@ -25,6 +27,10 @@ class ShapeNetMesh(mi.Mesh):
                                it from masks or cameras
     ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of
                                ``domain``, else 1
+    ``ground``       point     on the table that the object stands on [scene units]: the surface does
+                               not go below, where no photograph shows it. Not together with
+                               ``weights``. Default: none
+    ``up``           vector    normal of the table. Default: z
     ``to_world``     transform applied on top of everything. Default: none
     ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
                                to false to place a fit into a scene of your own. Default: true
@@ -76,8 +82,8 @@ class ShapeNetMesh(mi.Mesh):
         self.subdivisions = props.get("subdivisions", 5)
         if not isinstance(self.subdivisions, int) or self.subdivisions not in range(9):
             raise ValueError(f'shapenet "{props.id()}": subdivisions is {self.subdivisions}, must be 0 to 8')
-        given = {key: props[key] for key in ("center", "radius", "domain", "weights") if key in props}
-        for key in ("center", "radius", "domain"):
+        given = {key: props[key] for key in (*FOR_FITS, "weights") if key in props}
+        for key in FOR_FITS:
             if key in given and "weights" in given:
                 raise ValueError(f'shapenet "{props.id()}": weights carry their own {key}; give only one of the two')
         to_world = props.get("to_world", mi.ScalarTransform4f())
@@ -93,6 +99,14 @@ class ShapeNetMesh(mi.Mesh):
         self.radius = number(props, "radius", positive=True) if "radius" in given else None
         if self.center is not None and not (self.center.dtype.kind == "f" and np.isfinite(self.center).all()):
             raise ValueError(f'shapenet "{props.id()}": center is {given["center"]}, must be a <point>')
+        #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
+        self.ground = None
+        if "ground" in given:
+            up = np.array(given.get("up", [0.0, 0.0, 1.0])).ravel()
+            self.ground = np.stack([np.array(given["ground"]).ravel(), up / max(np.linalg.norm(up), 1e-30)])
+            if not (np.isfinite(self.ground).all() and up.any()):
+                raise ValueError(f'shapenet "{props.id()}": ground is {given["ground"]} and up {up.tolist()}, must be '
+                                 "a <point> and a <vector> that is not 0")  # fmt: skip
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain, self.domain_file = None, None
         if "domain" in given:

@@ -18,27 +18,34 @@ class Ring(nn.Module):
     `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
     sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
     paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shapenet.Flow` and
-    `mi_ring.nets.brdfnet.ReflectanceMap` say.
+    `mi_ring.nets.brdfnet.ReflectanceMap` say. `ground` (2, 3): a point on the table that the object stands on, and the
+    table's unit normal; below it nothing is seen, and what the flow has there lies flat on it.
     """
 
     shape_net: Flow
     brdf_net: ReflectanceMap
     center: Tensor
     radius: Tensor
+    ground: Tensor | None
 
     def __init__(
         self, center: Sequence[float] | np.ndarray | Tensor, radius: float, scale: float = 1.0,
         domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE,
         bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
-        networks: tuple[Flow, ReflectanceMap] | None = None,
+        networks: tuple[Flow, ReflectanceMap] | None = None, ground: np.ndarray | Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
         self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
+        self.register_buffer("ground", None if ground is None else torch.as_tensor(ground, dtype=torch.float32))
         self.domain = domain or Sphere()
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
         """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""
-        return self.center + self.radius * self.shape_net(s, time)
+        points = self.center + self.radius * self.shape_net(s, time)
+        if self.ground is None:
+            return points
+        place, up = self.ground
+        return points + ((place - points) @ up).clamp(min=0)[:, None] * up

@@ -32,6 +32,7 @@ def ring_of(state: dict) -> Ring:
     ring = Ring(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
         subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
+        ground=state["networks"].get("ground"),
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     return ring
