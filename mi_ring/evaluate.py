@@ -22,8 +22,8 @@ class EvaluateConfig:
 
     In it: errors of normals [deg] and depths [% of the diagonal of the true bounding box] where both surfaces are seen;
     overlap of silhouettes; share of what is seen whose faces point away from the camera; Chamfer distance [% of the
-    diagonal] and F-score of whole surfaces, unseen parts included; genus; triangles that cross another; PSNR [dB] and
-    SSIM of the photographs that mi_ring.render predicts. A file has the same for every photograph.
+    diagonal] and F-score of whole surfaces, unseen parts included unless --seen; genus; triangles that cross another;
+    PSNR [dB] and SSIM of the photographs that mi_ring.render predicts. A file has the same for every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -32,6 +32,8 @@ class EvaluateConfig:
     """True surface in the units and frame of the scene: PLY, OBJ or GLB."""
     novel: Path | None = None
     """Scene of photographs that the fit has not seen."""
+    seen: bool = False
+    """Leave out of Chamfer distance and F-score what no photograph of the fit shows, of both surfaces."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs."""
     out: Path | None = None
@@ -50,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
     if out.suffix.lower() != ".json":
         raise InputError(f"{out}: --out: must end in .json")
     require_place(out, "--out")
-    numbers = rounded(evaluate_fit(config.run, config.mesh, config.novel, config.spp))
+    numbers = rounded(evaluate_fit(config.run, config.mesh, config.novel, config.spp, config.seen))
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)

@@ -1,6 +1,7 @@
 """Write a fitted object for other programs: `python -m mi_ring.export RUN FILE.{ply,obj,glb,xml}`."""
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,12 +9,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mi_ring.capture.loading import load_views
 from mi_ring.errors import InputError
 from mi_ring.output import gltf
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
+from mi_ring.rendering.visibility import View
 from mi_ring.ring.material import MaterialOptions, dress
 from mi_ring.ring.saved import load_fit
 from mi_ring.system import command
@@ -27,9 +30,10 @@ GLB_LEVEL = 5  #: of its mesh; the normal map has what is finer
 class ExportConfig(MaterialOptions):
     """Write the object of a finished fit for other programs. The file's name says as what.
 
-    .ply: the mesh with the parameters of its BSDF as vertex attributes. .glb: with a normal map and the material as
-    glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files. .xml: a scene for Mitsuba, with bitmap textures
-    and a stock BSDF, that needs no mi_ring. Positions are in the scene's units and frame.
+    .ply: the mesh with the parameters of its BSDF as vertex attributes, and whether any photograph shows the vertex.
+    .glb: with a normal map and the material as glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files.
+    .xml: a scene for Mitsuba, with bitmap textures and a stock BSDF, that needs no mi_ring. Positions are in the
+    scene's units and frame.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -70,6 +74,15 @@ def require_options(config: ExportConfig) -> None:
         raise InputError(f"{config.file}: is a file of the fit or of a capture; choose another name")
 
 
+def seen_from(run: Path) -> list[View] | None:
+    """What each photograph of a fit can show; None where that cannot be read."""
+    try:
+        return load_views((run if run.is_dir() else run.parent) / "scene.xml")
+    except InputError as error:
+        print(f"The file goes without what the photographs show: {error}", file=sys.stderr)
+        return None
+
+
 def main(arguments: Sequence[str]) -> None:
     """The command."""
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
@@ -83,12 +96,13 @@ def main(arguments: Sequence[str]) -> None:
     if kind in (".glb", ".obj"):
         gltf.require_expressible(ring)
     photograph = first_photograph(config.run) if kind == ".xml" else None
+    views = seen_from(config.run) if kind in (".ply", ".glb") else None
     require_place(config.file)
     if kind == ".ply":
-        write_mesh(ring, level, config.file, config.time)
+        write_mesh(ring, level, config.file, config.time, views)
         files = [config.file]
     elif kind == ".glb":
-        write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, config.metres))
+        write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, config.metres, views))
         files = [config.file]
     else:
         print("Cutting the surface open and baking its material", flush=True)

@@ -26,25 +26,27 @@ DRAWING = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # without 
 COLOUR = np.array([230, 170, 120])  # of the box, sRGB
 
 
-def glb(positions, normals, uv, faces, image, scale=1.0):
+def glb(positions, normals, uv, faces, image, scale=1.0, seen=None):
     """A GLB of a matte mesh whose colour is an image, (H, W, 3) uint8; made by hand: glTF 2.0, section 4.
 
-    `scale`: by which its exporter multiplied the true colour.
+    `scale`: by which its exporter multiplied the true colour. `seen` (V,): what photographs show; all, by default.
     """
     Image.fromarray(image).save(png := io.BytesIO(), "PNG")
-    arrays = [np.asarray(values, "<f4") for values in (positions, normals, uv)] + [np.asarray(faces, "<u4").ravel()]
+    seen = np.ones(len(positions)) if seen is None else seen
+    arrays = [np.asarray(values, "<f4") for values in (positions, normals, uv, seen)]
+    arrays += [np.asarray(faces, "<u4").ravel()]
     parts = [array.tobytes() for array in arrays] + [png.getvalue() + b"\0" * (-len(png.getvalue()) % 4)]
     offsets = np.cumsum([0, *map(len, parts)]).tolist()
-    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}
-    kinds = [(5126, "VEC3"), (5126, "VEC3"), (5126, "VEC2"), (5125, "SCALAR")]
+    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "_SEEN": 3}
+    kinds = [(5126, "VEC3"), (5126, "VEC3"), (5126, "VEC2"), (5126, "SCALAR"), (5125, "SCALAR")]
     content = json.dumps({
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 4, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0},
                        "extensions": {"KHR_materials_specular": {"specularFactor": 0.0}},
                        "extras": {"mi_ring": {"scale": scale}}}],
         "extensionsUsed": ["KHR_materials_specular"],
-        "textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/png"}],
+        "textures": [{"source": 0}], "images": [{"bufferView": 5, "mimeType": "image/png"}],
         "buffers": [{"byteLength": offsets[-1]}],
         "bufferViews": [{"buffer": 0, "byteOffset": o, "byteLength": len(part)} for o, part in zip(offsets, parts)],
         "accessors": [
@@ -75,7 +77,8 @@ def page_file(fitted, tmp_path_factory):
     corners, normals = box.triangles.reshape(-1, 3), np.repeat(box.face_normals, 3, axis=0)
     file = tmp_path_factory.mktemp("report") / "report.html"
     faces = np.arange(len(corners)).reshape(-1, 3)
-    box = glb(corners, normals, 0 * corners[:, :2], faces, np.tile(COLOUR.astype(np.uint8), (5, 7, 1)))
+    seen = normals[:, 1] == 0
+    box = glb(corners, normals, 0 * corners[:, :2], faces, np.tile(COLOUR.astype(np.uint8), (5, 7, 1)), seen=seen)
     file.write_text(report.report_html(fitted, box), "utf-8")
     return file
 
@@ -158,7 +161,7 @@ def test_the_viewer_draws_and_everything_moves_it(width, open_page, page_file):
     for name, value in (("azimuth", "60"), ("elevation", "-50"), ("brightness", "1.5")):
         page.locator(f"[name={name}]").fill(value)
         assert changed(), name
-    for shown in ("diffuse", "specular", "roughness", "normals", "shaded"):
+    for shown in ("diffuse", "specular", "roughness", "normals", "unseen", "shaded"):
         page.locator("[name=show]").select_option(shown)
         assert changed(), shown
     page.locator("[name=reset]").click()
@@ -175,6 +178,21 @@ def test_a_diffuse_box_shows_its_colour_and_its_normals(open_page, page_file):
     for axis in range(3):  # the axes of the world, for the box has them: one side of each is seen
         sides = [np.where(np.arange(3) == axis, end, 127.5) for end in (0, 255)]
         assert any(np.abs(colours - side).max(1).min() < 1.1 for side in sides)
+
+
+def test_what_no_photograph_shows_is_magenta_and_the_rest_as_it_was(open_page, page_file):
+    """Two sides of the box, of which one is in sight."""
+    page, shots = open_page(page_file), {}
+    for shown in ("shaded", "normals", "unseen"):
+        page.locator("[name=show]").select_option(shown)
+        shots[shown] = (picture(page.locator("canvas").screenshot())[2:-2] * 255).round()
+    away = {side: np.abs(shots["normals"] - [127.5, side, 127.5]).max(-1) < 1.1 for side in (0, 255)}
+    unseen = away[0] | away[255]
+    magenta = (shots["unseen"] == [255, 0, 255]).all(-1)
+    assert 0.01 < unseen.mean() < 0.5
+    assert (magenta == unseen).mean() > 0.998  # but for the edges, which are smoothed
+    same = (shots["unseen"] == shots["shaded"]).all(-1)
+    assert (same == ~unseen).mean() > 0.995 and (same & (shots["shaded"] > 0).any(-1)).mean() > 0.01
 
 
 def test_each_slider_moves_its_own_divider(open_page, page_file):

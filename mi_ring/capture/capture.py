@@ -18,6 +18,7 @@ from mi_ring.geometry.camera import NoParallax, nearest_point
 from mi_ring.geometry.hull import Hull, Silhouette, evenly
 from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.visibility import View
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23
@@ -175,6 +176,11 @@ class Capture:
                 silhouette = Silhouette(mask, sensor.camera, self.outline(k), self.valid[k])
                 once.setdefault((id(mask), sensor.camera.to_world.tobytes()), silhouette)
         return list(once.values())
+
+    @property
+    def views(self) -> list[View]:
+        """What each photograph can show."""
+        return [View(sensor.camera, valid) for sensor, valid in zip(self.sensors, self.valid, strict=True)]
 
     @functools.cached_property
     def hull(self) -> Hull | None:

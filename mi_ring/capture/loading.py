@@ -14,6 +14,7 @@ from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.visibility import View
 from mi_ring.system import llvm
 
 
@@ -80,6 +81,13 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     if not sensors:
         raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
     return scene, sensors
+
+
+def load_views(path: Path) -> list[View]:
+    """What each photograph of a scene file can show, without opening it. Raises InputError if it cannot be read."""
+    _, sensors = open_scene(path)
+    valid = read_once([(s, s.valid) for s in sensors], "valid", path)
+    return [View(sensor.camera, mask) for sensor, mask in zip(sensors, valid)]
 
 
 def recompute_normals(scene: mi.Scene) -> None:

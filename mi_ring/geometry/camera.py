@@ -40,6 +40,12 @@ class Camera(NamedTuple):
         d = np.stack([-x, -y, np.ones_like(x)], 1) @ self.to_world[:3, :3].T
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates (n, 2), and depths (n,) along the optical axis [scene units], of points (n, 3)."""
+        x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
+        with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
+            return self.centre - self.focal * np.stack([x, y], 1) / z[:, None], z
+
     def shrunk(self, scale: int) -> "Camera":
         """Of the same photograph, `scale` times smaller."""
         size = self.size[0] // scale, self.size[1] // scale

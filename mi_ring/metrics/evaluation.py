@@ -14,16 +14,18 @@ from mi_ring.ring.saved import load_fit
 
 LINES = {  # of the table
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
-    "flipped": "seen from the back, share", "chamfer": "Chamfer distance, % of the diagonal",
+    "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
+    "chamfer": "Chamfer distance, % of the diagonal",
     **{f"f_score_{t}": f"F-score at {t} % of the diagonal" for t in THRESHOLDS}, "genus": "genus",
     "self_intersections": "triangles that cross others", "psnr": "PSNR, dB", "ssim": "SSIM",
 }  # fmt: skip
 
 
-def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP) -> dict:
+def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False) -> dict:
     """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
 
-    What is not defined is left out: the genus of a surface that is not closed, for instance.
+    `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
+    genus of a surface that is not closed, for instance.
     """
     ring = load_fit(run)
     capture = load_capture(run / "scene.xml")
@@ -31,7 +33,7 @@ def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SP
     truth_mesh, truth = load_true_mesh(mesh)
     guess_mesh, guess = load_true_mesh(run / "mesh.ply")
     numbers, views = compare_surfaces(capture, guess, truth, float(np.linalg.norm(truth_mesh.extents)))
-    numbers |= compare_shapes(guess_mesh, truth_mesh)
+    numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None)
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:
             numbers[key] = genus(surface)

@@ -1,5 +1,6 @@
 """How near two surfaces are: normals, depths, silhouettes, distances, crossing triangles."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -13,6 +14,7 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.rendering.visibility import View, Visibility
 from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
@@ -77,28 +79,42 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
     } if len(angle) else {}  # fmt: skip
 
 
-def compare_shapes(guess: trimesh.Trimesh, truth: trimesh.Trimesh) -> dict[str, float]:
+def compare_shapes(
+    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[View] | None = None
+) -> dict[str, float]:
     """Chamfer distance [% of the diagonal of the true bounding box] and F-scores of two whole surfaces.
 
     100,000 points of each, drawn evenly by area with a fixed seed, and their exact distances from the other surface:
     not from points of it, so that equal surfaces have distance 0. `chamfer` is the mean of the two mean distances, from
     the fit to the truth and back; `f_score_t` is the harmonic mean of precision, the share of the fit's points within t
     % of the diagonal of the truth, and recall, the share of the truth's within t of the fit (Knapitsch et al., Tanks
-    and Temples, ACM TOG 2017). Parts that no camera sees count, too.
+    and Temples, ACM TOG 2017). Parts that no camera sees count, too, unless `views` are given: then the points are
+    those that one of them shows, and `unseen` and `unseen_true` are the shares of the two surfaces that none does.
     """
     diagonal, middle = np.linalg.norm(truth.extents), truth.bounds.mean(0)
-    there, back = (100 / diagonal * distances(a, b, middle) for a, b in ((guess, truth), (truth, guess)))
+    there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
     numbers = {"chamfer": float(there.mean() + back.mean()) / 2}
+    if views is not None:
+        numbers |= {"unseen": 1 - len(there) / POINTS, "unseen_true": 1 - len(back) / POINTS}
     for threshold in THRESHOLDS:
         precision, recall = ((d <= threshold).mean() for d in (there, back))
         numbers[f"f_score_{threshold}"] = float(2 * precision * recall / max(precision + recall, 1e-12))
     return numbers
 
 
-def distances(start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray) -> np.ndarray:
-    """Of points of one surface from another (POINTS,). What counts is how both lie around `middle`."""
+def distances(
+    start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[View] | None = None
+) -> np.ndarray:
+    """Of points of one surface from another (POINTS,), or of those that one of the views shows.
 
-    points, _ = trimesh.sample.sample_surface(start, POINTS, seed=0)
+    What counts is how both lie around `middle`.
+    """
+    points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
+    if views is not None:
+        points = points[Visibility(start.vertices, start.faces, views).of(points, start.face_normals[faces])]
+        if not len(points):
+            raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
+                             "same frame, and do the faces of both point outwards?")  # fmt: skip
     mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)
     squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
     return np.sqrt(squared)

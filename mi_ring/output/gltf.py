@@ -3,6 +3,7 @@
 import io
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
 from mi_ring.rendering.attributes import constants, load_bsdf
+from mi_ring.rendering.visibility import View, seen_of
 from mi_ring.ring.ring import Ring
 
 LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled`, but for glTF's
@@ -101,24 +103,33 @@ def png(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def glb(ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None) -> bytes:
+def glb(
+    ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
+    views: Sequence[View] | None = None,
+) -> bytes:  # fmt: skip
     """The object as a GLB file with textures of `resolution` texels a side, in the scene's frame.
 
     Positions are in scene units; with `metres`, the length of one, a node scales them to glTF's. The parameters of the
     BSDF are also there as they are, as vertex attributes (_DIFFUSE, …) and, what they mean, in the material's extras.
+    With `views` there is also _SEEN: 1 where one of them shows the object, 0 where none does.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
     texels = rasterise(ring, atlas, resolution, time)
     material = metallic_roughness(ring.bsdf, reflectances(ring, texels.s))
-    return assemble_glb(atlas, textures(material, texels), material, reflectances(ring, atlas.s), ring.bsdf, metres)
+    exact, seen = reflectances(ring, atlas.s), None
+    if views is not None:
+        s = np.zeros((atlas.whole.max() + 1, 3), np.float32)
+        s[atlas.whole] = atlas.s
+        seen = seen_of(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
+    return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen)
 
 
 def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
-    metres: float | None = None,
+    metres: float | None = None, seen: np.ndarray | None = None,
 ) -> bytes:  # fmt: skip
-    """The GLB file of a mesh, its `textures` and its exact parameters at the vertices."""
+    """The GLB file of a mesh, its `textures` and its exact parameters at the vertices; `seen` (V,) bool."""
     file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
     blob = bytearray()
 
@@ -154,6 +165,8 @@ def assemble_glb(
     )
     for name, values in exact.items():
         setattr(attributes, f"_{name.upper()}", accessor(values.astype(np.float32)))
+    if seen is not None:
+        attributes._SEEN = accessor(seen.astype(np.float32))
     indices = accessor(atlas.faces.astype(np.uint32).ravel(), target=pygltflib.ELEMENT_ARRAY_BUFFER)
     file.samplers.append(pygltflib.Sampler(
         magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,

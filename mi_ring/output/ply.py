@@ -1,25 +1,38 @@
 """Meshes as PLY, with the material at each vertex."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mitsuba as mi
 import torch
 
 from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.rendering.visibility import View, seen_of
 from mi_ring.ring.ring import Ring
 from mi_ring.system.files import write_file
 
 
-def write_mesh(ring: Ring, subdivisions: int, path: Path, time: float = 1.0) -> None:
-    """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …)."""
+def write_mesh(
+    ring: Ring, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[View] | None = None
+) -> float | None:
+    """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …).
+
+    With `views` also vertex_seen: 1 where one of them shows the object, 0 where none does. Returns the share of the
+    object's area that none does.
+    """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():
         s = s.to(ring.center.device)
         vertices, material = ring.surface(s, time), ring.brdf_net(s)
     mesh = mesh_of(vertices.cpu().numpy(), faces)
+    unseen = None
+    if views is not None:
+        seen, unseen = seen_of(ring, s.cpu().numpy(), faces, views)
+        material = {"seen": torch.from_numpy(seen).float(), **material}
     for name, value in material.items():
         mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
     write_ply(mesh, path)
+    return unseen
 
 
 def write_ply(mesh: mi.Mesh, path: Path) -> None:

@@ -40,8 +40,11 @@ class PhotographPanel:
     pictures: dict[str, str]
 
 
-def report_html(fit: Any, glb: bytes | None = None) -> str:
-    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer."""
+def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None) -> str:
+    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer.
+
+    `unseen`: the share of its area that no photograph shows.
+    """
     capture, ring = fit.capture, fit.ring
     rows, errors = [], []
     for k in capture.spread():
@@ -59,6 +62,7 @@ def report_html(fit: Any, glb: bytes | None = None) -> str:
         "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
+        **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
         "Made by": f"mi_ring {__version__}",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
     }

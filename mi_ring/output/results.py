@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.output import gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
+from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
@@ -111,20 +113,21 @@ def write_inputs(path: Path, fit: Any) -> None:
 def write(folder: Path, fit: Any, scene: bytes) -> None:
     """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
     write_state(ring_state(fit.ring, fit.config.settings()), folder / "ring.pt")
-    write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply")
+    views = fit.capture.views
+    unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     write_file(folder / "scene.xml", scene)
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)
-    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring)))
+    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 
-def viewed(ring: Ring) -> bytes | None:
+def viewed(ring: Ring, views: Sequence[View] | None = None) -> bytes | None:
     """The object for the report's viewer as GLB, where that is possible."""
     level = min(VIEWED, ring.subdivisions)
     try:
-        return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)))
+        return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)
     except Exception as error:  # whatever it is, the report is worth more
         print(f"The report goes without a view of the object: {' '.join(str(error).split())}")
         return None

@@ -5,12 +5,13 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
-// What can be shown in place of radiance; roughness as the width of the distribution, the square of glTF's. The last two are plain numbers: sRGB's curve is undone.
+// What can be shown in place of radiance; roughness as the width of the distribution, the square of glTF's. Roughness and normals are plain numbers: sRGB's curve is undone.
 const SHOWN = {
   diffuse: "diffuseColor.rgb",
   specular: "material.specularColorBlended",
   roughness: "sRGBTransferEOTF(vec4(vec3(roughnessFactor * roughnessFactor), 1.0)).rgb",
   normals: "sRGBTransferEOTF(vec4(transformNormalByInverseViewMatrix(normal, viewMatrix) * 0.5 + 0.5, 1.0)).rgb",
+  unseen: "mix(vec3(1.0, 0.0, 1.0), outgoingLight, step(0.5, vSeen))",
 };
 const HALF_FIELD = 15; // of view [degrees]
 const RADIANS = Math.PI / 180;
@@ -25,6 +26,10 @@ function show(material, shown) {
   material.onBeforeCompile = (shader) => {
     const end = "#include <opaque_fragment>";
     if (shown in SHOWN) shader.fragmentShader = shader.fragmentShader.replace(end, `outgoingLight = ${SHOWN[shown]};\n${end}`);
+    if (shown !== "unseen") return;
+    const [begin, varying] = ["#include <begin_vertex>", "varying float vSeen;\n"];
+    shader.vertexShader = `attribute float _seen;\n${varying}${shader.vertexShader.replace(begin, `${begin}\nvSeen = _seen;`)}`;
+    shader.fragmentShader = varying + shader.fragmentShader;
   };
   material.customProgramCacheKey = () => shown;
   material.needsUpdate = true;
