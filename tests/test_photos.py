@@ -11,7 +11,6 @@ from test_photogrammetry import CENTER, LENS, hit_ellipsoid, in_a_dim_room, pose
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.photogrammetry.board import Sighting
 from mi_ring.photogrammetry.folder import Picture, relative_exposures
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.table import Plane
@@ -100,17 +99,19 @@ def test_mistakes_of_the_user(arguments, words, folder, tmp_path, capsys, monkey
 
 
 def test_the_sheet_tells_how_strong_the_flash_is():
-    """Paper of that albedo under a light of known strength is as bright as Lambert's law says."""
-    pose = np.eye(4)
+    """Paper of that albedo under a light of known strength is as bright as Lambert's law says, but in a shadow."""
+    pose, flash = np.eye(4), np.array([-20.0, 15.0, 4.0])
+    pose[:3, :3] = Rotation.from_euler("xyz", [170, 12, 40], degrees=True).as_matrix()
     pose[:3, 3] = [30.0, -40.0, 300.0]
     rgb = np.array([2e5, 1.5e5, 1e5])
-    place = np.array([10.0, 20.0, 0.0])
-    way = pose[:3, 3] - place
-    radiance = PAPER / np.pi * rgb * (way[2] / np.linalg.norm(way)) / (way @ way)
-    around = np.array([[9, 9, 0], [-9, 9, 0], [9, -9, 0], [-9, -9, 0.0]])
-    sighting = Sighting(np.arange(4), place + around, np.zeros((4, 2)))
-    sheet = Sheet({"a": sighting}, {"a": radiance})
-    np.testing.assert_allclose(sheet.strengths(Motion({"a": (LENS, pose)}, np.zeros((0, 3)), None, {}))["a"], rgb)
+    places = np.array([[10.0, 20, 0], [70, -60, 0], [-80, 30, 0], [5, 90, 0], [-40, -90, 0]])
+    way = pose[:3, :3] @ flash + pose[:3, 3] - places
+    away = np.linalg.norm(way, axis=1)
+    radiance = PAPER / np.pi * rgb * (way[:, 2] / away**3)[:, None]
+    radiance[3] *= 0.05
+    sheet = Sheet({}, {"a": (places, radiance)})
+    motion = Motion({"a": (LENS, pose)}, np.zeros((0, 3)), None, {})
+    np.testing.assert_allclose(sheet.strengths(motion, flash)["a"], rgb)
 
 
 def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin():

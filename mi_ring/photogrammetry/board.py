@@ -254,17 +254,18 @@ def umeyama(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.
     return scale, rotation, target - scale * rotation @ middle
 
 
-def white(linear: np.ndarray, sighting: Sighting) -> np.ndarray | None:
-    """The paper's linear colour (3,) in a photograph (H, W, 3) float32; None where too little of it is seen.
+def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarray]:
+    """White squares of which a photograph (H, W, 3) float32 shows all four corners: middles (n, 3) and colours (n, 3).
 
-    The median about the markers of white squares of which all four corners are seen.
+    Middles are on the sheet, as the sighting has them; colours are linear, medians about the markers.
     """
     pixels = dict(zip(sighting.ids.tolist(), sighting.pixels))
+    places = dict(zip(sighting.ids.tolist(), sighting.points))
     inner = (1 - MARKER) / 4  # half way between the square's edge and the marker's, in squares
     rim = np.linspace(inner, 1 - inner, 9)[:, None] * [1, 0] + [0, inner]
     rims = np.concatenate([rim, rim[:, ::-1], 1 - rim, 1 - rim[:, ::-1]])
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
-    found = []
+    middles, colours = [], []
     for corner in pixels:
         ring = [corner, corner + 1, corner + COLUMNS - 1, corner + COLUMNS]
         row, column = divmod(corner, COLUMNS - 1)
@@ -275,5 +276,7 @@ def white(linear: np.ndarray, sighting: Sighting) -> np.ndarray | None:
             continue
         plane = cv2.getPerspectiveTransform(unit, four)
         x, y = (cv2.perspectiveTransform(rims[None], plane)[0] - 0.5).astype(np.float32).T
-        found.append(cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0])
-    return np.median(np.concatenate(found), 0) if found else None
+        seen = cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        middles.append(np.mean([places[k] for k in ring], 0))
+        colours.append(np.median(seen, 0))
+    return np.array(middles).reshape(-1, 3), np.array(colours).reshape(-1, 3)

@@ -64,18 +64,21 @@ class Sheet(NamedTuple):
     """What photographs show of the printed sheet."""
 
     sightings: dict[str, Sighting]  #: by the photograph's name
-    white: dict[str, np.ndarray]  #: (3,) linear colour of the paper, by the photograph's name
+    white: dict[str, tuple[np.ndarray, np.ndarray]]  #: by the same, what `mi_ring.photogrammetry.board.white` says
 
-    def strengths(self, motion: Motion) -> dict[str, np.ndarray]:
-        """Intensities (3,) of lights at the cameras that make the paper as bright as it is, by the photograph's name.
+    def strengths(self, motion: Motion, flash: np.ndarray) -> dict[str, np.ndarray]:
+        """Intensities (3,) of the flash that make the paper as bright as it is, by the photograph's name.
 
-        `motion` is in the frame of the sheet. They are those of the flash, and of the exposure and white balance.
+        `motion` is in the frame of the sheet, `flash` (3,) in the camera's axes. They are those of the exposure and the
+        white balance, too.
         """
         found = {}
         for name in self.white.keys() & motion.cameras.keys():
-            way = motion.cameras[name][1][:3, 3] - self.sightings[name].points.mean(0)
-            away = np.linalg.norm(way)
-            found[name] = np.pi * self.white[name] / PAPER * away**3 / max(way[2], 1e-9)
+            pose, (places, colours) = motion.cameras[name][1], self.white[name]
+            way = pose[:3, :3] @ flash + pose[:3, 3] - places
+            falloff = way[:, 2:] / np.linalg.norm(way, axis=1, keepdims=True) ** 3
+            if len(places) and (way[:, 2] > 0).all():
+                found[name] = np.median(np.pi / PAPER * colours / falloff, 0)  # some squares are in a shadow
         return found
 
 
@@ -89,13 +92,13 @@ def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progres
         for picture in progress(pictures, "sheet"):
             if sighting := board.detect(picture.srgb()):
                 paper = white(picture.linear(), sighting)
-                known[picture.name] = [a.tolist() for a in sighting] + [None if paper is None else paper.tolist()]
+                known[picture.name] = [a.tolist() for a in (*sighting, *paper)]
             picture.close()
         write_file(kept, json.dumps(known))
-    sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, _) in known.items()}
+    sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, *_) in known.items()}
     if len(sightings) < FEWEST_SIGHTINGS:
         return None
-    return Sheet(sightings, {name: np.array(paper) for name, (*_, paper) in known.items() if paper})
+    return Sheet(sightings, {n: (square * np.array(m), np.array(c)) for n, (*_, m, c) in known.items() if m})
 
 
 def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
@@ -294,7 +297,7 @@ def shots(
 
     The sheet tells how strong it is. Without one that is not known, and it is made so weak that fits see that it isn't.
     """
-    known = sheet.strengths(motion) if sheet else {}
+    known = sheet.strengths(motion, flash) if sheet else {}
     usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM)
     result = []
     for picture, exposure in zip(pictures, relative_exposures(pictures)):
