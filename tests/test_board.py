@@ -219,7 +219,7 @@ def test_white_is_the_papers_colour(aside):
     linear = ((picture / 255.0) ** 2.2).astype(np.float32)
     places, colours = white(linear, sightings["00"])
     np.testing.assert_allclose(colours, np.broadcast_to(0.06 + 0.94 * PAPER, colours.shape), rtol=0.06)
-    np.testing.assert_allclose(places[:, :2] % 20, 10)  # middles of squares [mm]
+    np.testing.assert_allclose(places[:, :2] / 20, (places[:, :2] / 20).round(), atol=1e-6)  # of 9 x 13 squares
     few = Sighting(*(part[:6] for part in sightings["00"]))
     assert not len(white(linear, few)[0])
 
