@@ -250,7 +250,7 @@ def searched(
     First in whole photographs, reduced; then closer to what was found.
     """
     body, plane = find_body(space, hints, progress)
-    if body is None:
+    if body is None or not all(body.coverage(view).any() for view in space.views):
         raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
                          "nor one that the flash lights more than what is around it; give --masks")  # fmt: skip
     views, windows = [], {}
