@@ -25,6 +25,7 @@ from mi_ring.photogrammetry.workflow import (
     find_object,
     find_sheet,
     require_same_photographs,
+    require_sides,
     shots,
     upright,
 )
@@ -96,6 +97,7 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"--box: is in the frame of the sheet of `mi-ring board`, which {config.folder} does not show")
     motion, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
     print(cameras_report(motion))
+    require_sides(motion, config.folder)
     if sheet:
         moved = align(sheet.sightings, motion.cameras)
         motion = motion.moved(moved.scale, moved.rotation, moved.shift)

@@ -1,6 +1,10 @@
 """The command that makes a capture of a folder of photographs, and the stages of its way."""
 
 import json
+import subprocess
+import sys
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +19,7 @@ from mi_ring.photogrammetry.folder import Picture, relative_exposures
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.views import camera_of
-from mi_ring.photogrammetry.workflow import PAPER, Sheet, upright
+from mi_ring.photogrammetry.workflow import PAPER, Sheet, require_sides, upright
 from mi_ring.system import command
 
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -134,6 +138,23 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
     assert plane.offset * 18 == pytest.approx(-3, rel=0.1)  # the cameras are 18 away, now 1
     for (_, pose), before in zip(exact.cameras.values(), poses(12)):
         assert pose[2, 1] == pytest.approx(before[2, 1])  # how much the photograph's down is the world's up
+
+
+@pytest.mark.parametrize("degrees, enough", [(12, False), (18, True)])
+def test_photographs_from_one_side_are_refused(degrees, enough):
+    turns = Rotation.from_euler("y", np.linspace(-degrees / 2, degrees / 2, 5)[:, None], degrees=True).as_matrix()
+    poses_ = [np.block([[turn, np.ones((3, 1))], [np.eye(4)[3:]]]) for turn in turns]
+    motion = Motion({str(k): (LENS, pose) for k, pose in enumerate(poses_)}, np.zeros((0, 3)), None, {})
+    with nullcontext() if enough else pytest.raises(InputError, match="folder: .* within 12 degrees; walk around"):
+        require_sides(motion, Path("folder"))
+
+
+def test_a_process_that_is_ended_says_nothing():
+    """COLMAP's library would print a stack trace."""
+    pytest.importorskip("pycolmap")
+    code = "import os; from mi_ring.system.optional import need; need('pycolmap', ''); os.kill(os.getpid(), 15)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (-15, "")
 
 
 def test_exposures_of_exif(tmp_path):

@@ -25,6 +25,7 @@ from mi_ring.system.files import write_file
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
 CLOSE = 400  #: along the object, in the pictures that its outlines are found in
+FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
 PAPER = 0.8  #: albedo of white paper
 DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
@@ -115,6 +116,15 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
     model = Colmap.model(source.src)
     points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
     return Motion(cameras, points, None, failed)
+
+
+def require_sides(motion: Motion, folder: Path) -> None:
+    """Raise InputError if all photographs are from one side, which does not tell how deep anything is."""
+    ahead = np.stack([pose[:3, 2] for _, pose in motion.cameras.values()])
+    widest = float(np.degrees(np.arccos(np.clip((ahead @ ahead.T).min(), -1, 1))))
+    if widest < FEWEST_DEGREES:
+        raise InputError(f"{folder}: photographs: all are from one side, within {widest:.0f} degrees; walk around the "
+                         "object, 10 degrees at a time")  # fmt: skip
 
 
 def find_cameras(

@@ -1,6 +1,8 @@
 """Packages that not every machine can install: asked for when they are needed."""
 
 import importlib
+import signal
+import threading
 from types import ModuleType
 
 from mi_ring.errors import InputError
@@ -9,9 +11,13 @@ from mi_ring.errors import InputError
 def need(package: str, what: str) -> ModuleType:
     """Import a package. Raises InputError, which says `what` it is for, if it is not installed."""
     try:
-        return importlib.import_module(package)
+        module = importlib.import_module(package)
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
         raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install {package}` "
                          "(for some systems, Linux on ARM for one, there is none ready-made)") from error  # fmt: skip
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # pycolmap has put one of its own, which prints a stack trace
+    return module
