@@ -140,6 +140,7 @@ def values(tmp_path):
         "shapenet": [
             {"weights": str(tmp_path / "ring.pt"), "subdivisions": 1, "to_world": moved, "flash": False},
             {"domain": str(tmp_path / "ball.ply"), "center": [1, 2, 3], "radius": 2.0, "subdivisions": 1,
+             "ground": [1, 1, 3], "up": [0, 2, 0],
              "bsdf": {"type": "cooktorrance", "diffuse": grey, "specular": 0.2, "roughness": 0.4}},
         ],
         "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "distribution": "beckmann"}],
