@@ -1,6 +1,7 @@
 """The commands `fit` and `render` from end to end on a small capture."""
 
 import json
+import math
 import os
 import re
 import signal
@@ -25,6 +26,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting import checkpoint, optimizers, session, start, terms
 from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
@@ -590,23 +592,44 @@ def test_paper_preset_is_the_papers():
 
 
 def test_regulariser_is_relaxed_and_nothing_else():
-    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04), calm=0.5))
-    assert terms.default_terms["velocity"].schedule(it) == pytest.approx(0.2)
+    state = SimpleNamespace(config=Config(velocity_decay=0.04), calm=0.5, unexplained=0.06)
+    schedule = terms.default_terms["velocity"].schedule
+    assert schedule(SimpleNamespace(fit=state)) == pytest.approx(0.2)
+    state.unexplained = 0.18  # photographs that disagree with the model
+    assert schedule(SimpleNamespace(fit=state)) == pytest.approx(0.9**4)
+    state.unexplained = 0.5
+    assert schedule(SimpleNamespace(fit=state)) == 1
     assert all(term.schedule is None for name, term in terms.default_terms.items() if name != "velocity")
+
+
+def test_what_is_unexplained_is_a_share_of_the_objects_light():
+    observed = torch.tensor([0.5, 0.25, 0.1, 0.4, 9.0]).reshape(1, 1, 5, 1).expand(1, 1, 5, 3)
+    predicted = torch.tensor([0.4, 0.30, 9.0, 0.7, 0.0]).reshape(1, 1, 5, 1).expand(1, 1, 5, 3)
+    clipped = torch.zeros(1, 1, 5, 3, dtype=torch.bool)
+    clipped[..., 3, :] = True  # brighter than observed: no error
+    it = SimpleNamespace(predicted=predicted, observed=observed, clipped=clipped, masked=torch.tensor([True]),
+                         mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]),
+                         coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))  # fmt: skip
+    assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
+    it.masked = torch.tensor([False])  # then what is predicted to be the object is
+    assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05 + 9) / (0.5 + 0.25 + 0.4 + 9))
 
 
 def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up_unless_it_is_late():
     ball = trimesh.creation.icosphere(2)
     two = ball + trimesh.creation.icosphere(2).apply_translation([0.5, 0, 0])
-    state = SimpleNamespace(iterations=200, crossing=0.0, calm=0.0, held=False)
+    state = SimpleNamespace(iterations=200, crossing=0.0, calm=0.0, held=False, unexplained=0.5)
 
     def go(numbers, mesh):
         for number in numbers:
             vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
-            Fit.hold(state, SimpleNamespace(number=number, progress=(number - 1) / 200, vertices=vertices, faces=faces))
+            share = 0.1 if number < 20 else math.nan
+            Fit.hold(state, SimpleNamespace(number=number, progress=(number - 1) / 200, vertices=vertices, faces=faces,
+                                            unexplained=lambda share=share: share))  # fmt: skip
 
     go(range(1, 20), ball)
     assert state.calm == pytest.approx(19 / 200)  # as planned
+    assert state.unexplained == pytest.approx(0.1 + 0.4 * 0.9**19)
     go(range(20, 80), two)
     assert state.crossing > 0.05 and state.calm == pytest.approx(-0.3)
     go(range(80, 100), ball)

@@ -59,7 +59,8 @@ class Config:
     flow is, the paper's lambda."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
-    while it finds its place, weak at the end, for details. It is held back while the surface crosses itself."""
+    while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while
+    much of the light is unexplained."""
     laplacian_scale: float = 0.01
     """The paper's alpha: how much the regulariser smoothes the velocity field."""
     blur: float = 0.06

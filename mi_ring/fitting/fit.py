@@ -32,11 +32,12 @@ from mi_ring.system.machine import autocast, device
 
 LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
-RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing"}
+RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
 CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
 CROSSING_EVERY = 20  #: iterations between counts of them
 STRONGEST = -0.3  #: the least `calm`
 RETREAT, CATCH_UP = 2.0, 3.0  #: how fast the regulariser strengthens then, and weakens afterwards; 1 is as planned
+RECENT = 0.1  #: weight of an iteration in the mean of what is unexplained
 LATE = 0.6  #: progress after which a surface that crosses itself says that the regulariser is too weak
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
@@ -97,6 +98,7 @@ class Fit:
         self.crossing: float = 0.0  #: share of the triangles that cross others, when they were counted last
         self.calm: float = 0.0  #: how far the regulariser has weakened: like `progress`, but for holding back
         self.held = False  # did it cross itself late?
+        self.unexplained: float = 1.0  #: share of the object's light that is not as predicted, of the last iterations
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
@@ -241,7 +243,8 @@ class Fit:
         """Let the regulariser weaken as the fit goes on; hold it and strengthen it while the surface crosses itself.
 
         Where photographs disagree with the model a weak one lets the surface fold. Limbs that grow cross in passing,
-        early: afterwards the regulariser catches up with its plan. Where they cross late it does not.
+        early: afterwards the regulariser catches up with its plan. Where they cross late it does not. How much they
+        disagree is noted as well, see `terms.strength`.
         """
         step = 1 / self.iterations
         if it.number % CROSSING_EVERY == 0:
@@ -251,6 +254,9 @@ class Fit:
             self.calm = max(STRONGEST, self.calm - RETREAT * step)
         else:
             self.calm = min(it.number * step, self.calm + (1.0 if self.held else CATCH_UP) * step)
+        unexplained = it.unexplained()
+        if math.isfinite(unexplained):
+            self.unexplained += RECENT * (unexplained - self.unexplained)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.
@@ -284,6 +290,7 @@ class Fit:
             "crossing": self.crossing,
             "calm": self.calm,
             "held": self.held,
+            "unexplained": self.unexplained,
         }
         return copy.deepcopy(state)  # which the next iteration would change
 
@@ -295,6 +302,7 @@ class Fit:
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
         self.crossing, self.calm, self.held = state["crossing"], state["calm"], state["held"]
+        self.unexplained = state["unexplained"]
 
 
 def require_networks(ring: Ring) -> None:

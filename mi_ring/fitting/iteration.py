@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mi_ring.fitting.schedule import Stage
@@ -50,7 +51,17 @@ class Iteration:
             "iteration": self.number, "seconds": round(fit.seconds, 3), "loss": self.loss, **self.terms,
             "weights": self.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
             "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices), "crossing": fit.crossing,
+            "unexplained": fit.unexplained,
         }  # fmt: skip
+
+    def unexplained(self) -> float:
+        """How much of the object's light is not as predicted, as a share of it; NaN where no light of it is seen."""
+        with torch.no_grad():
+            masked = self.masked.to(self.mask.device)[:, None, None]
+            surely = torch.minimum(torch.where(masked, self.mask, 1.0), self.coverage) > 0.99
+            error = (self.predicted - self.observed)[surely]
+            error = torch.where(self.clipped[surely], error.clamp(max=0), error)
+            return float(error.abs().sum() / self.observed[surely].sum())
 
     def detach(self) -> None:
         """Let go of the graph, when the backward pass is done."""
