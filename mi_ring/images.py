@@ -7,6 +7,7 @@ import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -38,9 +39,14 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 
 def read_image(path: Path) -> np.ndarray:
     """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32."""
-    # imageio reads PNGs of 16 bits as 8, silently; Mitsuba reads no TIFF.
-    tiff = path.suffix.lower() in (".tif", ".tiff")
-    pixels = np.array(imageio.imread(path) if tiff else mi.Bitmap(str(path)), copy=True)
+    suffix = path.suffix.lower()
+    if suffix in (".tif", ".tiff"):  # which Mitsuba does not read
+        pixels = np.array(imageio.imread(path))
+    elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
+        with Image.open(path) as image:
+            pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
+    else:  # others read PNGs of 16 bits as 8, silently
+        pixels = np.array(mi.Bitmap(str(path)), copy=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return pixels if pixels.ndim == 3 else pixels[:, :, None]

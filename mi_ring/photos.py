@@ -1,17 +1,20 @@
 """From a folder of photographs to a capture to fit: `python -m mi_ring.photos FOLDER DIR`."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.errors import InputError
+from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
@@ -21,6 +24,7 @@ from mi_ring.photogrammetry.scene import windows, write_shot
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
     Hints,
+    Object,
     find_cameras,
     find_object,
     find_sheet,
@@ -31,6 +35,7 @@ from mi_ring.photogrammetry.workflow import (
 )
 from mi_ring.system import command
 from mi_ring.system.files import writing
+from mi_ring.system.progress import progress
 
 
 @dataclass(frozen=True)
@@ -47,8 +52,9 @@ class PhotosConfig:
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
     """Folder to write: scene.xml, with what belongs to it; work/ holds what has been found so far."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the flash from the lens, in the camera's axes (x right, y down, z forward) [mm with a sheet; else the unit is
-    the median distance from the cameras to the object]."""
+    """Of the flash from the lens, in the camera's axes (x right, y down, z forward) as most photographs are shown: of
+    those held otherwise it turns with the camera [mm with a sheet; else the unit is the median distance from the
+    cameras to the object]."""
     turntable: bool = False
     """Did the object turn, with the sheet under it, while camera and flash stood?"""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
@@ -65,11 +71,6 @@ class PhotosConfig:
             raise InputError(f"--square-mm: is {self.square_mm}, must be above 0")
 
 
-def progress(things: Iterable, what: str, total: int | None = None) -> Iterable:
-    """Iterates over things and shows how far it is."""
-    return tqdm(things, what, total, leave=False, disable=None)
-
-
 def cameras_report(motion: Motion) -> str:
     """What structure from motion has found."""
     count, failed = len(motion.cameras), motion.failed
@@ -80,14 +81,41 @@ def cameras_report(motion: Motion) -> str:
     ])  # fmt: skip
 
 
+def masks_report(found: Object, motion: Motion) -> str:
+    """Which photographs have a mask."""
+    without = [name for name in motion.cameras if name not in found.masks]
+    why = "does not show the object, or not clearly enough for a mask"
+    return "\n".join([
+        f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs",
+        *(f"  without: {name}: {why}" for name in without),
+    ])  # fmt: skip
+
+
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if `check` finds something to mend."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
-    scene = config.out / "scene.xml"
-    if scene.exists():
+    scene, sheet = config.out / "scene.xml", config.out / "check.png"
+    if scene.exists() and sheet.exists():
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it to make it anew from "
                          f"{config.out}/work")  # fmt: skip
-    pictures = find_pictures(config.folder)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        if not scene.exists():
+            make(config, scene)
+        inspection = inspect(load_capture(scene))
+    except KeyboardInterrupt:
+        print("mi_ring.photos: interrupted; the same command goes on", file=sys.stderr, flush=True)
+        os._exit(130)  # native threads do not let themselves be ended; what they write is whole or not at all
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    inspection.save(sheet, "DIR")
+    print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
+    return int(bool(inspection.findings))
+
+
+def make(config: PhotosConfig, scene: Path) -> None:
+    """The capture, from what has been found so far."""
+    pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
     with writing(config.out):
         config.out.mkdir(parents=True, exist_ok=True)
     work = config.out / "work"
@@ -108,6 +136,9 @@ def main(arguments: Sequence[str]) -> int:
     hints = Hints(plane, config.box, config.masks)
     found = find_object(pictures, motion, hints, work / "masks", progress)
     plane = found.plane
+    print(masks_report(found, motion))
+    if config.masks == "auto":  # what shows a table and no mask would be taken for the object
+        motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
     if not sheet:
         motion, plane = upright(motion, found.center, plane)
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
@@ -120,10 +151,6 @@ def main(arguments: Sequence[str]) -> int:
     finally:
         writer.close()
     print(f"{scene}: {len(taken)} photographs\n")
-    inspection = inspect(load_capture(scene))
-    inspection.save(config.out / "check.png", "DIR")
-    print(f"{inspection.text}\nContact sheet: {config.out / 'check.png'}\nNow: mi-ring fit {scene}")
-    return int(bool(inspection.findings))
 
 
 if __name__ == "__main__":

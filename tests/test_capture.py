@@ -15,6 +15,7 @@ from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.importers.reading import pixels_of
 from mi_ring.rendering import bridge
 from mi_ring.ring.saved import load_fit, ring_state
 from mi_ring.system.files import write_state
@@ -267,3 +268,15 @@ def test_exposure_and_reflectance_follow_the_lamp(small_capture):
     assert exposure == pytest.approx(inside.mean().item(), rel=1e-5)
     # The lamp gives 2.2 at the centre, so a surface there that looks `exposure` bright reflects exposure / 2.2.
     assert scene.reflectance(CENTER, exposure) == pytest.approx(exposure / 2.2, rel=1e-4)
+
+
+def test_a_jpeg_that_ends_too_early_is_refused(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    images.write_image(noise, tmp_path / "a.jpg")
+    whole = np.array(mi.Bitmap(str(tmp_path / "a.jpg")))
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.jpg"), whole)
+    content = (tmp_path / "a.jpg").read_bytes()
+    for share in (0.3, 0.99):
+        (tmp_path / "a.jpg").write_bytes(content[: int(share * len(content))])
+        with pytest.raises(InputError, match=r"a.jpg: cannot be read as image \(image file is truncated"):
+            pixels_of(tmp_path / "a.jpg")

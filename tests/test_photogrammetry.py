@@ -18,6 +18,7 @@ from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.motion import Motion, pairs_to_match
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
+from mi_ring.photogrammetry.workflow import Hints, find_body
 from mi_ring.rendering.lights import Light
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid
@@ -117,8 +118,11 @@ def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
     np.testing.assert_array_equal(masks.unsure(mask, guess), expected)
 
 
-def on_a_table(pose, random, gain):
-    """The ellipsoid over a table of many colours, lit by a flash with a cone, a little room light; and its mask."""
+def on_a_table(pose, random, gain, bare=False):
+    """The ellipsoid over a table of many colours, lit by a flash with a cone, a little room light; and its mask.
+
+    A bare table is without it.
+    """
     camera = camera_of(LENS, pose)
     t, cosine = hit_ellipsoid(camera)
     rays = rays_of(camera)
@@ -127,7 +131,7 @@ def on_a_table(pose, random, gain):
     place = camera.position + away[:, None] * rays
     pattern = 0.45 + 0.3 * np.sin(1.7 * place[:, :1] + [0, 1, 2]) * np.cos(2.3 * place[:, 1:2] + [2, 0, 1])
     cone = (rays @ camera.forward) ** 3
-    object_ = np.isfinite(t)
+    object_ = np.isfinite(t) & (not bare)
     distance, facing = np.where(object_, t, away), np.where(object_, cosine, -rays[:, 2])
     albedo = np.where(object_[:, None], [0.5, 0.42, 0.36], pattern)
     radiance = gain * albedo * (cone * np.clip(facing, 0, 1) * (18 / distance) ** 2 + 0.03)[:, None]
@@ -146,11 +150,32 @@ def test_what_stands_on_a_table_differs_from_it():
         true.append(mask)
     plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     space = masks.Space.seen_by(views)
-    guesses = table.not_table(views, plane, space.center, space.reach)
+    guesses = table.Table(views, plane, space.center, space.reach, lambda things, *_: things).others()
     assert np.median([masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
-    sure = table.patterns(views, plane, CENTER, 5.0)
+    sure = table.Table(views, plane, CENTER, 5.0, lambda things, *_: things).patterns()
     assert max((s & t).sum() for s, t in zip(sure, true)) < 0.01 * np.mean([t.sum() for t in true])
     assert np.mean([s.sum() for s in sure]) > 0.1 * sure[0].size
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_table_that_the_flash_lights_is_no_object(bare):
+    random = np.random.default_rng(1)
+    views = [view(str(k), pose, on_a_table(pose, random, 1.0, bare)[0]) for k, pose in enumerate(poses(20, lowest=30))]
+    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    body = find_body(masks.Space.seen_by(views), Hints(plane), False, lambda things, *_: things)
+    if bare:
+        assert body is None
+    else:
+        np.testing.assert_allclose(body.points.mean(0), CENTER, atol=0.5)
+
+
+def test_a_few_voxels_are_no_object():
+    views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
+    space = masks.Space.seen_by(views)
+    for radius, enough in ((1.2, False), (3.0, True)):
+        near = np.linalg.norm(space.grid - space.grid[len(space.grid) // 2], axis=1)
+        space.allowed = near < radius * (space.axis[1] - space.axis[0])
+        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views]) is not None) == enough
 
 
 def test_the_pattern_of_the_table_is_known_again_in_a_shadow():

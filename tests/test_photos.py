@@ -115,7 +115,7 @@ def test_the_sheet_tells_how_strong_the_flash_is():
     radiance[3] *= 0.05
     sheet = Sheet({}, {"a": (places, radiance)})
     motion = Motion({"a": (LENS, pose)}, np.zeros((0, 3)), None, {})
-    np.testing.assert_allclose(sheet.strengths(motion, flash)["a"], rgb)
+    np.testing.assert_allclose(sheet.strengths(motion, {"a": flash})["a"], rgb)
 
 
 def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin():

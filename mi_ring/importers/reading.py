@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import scipy.io
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from mi_ring.errors import InputError
 from mi_ring.images import read_image
@@ -31,7 +32,8 @@ def image_size(path: Path) -> tuple[int, int]:
             width, height = mi.Bitmap(str(file)).size()
             return width, height
         with Image.open(file) as image:
-            return image.size
+            # Pillow turns TIFFs by their orientation, `read_image` does not.
+            return (image.tag_v2[256], image.tag_v2[257]) if isinstance(image, TiffImageFile) else image.size
 
     return read_as(path, "image", size)
 

@@ -1,6 +1,7 @@
 """Writes frames as a scene file with its images, whole or not at all."""
 
 import contextlib
+import filecmp
 import os
 import shutil
 import tempfile
@@ -50,9 +51,13 @@ class Writer:
         return relative_to(self.scene.parent, path)
 
     def finish(self, xml: bytes) -> None:
-        """Move everything to its place. Raises InputError if there are other files, which may be the sources."""
+        """Move everything to its place. Raises InputError if there are other files, which may be the sources.
+
+        Files that are the same are left by one that was ended here.
+        """
         for file in self.files:
-            if (self.folder / file).exists():
+            place = self.folder / file
+            if place.exists() and not filecmp.cmp(self.staging / file, place, shallow=False):
                 raise InputError(f"{self.folder / file}: exists already; give SCENE.xml another name or folder")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """Whether a capture is usable and what is wrong with it: a table, findings and a contact sheet."""
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from mi_ring.metrics.captures import capture_findings, drop_empty, facing, measu
 from mi_ring.metrics.mask_agreement import agreements
 from mi_ring.output.capture_sheet import capture_sheet
 from mi_ring.system.files import write_file, writing
+from mi_ring.system.progress import progress
 
 
 @dataclass(frozen=True)
@@ -33,17 +35,27 @@ class Inspection:
 
 def inspect(capture: Capture) -> Inspection:
     """Measure a capture. Empty masks, which are findings, are taken from it."""
+    with progress(None, "inspecting", 4) as bar:
+        return inspected(capture, bar.update)
+
+
+def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
+    """As `inspect`; `advance` is called after each of its four steps."""
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(capture)]
     try:
         center, radius = capture.sphere()
     except NoHull as error:
         center, radius = sphere_of_cameras(capture)
         found += [] if capture.whole else [str(error)]
+    advance()
     agreement, wrong = agreements(capture)
+    advance()
     rows = measure(capture, center, radius, agreement)
+    advance()
     found += wrong or filter(None, [facing(capture, center)])
     found += capture_findings(capture, rows, center)
     page = capture_sheet(capture, rows, center, radius)
+    advance()
     given = sum(mask is not None for mask in capture.masks)
     if capture.threshold is not None:
         masks = "found by brightness, for the room was dark"

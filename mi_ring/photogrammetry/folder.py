@@ -1,5 +1,7 @@
 """The photographs of a folder: which there are, their pixels and what their EXIF data say."""
 
+import hashlib
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,14 +18,16 @@ from mi_ring.system.optional import need
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 HEIF = (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF
 FEWEST = 8  #: photographs that a reconstruction needs at least
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph as it was taken. Pixels are those of the sensor: EXIF orientation is left alone."""
+    """A photograph."""
 
     path: Path
+    upright: bool = True  #: turned as EXIF says; else as the file has it, which other tools' cameras refer to
 
     @property
     def name(self) -> str:
@@ -36,6 +40,10 @@ class Picture:
 
         Raises InputError if it cannot be read.
         """
+        return turned(self.stored(), self.orientation)
+
+    def stored(self) -> np.ndarray:
+        """`pixels` before they are turned."""
         suffix = self.path.suffix.lower()
         if suffix in RAW:
             return read_as(self.path, "raw photograph", develop)
@@ -46,6 +54,17 @@ class Picture:
         if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
+
+    @cached_property
+    def orientation(self) -> int:
+        """By EXIF's numbers, how the pixels of the file are still to be turned; HEIF's reader has done so."""
+        suffix = self.path.suffix.lower()
+        if not self.upright or suffix in HEIF:
+            return 1
+        if suffix in RAW:
+            return FLIPS.get(read_as(self.path, "raw photograph", flip), 1)
+        value = exif_of(self.path).get(ExifTags.Base.Orientation)
+        return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
     @property
     def encoding(self) -> str:
@@ -60,7 +79,8 @@ class Picture:
             return width, height
         if self.path.suffix.lower() in HEIF:
             need("pillow_heif", f"{self.path}").register_heif_opener()
-        return image_size(self.path)
+        width, height = image_size(self.path)
+        return (height, width) if self.orientation > 4 else (width, height)
 
     def grey(self, longest: int) -> np.ndarray:
         """For features: (h, w) uint8 of so many pixels at most, each the mean of as many whole ones."""
@@ -104,7 +124,7 @@ class Picture:
         file = next((f for name in names if (f := Path(source) / name).is_file()), None)
         if file is None:
             return None
-        mask = read_as(file, "mask", read_image)[:, :, 0]
+        mask = Picture(file, self.upright).pixels[:, :, 0]
         if mask.shape[::-1] != self.size:
             sizes = *mask.shape[::-1], *self.size
             raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
@@ -122,8 +142,41 @@ def develop(path: Path) -> np.ndarray:
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 
-def find_pictures(folder: Path) -> list[Picture]:
-    """The photographs of a folder, by name. Raises InputError if there is no such folder or if they are too few."""
+def flip(path: Path) -> int:
+    """How a raw photograph is turned, by LibRaw's numbers."""
+    with need("rawpy", f"{path}").imread(str(path)) as raw:
+        return raw.sizes.flip
+
+
+def mirrors(orientation: int) -> tuple[bool, int, int]:
+    """What turns a picture of an orientation by EXIF: are rows columns, then the signs of columns and rows."""
+    columns, rows = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
+    return orientation > 4, columns, rows
+
+
+def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels (H, W, …) of an orientation by EXIF as they are to be shown."""
+    across, columns, rows = mirrors(orientation)
+    return np.ascontiguousarray((pixels.swapaxes(0, 1) if across else pixels)[::rows, ::columns])
+
+
+def axes_of(orientation: int) -> np.ndarray:
+    """(3, 3): from the axes of the sensor, x right, y down, z forward, to those of the photograph as it is shown."""
+    across, columns, rows = mirrors(orientation)
+    return np.diag([columns, rows, 1.0]) @ np.eye(3)[[1, 0, 2] if across else [0, 1, 2]]
+
+
+def turned_with(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
+    """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name."""
+    usual, _ = Counter(picture.orientation for picture in pictures).most_common(1)[0]
+    return {p.name: axes_of(p.orientation) @ axes_of(usual).T @ vector for p in pictures}
+
+
+def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
+    """The photographs of a folder, by name, turned or not.
+
+    Raises InputError if there is no such folder, if they are too few or if some are the same.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "
                          "of the photographs")  # fmt: skip
@@ -138,13 +191,26 @@ def find_pictures(folder: Path) -> list[Picture]:
     if len(found) < FEWEST:
         raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({', '.join(PLAIN + HEIF)} or raw); at least "
                          f"{FEWEST} are needed, better 40, from all around")  # fmt: skip
-    return [Picture(path) for path in found.values()]
+    require_different(list(found.values()))
+    return [Picture(path, upright) for path in found.values()]
+
+
+def require_different(files: Sequence[Path]) -> None:
+    """Raise InputError, which says which, if files have the same content."""
+    sizes = Counter(path.stat().st_size for path in files)
+    alike = defaultdict(list)
+    for path in files:
+        if sizes[path.stat().st_size] > 1:
+            alike[hashlib.sha256(path.read_bytes()).digest()].append(path.name)
+    for names in alike.values():
+        if len(names) > 1:
+            raise InputError(f"{files[0].parent}: FOLDER: {', '.join(names)} are the same photograph; keep one of them")
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
     """The focal length by EXIF, as of a frame 36 mm wide, of the first photograph that says; None if none does."""
     for picture in pictures:
-        exif = exif_of(picture.path)
+        exif = exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)
         value = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
         if isinstance(value, int | float) and value > 0:
             return float(value)
@@ -155,7 +221,7 @@ def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
     """(N,) by EXIF, 1 for the one in the middle; all 1 unless all photographs say."""
     exposures = []
     for picture in pictures:
-        exif = exif_of(picture.path)
+        exif = exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)
         tags = ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber
         try:
             seconds, iso, number = (float(np.ravel(exif[tag])[0]) for tag in tags)
@@ -166,12 +232,14 @@ def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
     return found / np.median(found) if np.isfinite(found).all() and (found > 0).all() else np.ones(len(found))
 
 
-def exif_of(path: Path) -> dict:
-    """EXIF data about the exposure, empty where there are none."""
+def exif_of(path: Path) -> Image.Exif:
+    """EXIF data, empty where there are none."""
     try:
         if path.suffix.lower() in HEIF:
             need("pillow_heif", f"{path}").register_heif_opener()
         with Image.open(path) as image:
-            return dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
+            exif = image.getexif()
+            exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+            return exif
     except (OSError, SyntaxError):  # damaged, or a raw format that Pillow does not know
-        return {}
+        return Image.Exif()

@@ -21,6 +21,7 @@ from mi_ring.photogrammetry.views import View
 SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
 AGREE = 0.9  #: share of those that must call it object
 RESOLUTION = 96  #: voxels along an edge of the space that is looked at
+FEWEST = 30  #: voxels of an object: a few agree anywhere, and then agree perfectly
 BAND = 0.04  #: of the object's size: GrabCut decides so far inside the votes' outline, and somewhat further outside
 ROUNDS, SETTLED = 6, 0.995  #: at most; or when so much of the masks' union is the same as before
 DARKEST = 1e-3  #: radiance below which nothing is told
@@ -84,18 +85,18 @@ class Space:
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + body.spacing)
 
     def vote(self, masks: Sequence[np.ndarray]) -> Body | None:
-        """The largest piece of what most masks (H, W) call object; None if there is nothing."""
+        """The largest piece of what most masks (H, W) call object; None if it is next to nothing."""
         yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
         for view, mask in zip(self.views, masks):
             pixel, inside = view.places(self.grid)
             shown += inside
             yes += inside & (mask[pixel[:, 1], pixel[:, 0]] > 0)
         object_ = (yes >= AGREE * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
-        pieces, count = ndimage.label(object_.reshape([len(self.axis)] * 3))
-        if not count:
-            return None
+        pieces, _ = ndimage.label(object_.reshape([len(self.axis)] * 3))
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
+        if sizes.max() < FEWEST:
+            return None
         return Body(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
 
 

@@ -1,10 +1,11 @@
 """Structure from motion: cameras and points from photographs alone, by COLMAP's library."""
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image
@@ -22,6 +23,8 @@ NEIGHBOURS, KEYS = 12, 40  #: beyond: with so many before and after, and so many
 PAIRS_AT_ONCE = 60
 ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
 TEXTURED, MATCHED = 300, 50  #: features of a photograph, and matches of two, from which they are worth something
+STILL, MOST = 0.01, 0.9  #: two photographs are alike if features move so little, in widths; and pairs that must not be
+ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
 @dataclass
@@ -45,6 +48,15 @@ class Motion:
 
 
 Progress = Callable[..., Iterable]  #: (things, what, how many of them): iterates over them and shows how far it is
+Result = TypeVar("Result")
+
+
+def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
+    """What a long native call returns. Ctrl-C is heard meanwhile, not only at its end: it runs in another thread."""
+    future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
+    while not wait([future], 0.1).done:
+        pass
+    return future.result()
 
 
 def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: Progress) -> Motion:
@@ -65,7 +77,8 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
     if found < max(3, len(pictures) / 2):
         raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put "
                          f"together: {why_not(folder)}")  # fmt: skip
-    adjust(model)
+    for _ in progress(adjustments(model), "bundle adjustment"):
+        pass
     growing = folder / "sparse.partial"
     growing.mkdir(exist_ok=True)
     model.write(growing)
@@ -94,7 +107,8 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
             elif equivalent:
                 focal = equivalent / 36 * max(reduced.size)
                 reader.camera_params = f"{focal},{reduced.width / 2},{reduced.height / 2},0"
-            pycolmap.extract_features(database, grey, [file], pycolmap.CameraMode.SINGLE, reader, options)
+            mode = pycolmap.CameraMode.SINGLE
+            interruptible(pycolmap.extract_features, database, grey, [file], mode, reader, options)
             cameras = {image.name: image.camera_id for image in images_of(database)}
         lenses.setdefault(picture.size, cameras[file])
 
@@ -118,7 +132,10 @@ def pairs_to_match(count: int) -> list[tuple[int, int]]:
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Compare photographs with each other; pairs that the database has already are left as they are."""
+    """Compare photographs with each other; pairs that the database has already are left as they are.
+
+    Raises InputError after the first of them if they show everything from one place.
+    """
     pycolmap = need("pycolmap", "features")
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     pairs = pairs_to_match(len(pictures))
@@ -127,7 +144,28 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
     for batch in progress(batches, "matching"):
         chosen.write_text("".join(f"{pictures[a].name}.png {pictures[b].name}.png\n" for a, b in batch), "utf-8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
-        pycolmap.match_image_pairs(folder / "database.db", matching, pairing)
+        interruptible(pycolmap.match_image_pairs, folder / "database.db", matching, pairing)
+        if batch is batches[0] and (share := alike(folder / "database.db", len(batch))) >= MOST:
+            raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {len(batch)} pairs are "
+                             "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
+
+
+def alike(database: Path, pairs: int) -> float:
+    """The share of so many pairs that match and where features move together, as from one place."""
+    pycolmap = need("pycolmap", "features")
+    with pycolmap.Database.open(database) as opened:
+        width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
+        images = {image.image_id: width[image.camera_id] for image in opened.read_all_images()}
+        places = {k: opened.read_keypoints(k)[:, :2] for k in images}
+        still = 0
+        for number, geometry in zip(*opened.read_two_view_geometries()):
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            first, second = geometry.inlier_matches.T
+            if len(first) >= MATCHED:
+                moved = places[a][first] - places[b][second]
+                away = np.linalg.norm(moved - np.median(moved, 0), axis=1)  # nobody holds a camera quite still
+                still += float(np.median(away)) < STILL * images[a]
+    return still / pairs
 
 
 def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
@@ -138,22 +176,24 @@ def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
     for _ in range(2):  # the pair that it begins with
         next(bar, None)
     (folder / "models").mkdir(exist_ok=True)
-    models = pycolmap.incremental_mapping(
-        folder / "database.db", folder / "grey", folder / "models", options, next_image_callback=lambda: next(bar, None)
-    )
+    models = interruptible(
+        pycolmap.incremental_mapping, folder / "database.db", folder / "grey", folder / "models", options,
+        next_image_callback=lambda: next(bar, None),
+    )  # fmt: skip
     for _ in bar:
         pass
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
-def adjust(model: Any) -> None:
-    """Bundle adjustment with a robust loss, and points that do not fit left out.
+def adjustments(model: Any) -> Iterator[None]:
+    """Bundle adjustment with a robust loss, and points that do not fit left out, a few iterations at a time.
 
     Highlights and the flash's shadows move with the camera: features on them are wrong but match, and by least squares
     alone they would bend all cameras.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
     config = pycolmap.BundleAdjustmentConfig()
     for k in model.reg_image_ids():
@@ -161,7 +201,11 @@ def adjust(model: Any) -> None:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        for _ in range(100 // ITERATIONS):
+            yield
+            summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+            if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
+                break
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
             break
 

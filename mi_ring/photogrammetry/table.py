@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
 
 FLAT = 0.004  #: distance from the plane, in that of the cameras, up to which a point belongs to it
@@ -99,22 +100,46 @@ class Ground:
         return shown.reshape(height, width, *texels.shape[1:])
 
 
-def laid(ground: Ground, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """How each view has the table (views, TEXELS², 3), and the table (TEXELS², 3): log radiance, NaN where not shown.
+class Table:
+    """The table as views show it together: alike from everywhere, but for how it is lit.
 
-    The table looks alike from everywhere, but for how it is lit: a smooth function of place, found for each view.
+    That is a smooth function of place, found for each view.
     """
-    x, y = 2 * ground.u, 2 * ground.v
-    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
-    stack = np.empty((len(views), len(ground.points), 3), np.float32)
-    for own, view in zip(stack, views):
-        pixel, inside = view.places(ground.points)
-        own[:] = np.where(inside[:, None], log_radiance(view)[pixel[:, 1], pixel[:, 0]], np.nan)
-    for _ in range(3):  # the table's colours and how each photograph is lit, in turn
-        table = median(stack)
-        for own in stack:
-            own -= (smooth @ lighting(own - table, smooth))[:, None]
-    return stack, median(stack)
+
+    def __init__(
+        self, views: Sequence[View], plane: Plane, center: np.ndarray, reach: float, progress: Progress
+    ) -> None:
+        self.views, self.ground, self.progress = views, Ground(plane, center, reach), progress
+        x, y = 2 * self.ground.u, 2 * self.ground.v
+        smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+        #: How each view has it (views, TEXELS², 3), and how it is (TEXELS², 3): log radiance, NaN where not shown.
+        self.stack = np.empty((len(views), len(self.ground.points), 3), np.float32)
+        for own, view in zip(self.stack, progress(views, "table")):
+            pixel, inside = view.places(self.ground.points)
+            own[:] = np.where(inside[:, None], log_radiance(view)[pixel[:, 1], pixel[:, 0]], np.nan)
+        for number in range(3):  # the table's colours and how each photograph is lit, in turn
+            colours = median(self.stack)
+            for own in progress(self.stack, f"table, round {number + 1}"):
+                own -= (smooth @ lighting(own - colours, smooth))[:, None]
+        self.colours = median(self.stack)
+
+    def others(self) -> list[np.ndarray]:
+        """Of each view (H, W) uint8 what differs from the table as the others show it: what stands on it."""
+        result = []
+        for view, own in zip(self.progress(self.views, "beside the table"), self.stack):
+            rest = np.abs(own - self.colours).max(1)
+            other = rest > max(LEAST, SIGNIFICANT * float(np.nanmedian(rest)))
+            mask = cv2.medianBlur(self.ground.seen_by(view, other).astype(np.uint8), 5)
+            result.append(ndimage.binary_fill_holes(mask).astype(np.uint8))
+        return result
+
+    def patterns(self) -> list[np.ndarray]:
+        """Of each view (H, W) uint8 what surely is the table, for the pattern that the others show there is in it."""
+        known = self.colours.mean(1)
+        return [
+            alike(log_radiance(view).mean(-1), self.ground.seen_by(view, known))
+            for view in self.progress(self.views, "pattern of the table")
+        ]
 
 
 def log_radiance(view: View) -> np.ndarray:
@@ -126,25 +151,6 @@ def median(stack: np.ndarray) -> np.ndarray:
     """Of what is known of the first axis; NaN where nothing is. Much faster than `np.nanmedian`."""
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
-
-
-def not_table(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Of each view (H, W) uint8 what differs from the table as the others show it: what stands on it."""
-    ground, result = Ground(plane, center, reach), []
-    stack, table = laid(ground, views)
-    for view, own in zip(views, stack):
-        rest = np.abs(own - table).max(1)
-        other = rest > max(LEAST, SIGNIFICANT * float(np.nanmedian(rest)))
-        mask = cv2.medianBlur(ground.seen_by(view, other).astype(np.uint8), 5)
-        result.append(ndimage.binary_fill_holes(mask).astype(np.uint8))
-    return result
-
-
-def patterns(views: Sequence[View], plane: Plane, center: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Of each view (H, W) uint8 what surely is the table, for the pattern that the others show there is in it."""
-    ground = Ground(plane, center, reach)
-    table = laid(ground, views)[1].mean(1)
-    return [alike(log_radiance(view).mean(-1), ground.seen_by(view, table)) for view in views]
 
 
 def lighting(difference: np.ndarray, smooth: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
-from mi_ring.photogrammetry.folder import Picture, relative_exposures
+from mi_ring.photogrammetry.folder import Picture, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
-from mi_ring.photogrammetry.table import FLAT, Plane, find_plane, not_table, patterns
+from mi_ring.photogrammetry.table import FLAT, Plane, Table, find_plane
 from mi_ring.photogrammetry.views import around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
@@ -34,10 +34,11 @@ DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if what a folder holds was found in other photographs."""
+    """Raise InputError if what a folder holds was found in other photographs, or in these turned otherwise."""
     folder.mkdir(parents=True, exist_ok=True)
-    known, listed = folder / "photographs.json", {p.path.name: p.path.stat().st_size for p in pictures}
-    if known.exists() and json.loads(known.read_text("utf-8")) != listed:
+    known, listed = folder / "photographs.json", {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
+    first = folder / "sheet.json"  # before it is there, nothing was found in them
+    if first.exists() and known.exists() and json.loads(known.read_text("utf-8")) != listed:
         raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, or "
                          "give another DIR")  # fmt: skip
     write_file(known, json.dumps(listed))
@@ -67,16 +68,16 @@ class Sheet(NamedTuple):
     sightings: dict[str, Sighting]  #: by the photograph's name
     white: dict[str, tuple[np.ndarray, np.ndarray]]  #: by the same, what `mi_ring.photogrammetry.board.white` says
 
-    def strengths(self, motion: Motion, flash: np.ndarray) -> dict[str, np.ndarray]:
+    def strengths(self, motion: Motion, flash: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Intensities (3,) of the flash that make the paper as bright as it is, by the photograph's name.
 
-        `motion` is in the frame of the sheet, `flash` (3,) in the camera's axes. They are those of the exposure and the
-        white balance, too.
+        `motion` is in the frame of the sheet, `flash` (3,) in each camera's axes. They are those of the exposure and
+        the white balance, too.
         """
         found = {}
         for name in self.white.keys() & motion.cameras.keys():
             pose, (places, colours) = motion.cameras[name][1], self.white[name]
-            way = pose[:3, :3] @ flash + pose[:3, 3] - places
+            way = pose[:3, :3] @ flash[name] + pose[:3, 3] - places
             falloff = way[:, 2:] / np.linalg.norm(way, axis=1, keepdims=True) ** 3
             if len(places) and (way[:, 2] > 0).all():
                 found[name] = np.median(np.pi / PAPER * colours / falloff, 0)  # some squares are in a shadow
@@ -108,6 +109,10 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
     if source is None:
         return None
     frames = {frame.image.stem: frame for frame in source.frames()}
+    for p in pictures:
+        if p.name in frames and frames[p.name].size != p.size:
+            raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
+                source.src, *frames[p.name].size, p.path.name, *p.size))  # fmt: skip
     cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
     failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
     if len(cameras) < len(failed):
@@ -209,15 +214,14 @@ def find_object(
         views.append(reduced(picture, lens, pose, whole_of(lens, COARSE)))
         picture.close()
     space = masks.Space.seen_by(views)
-    plane = hints.plane
-    if plane is None:
+    plane, sheet = hints.plane, hints.plane is not None
+    if not sheet:
         positions = np.stack([view.camera.position for view in views])
         plane = find_plane(motion.points, positions, space.center, space.reach)
     if hints.masks == "auto":
-        body, shades, plane = searched(shown, motion, space, hints._replace(plane=plane), progress)
+        body, shades = searched(shown, motion, space, hints._replace(plane=plane), sheet, progress)
     else:
         body, shades = brought(shown, motion, space, hints, progress)
-    plane = hints.plane or plane
     for name, mask in shades.items():
         write_image(mask[..., None], folder / f"{name}.png")
     small = {view.name: masks.resized(shades[view.name] == OBJECT, view) for view in views if view.name in shades}
@@ -253,28 +257,32 @@ def brought(
 
 
 def searched(
-    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, progress: Progress
-) -> tuple[masks.Body, dict[str, np.ndarray], Plane | None]:
-    """The object and masks of all photographs but those that are not sure, and the table if there is one.
+    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, sheet: bool, progress: Progress
+) -> tuple[masks.Body, dict[str, np.ndarray]]:
+    """The object, and masks of all photographs but those that do not show it or are not sure.
 
-    First in whole photographs, reduced; then closer to what was found.
+    First in whole photographs, reduced; then closer to what was found. `sheet`: is the plane that of the sheet?
     """
-    body, plane = find_body(space, hints, progress)
-    if body is None or not all(body.coverage(view).any() for view in space.views):
-        raise InputError(f"{pictures[0].path.parent}: masks: no object was found, neither one that stands on a table "
-                         "nor one that the flash lights more than what is around it; give --masks")  # fmt: skip
+    folder, plane = pictures[0].path.parent, hints.plane
+    body = find_body(space, hints, sheet, progress)
+    covered = [(p, body.coverage(view)) for p, view in zip(pictures, space.views)] if body else []
+    showing = [(picture, cover) for picture, cover in covered if cover.any()]
+    if body is None or len(showing) < len(pictures) / 2:
+        raise InputError(f"{folder}: masks: no object was found, neither one that stands on a table nor one that the "
+                         "flash lights more than what is around it; give --masks")  # fmt: skip
     views, windows = [], {}
-    for picture, far in progress(list(zip(pictures, space.views)), "reading"):
+    for picture, cover in progress(showing, "reading"):
         lens, pose = motion.cameras[picture.name]
-        windows[picture.name] = around(lens, body.coverage(far), CLOSE)
+        windows[picture.name] = around(lens, cover, CLOSE)
         views.append(reduced(picture, lens, pose, windows[picture.name]))
         picture.close()
     space = masks.Space.about(views, body)
-    space.allowed = hints._replace(plane=plane).allow(space.grid, space.distance)
-    tables = patterns(views, plane, space.center, space.reach) if plane else masks.nothing(views)
+    space.allowed = hints.allow(space.grid, space.distance)
+    tables = Table(views, plane, space.center, space.reach, progress).patterns() if plane else masks.nothing(views)
     found = masks.settle(space, [body.coverage(view) for view in views], tables, progress)
-    if found is None:
-        raise InputError(f"{pictures[0].path.parent}: masks: those of the photographs do not agree; give --masks")
+    sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
+    if found is None or sure < len(pictures) / 2:
+        raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
     shades = {}
     for view, mask, agreed in zip(views, found.masks, found.agreement):
         if agreed >= SURE:
@@ -284,35 +292,45 @@ def searched(
                 maybe = masks.unsure(mask, masks.bright(view))
             shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
             shades[view.name] = pasted(shade, motion.cameras[view.name][0], windows[view.name])
-    return found.body, shades, plane
+    return found.body, shades
 
 
-def find_body(space: masks.Space, hints: Hints, progress: Progress) -> tuple[masks.Body | None, Plane | None]:
-    """The object by what differs from the table that it stands on, and the table; else by brightness, and None."""
-    views, plane, nothing = space.views, hints.plane, masks.nothing(space.views)
-    if plane:
-        space.allowed = hints.allow(space.grid, space.distance)
-        found = masks.settle(space, not_table(views, plane, space.center, space.reach), nothing, progress)
+def find_body(space: masks.Space, hints: Hints, sheet: bool, progress: Progress) -> masks.Body | None:
+    """The object by what differs from the table that it stands on; else by brightness.
+
+    Not so on a `sheet`, which differs from any object: there it would be the paper. Elsewhere what has the table's
+    pattern is left out, for the flash lights the middle of the table, too.
+    """
+    tables, guesses = masks.nothing(space.views), []
+    space.allowed = hints.allow(space.grid, space.distance)
+    if hints.plane:
+        table = Table(space.views, hints.plane, space.center, space.reach, progress)
+        tables = table.patterns()
+        guesses.append(table.others())
+    if not sheet:
+        guesses.append([masks.bright(view) & (1 - known) for view, known in zip(space.views, tables)])
+    for guess in guesses:
+        found = masks.settle(space, guess, tables, progress)
         if found and found.quality >= SURE:
-            return found.body, plane
-    space.allowed = hints._replace(plane=None).allow(space.grid, space.distance)
-    found = masks.settle(space, [masks.bright(view) for view in views], nothing, progress)
-    return (found.body if found and found.quality >= SURE else None), None
+            return found.body
+    return None
 
 
 def shots(
-    pictures: Sequence[Picture], motion: Motion, object_: Object, flash: np.ndarray, sheet: Sheet | None
+    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, sheet: Sheet | None
 ) -> list[Shot]:
-    """The photographs of the scene, in its frame; `flash` (3,) is where it is in the camera's axes [scene units].
+    """The photographs of the scene, in its frame; the flash's `offset` (3,) is in the camera's axes [scene units].
 
     The sheet tells how strong it is. Without one that is not known, and it is made so weak that fits see that it isn't.
     """
+    flash = turned_with(pictures, offset)
     known = sheet.strengths(motion, flash) if sheet else {}
     usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM)
     result = []
     for picture, exposure in zip(pictures, relative_exposures(pictures)):
         if picture.name in motion.cameras:
             lens, pose = motion.cameras[picture.name]
-            light = Light("point", pose[:3, :3] @ flash + pose[:3, 3], known.get(picture.name, exposure * usual))
+            light = Light("point", pose[:3, :3] @ flash[picture.name] + pose[:3, 3],
+                          known.get(picture.name, exposure * usual))  # fmt: skip
             result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
     return result

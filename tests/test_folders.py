@@ -1,0 +1,286 @@
+"""Folders of photographs that structure from motion puts together; some are ended on the way, some cannot be used."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageOps
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+from test_photogrammetry import AXES, CENTER, hit_ellipsoid, in_a_dim_room, pose_at, poses, rays_of
+
+from mi_ring import photos
+from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
+from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with
+from mi_ring.photogrammetry.motion import structure_from_motion
+from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs
+from mi_ring.system.progress import progress
+
+pty = pytest.importorskip("pty")  # not on Windows
+
+SIZE = (400, 300)
+LENS = Lens("PINHOLE", SIZE, (470.0, 470.0, 200.0, 150.0))
+
+
+def rendered(pose, noise):
+    """A speckled ellipsoid on a speckled table, lit by a flash at the camera: (H, W, 3) uint8."""
+    camera = camera_of(LENS, pose)
+    rays, t = rays_of(camera), hit_ellipsoid(camera)[0]
+    hit = np.isfinite(t)
+    floor = (CENTER[2] - AXES[2] - camera.position[2]) / rays[:, 2]
+    place = camera.position + np.where(hit, t, floor)[:, None] * rays
+    normal = (place - CENTER) / AXES**2
+    cosine = np.where(hit, -(normal * rays).sum(1) / np.linalg.norm(normal, axis=1), -rays[:, 2])
+    speckles = map_coordinates(noise, 5 * place.T, order=1, mode="grid-wrap")[:, None]
+    albedo = np.where(hit[:, None], (0.6 + 0.1 * speckles) * [1, 0.6, 0.4], (0.12 + 0.04 * speckles) * [0.6, 0.9, 1])
+    away = np.linalg.norm(place - camera.position, axis=1)
+    radiance = albedo * (np.clip(cosine, 0, 1) * (16 / away) ** 2 + 0.03)[:, None]
+    return (255 * radiance.clip(0, 1) ** (1 / 2.2)).reshape(*SIZE[::-1], 3).astype(np.uint8)
+
+
+def walk(count):
+    for k in range(count):
+        turn, tilt = 2 * np.pi * k / count, np.radians(40 + 12 * np.sin(3 * k))
+        d = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+        yield pose_at(CENTER + 16 * d, CENTER + 0.2 * np.array([np.sin(k), np.cos(k), 0]))
+
+
+@pytest.fixture(scope="module")
+def speckles():
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(64, 64, 64)), 1.2, mode="wrap")
+    return noise / noise.std()
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory, speckles):
+    """And their true masks in a folder within."""
+    folder = tmp_path_factory.mktemp("photographs")
+    (folder / "masks").mkdir()
+    for k, pose in enumerate(walk(14)):
+        Image.fromarray(rendered(pose, speckles)).save(folder / f"{k:02}.png")
+        mask = np.isfinite(hit_ellipsoid(camera_of(LENS, pose))[0]).reshape(SIZE[::-1])
+        Image.fromarray(mask).convert("L").save(folder / f"masks/{k:02}.png")
+    return folder
+
+
+#: Runs the command, ended without a word when a stage has come so far.
+KILLED = """
+import os, sys
+from mi_ring import photos
+stage, steps, *arguments = sys.argv[1:]
+def progress(things, what, total=None):
+    for k, thing in enumerate(things):
+        if what == stage and k == int(steps):
+            os.kill(os.getpid(), 9)
+        yield thing
+photos.progress = progress
+from mi_ring.importers import writer
+replace, count = os.replace, iter(range(10**6))
+def replaced(a, b):
+    replace(a, b)
+    if stage == "moving" and "images" in str(b) and next(count) == int(steps):
+        os.kill(os.getpid(), 9)
+writer.os.replace = replaced
+if stage == "inspecting":
+    photos.inspect = lambda capture: os.kill(os.getpid(), 9)
+sys.exit(photos.main(arguments))
+"""
+STAGES = [
+    ("sheet", 3), ("features", 5), ("matching", 1), ("cameras", 6), ("bundle adjustment", 1), ("reading", 4),
+    ("masks", 3), ("writing", 5), ("moving", 4), ("inspecting", 0),
+]  # fmt: skip
+
+
+def test_a_process_that_is_killed_at_any_stage_goes_on(photographs, tmp_path):
+    pytest.importorskip("pycolmap")
+    arguments = [str(photographs), str(tmp_path / "capture"), "--masks", str(photographs / "masks")]
+    for stage, steps in STAGES:
+        ended = subprocess.run([sys.executable, "-c", KILLED, stage, str(steps), *arguments], capture_output=True)
+        assert (stage, ended.returncode, ended.stderr.decode()) == (stage, -9, "")
+    assert photos.main(arguments) == 0
+    capture = load_capture(tmp_path / "capture/scene.xml")
+    assert len(capture) == 14 and (tmp_path / "capture/check.png").exists()
+    found = [(mask > 127).sum() for mask in capture.masks]
+    true = [(np.array(Image.open(file)) > 0).sum() for file in sorted((photographs / "masks").iterdir())]
+    np.testing.assert_allclose(found, true, rtol=0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_native_work_in_one_line(number, photographs, tmp_path):
+    """In a terminal, which says that it has no columns."""
+    pytest.importorskip("pycolmap")
+    ours, theirs = pty.openpty()
+    arguments = [sys.executable, "-m", "mi_ring.photos", str(photographs), str(tmp_path / "capture")]
+    process = subprocess.Popen(arguments, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    text = bytearray()
+
+    def listen():
+        while True:
+            try:
+                text.extend(os.read(ours, 4096))
+            except OSError:
+                return
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    until = time.monotonic() + 120
+    while b"matching:" not in text and time.monotonic() < until:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    process.send_signal(number)
+    since = time.monotonic()
+    assert process.wait(30) == 130
+    assert time.monotonic() - since < 3
+    listener.join()
+    os.close(ours)
+    last = text.decode().replace("\r", "\n").split("\n")
+    assert [line for line in last if line.strip()][-1] == "mi_ring.photos: interrupted; the same command goes on"
+    assert b"Traceback" not in text and (tmp_path / "capture/work/sheet.json").exists()
+
+
+def test_a_photograph_that_does_not_show_the_object_is_left_out(tmp_path, capsys):
+    """And those that do go on without it."""
+    random, frames = np.random.default_rng(3), []
+    for k, pose in enumerate(poses(20)):
+        if k == 5:
+            pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", 70, degrees=True).as_matrix()
+        Image.fromarray(in_a_dim_room(pose, random)[0].astype(np.uint8)).save(tmp_path / f"{k:02}.png")
+        frames.append({"file_path": f"{k:02}.png", "transform_matrix": (pose @ np.diag([1, -1, -1, 1.0])).tolist()})
+    top = {"fl_x": 170, "fl_y": 176, "cx": 77, "cy": 64, "w": 160, "h": 120, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(top))
+    assert photos.main([str(tmp_path), str(tmp_path / "capture")]) == 0
+    assert "Masks: of 19 of 20 photographs\n  without: 05: " in capsys.readouterr().out
+    capture = load_capture(tmp_path / "capture/scene.xml")
+    assert len(capture) == 19 and "05" not in capture.names
+
+
+def test_photographs_from_one_place_are_told_after_the_first_pairs(tmp_path, speckles):
+    pytest.importorskip("pycolmap")
+    random, whole = np.random.default_rng(0), rendered(next(walk(14)), speckles)
+    for k in range(14):
+        moved = np.roll(whole, random.integers(-9, 10, 2), (0, 1)) + random.normal(0, 3, whole.shape)
+        Image.fromarray(moved.clip(0, 255).astype(np.uint8)).save(tmp_path / f"{k:02}.png")
+    batches = []
+
+    def counting(things, what, *_):
+        return (batches.append(what) or thing for thing in things)
+
+    with pytest.raises(InputError, match=r"100% of the first 60 pairs are from one place; walk around"):
+        structure_from_motion(find_pictures(tmp_path), tmp_path / "work", counting)
+    assert batches.count("matching") == 1
+
+
+def test_photographs_that_are_the_same_file_are_named(tmp_path):
+    for k in range(9):
+        Image.fromarray(np.full((6, 8, 3), 10 * (k % 8), np.uint8)).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match=r"FOLDER: 0.png, 8.png are the same photograph; keep one of them"):
+        find_pictures(tmp_path)
+
+
+def test_a_broken_photograph_may_be_replaced(tmp_path):
+    for k in range(8):
+        Image.fromarray(np.full((6, 8, 3), 10 * k, np.uint8)).save(tmp_path / f"{k}.jpg")
+    work = tmp_path / "work"
+    require_same_photographs(find_pictures(tmp_path), work)
+    Image.fromarray(np.full((12, 8, 3), 7, np.uint8)).save(tmp_path / "3.jpg")
+    require_same_photographs(find_pictures(tmp_path), work)  # nothing has been made of them
+    (work / "sheet.json").write_text("{}")
+    require_same_photographs(find_pictures(tmp_path), work)
+    Image.fromarray(np.full((24, 8, 3), 7, np.uint8)).save(tmp_path / "3.jpg")
+    with pytest.raises(InputError, match="work: is of other photographs"):
+        require_same_photographs(find_pictures(tmp_path), work)
+
+
+def test_a_bar_is_shown_in_a_terminal_of_no_columns(monkeypatch):
+    ours, theirs = pty.openpty()
+    with open(theirs, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        list(progress(range(3), "counting"))
+        print("end", file=terminal, flush=True)
+        assert b"counting" in os.read(ours, 1000)
+    os.close(ours)
+
+
+def save_turned(pixels, path, orientation):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photographs_are_turned_as_pillow_turns_them(orientation, suffix, tmp_path):
+    pixels = np.zeros((40, 64, 4 if suffix == "png" else 3), np.uint8)
+    pixels[4:12, 40:60] = 200
+    file = tmp_path / f"a.{suffix}"
+    save_turned(pixels, file, orientation)
+    with Image.open(file) as image:
+        expected = np.array(ImageOps.exif_transpose(image))
+    picture, stored = Picture(file), Picture(file, upright=False)
+    np.testing.assert_array_equal(picture.pixels, expected)
+    assert picture.size == expected.shape[1::-1]
+    assert stored.size == (64, 40)
+    assert np.abs(stored.pixels.astype(int) - pixels).max() < 30
+    if suffix == "png":
+        np.testing.assert_array_equal(picture.mask("alpha"), expected[..., 3])
+    mask = tmp_path / "masks"
+    mask.mkdir()
+    Image.fromarray(expected[..., 0]).save(mask / "a.png")  # as an editor shows and saves it
+    np.testing.assert_array_equal(picture.mask(mask), expected[..., 0])
+    # The middle of the bright patch, from that of the photograph, turns with it.
+    before, after = (
+        np.mean(np.nonzero(p[..., 0] > 100), 1)[::-1] + 0.5 - np.array(p.shape[1::-1]) / 2 for p in (pixels, expected)
+    )
+    np.testing.assert_allclose(axes_of(orientation) @ [*before, 7], [*after, 7], atol=0.6)
+
+
+def test_the_flash_turns_with_the_camera(tmp_path):
+    """Right of the lens in a landscape; the camera turned to the left, as EXIF's 8 says: above it."""
+    for k, orientation in enumerate((1, 1, 8)):
+        save_turned(np.zeros((4, 6, 3), np.uint8), tmp_path / f"{k}.jpg", orientation)
+    pictures = [Picture(tmp_path / f"{k}.jpg") for k in range(3)]
+    found = turned_with(pictures, np.array([10.0, 0, 1]))
+    np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
+
+
+@pytest.mark.parametrize("orientation", FLIPS.values())
+def test_raw_photographs_are_turned_as_libraw_turns_them(orientation, tmp_path):
+    rawpy, tifffile = pytest.importorskip("rawpy"), pytest.importorskip("tifffile")
+    mosaic = np.full((48, 64), 1000, np.uint16)
+    mosaic[4:16, 40:60] = 30000
+    colours = np.array([10000, 0, 0, 0, 10000, 0, 0, 0, 10000])
+    matrix = np.stack([colours, np.full(9, 10000)], 1).ravel().tolist()
+    tifffile.imwrite(tmp_path / "a.dng", mosaic, photometric=32803, extratags=[
+        (274, 3, 1, orientation, True), (33421, 3, 2, (2, 2), True), (33422, 1, 4, (0, 1, 1, 2), True),
+        (50706, 1, 4, (1, 4, 0, 0), True), (50708, 2, 0, "none", True), (50721, 10, 9, matrix, True),
+        (50728, 5, 3, (1, 1, 1, 1, 1, 1), True), (50717, 3, 1, 65535, True),
+    ])  # fmt: skip
+    with rawpy.imread(str(tmp_path / "a.dng")) as raw:
+        expected = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True)
+    picture = Picture(tmp_path / "a.dng")
+    assert picture.orientation == orientation and picture.size == expected.shape[1::-1]
+    np.testing.assert_array_equal(picture.pixels, expected)
+    assert Picture(tmp_path / "a.dng", upright=False).size == (64, 48)
+
+
+def test_cameras_of_another_tool_are_those_of_the_pixels_as_stored(tmp_path):
+    pixels, eye = np.random.default_rng(0).integers(0, 255, (8, 40, 60, 3), np.uint8), np.eye(4).tolist()
+    for k in range(8):
+        save_turned(pixels[k], tmp_path / f"{k}.jpg", k + 1)
+    frames = [{"file_path": f"{k}.jpg", "transform_matrix": eye} for k in range(8)]
+    top = {"fl_x": 60, "fl_y": 60, "cx": 30, "cy": 20, "w": 60, "h": 40, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(top))
+    motion = cameras_beside(find_pictures(tmp_path, upright=False))
+    assert {lens.size for lens, _ in motion.cameras.values()} == {(60, 40)}
+    with pytest.raises(InputError, match=r"has a camera of 60 x 40 pixels for 4.jpg, which has 40 x 60"):
+        cameras_beside(find_pictures(tmp_path))
