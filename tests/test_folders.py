@@ -1,5 +1,6 @@
 """Folders of photographs that structure from motion puts together; some are ended on the way, some cannot be used."""
 
+import functools
 import json
 import os
 import signal
@@ -120,7 +121,8 @@ def test_an_interrupt_ends_native_work_in_one_line(number, photographs, tmp_path
     pytest.importorskip("pycolmap")
     ours, theirs = pty.openpty()
     arguments = [sys.executable, "-m", "mi_ring.photos", str(photographs), str(tmp_path / "capture")]
-    process = subprocess.Popen(arguments, stdout=theirs, stderr=theirs)
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # who starts the tests may ignore it
+    process = subprocess.Popen(arguments, stdout=theirs, stderr=theirs, preexec_fn=listening)
     os.close(theirs)
     text = bytearray()
 
