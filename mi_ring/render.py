@@ -35,7 +35,7 @@ def main(arguments: Sequence[str]) -> None:
         print(config.out)
     else:
         for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
-            write_picture(picture, config.out / view.name)
+            write_picture(picture, config.out / view.name, view.sensor.gamma)
         print(f"{len(views)} pictures in {config.out}/")
 
 

@@ -258,6 +258,7 @@ def sensor_xml(name, folder, masked, to_world, intensity):
         f'    <string name="mask" value="{folder}masks/{name}.png"/>' if masked else None,
         f'    <float name="fx" value="{FOCAL:.9g}"/> <float name="fy" value="{FOCAL:.9g}"/>',
         f'    <float name="cx" value="{SIZE / 2:.9g}"/> <float name="cy" value="{SIZE / 2:.9g}"/>',
+        '    <boolean name="calibrated" value="true"/>',
         f'    <transform name="to_world"><matrix value="{matrix}"/></transform>',
         f'    <film type="hdrfilm">{size}</film>',
         f'    <emitter type="point"><point name="position" x="{x}" y="{y}" z="{z}"/>'

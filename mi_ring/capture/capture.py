@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,6 +66,11 @@ class Capture:
         #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
         self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
 
+    @property
+    def known(self) -> bool:
+        """Does the scene say that cameras and lights are exact?"""
+        return all(sensor.calibrated for sensor in self.sensors)
+
     def __len__(self) -> int:
         return len(self.sensors)
 
@@ -81,6 +86,12 @@ class Capture:
         except ValueError:  # on several drives
             return [file.as_posix() for file in files]
         return [file.relative_to(common).as_posix() for file in files]
+
+    def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
+        """The photographs of these indices alone."""
+        names = "sensors", "images", "linear", "masks", "valid"
+        lists: dict[str, Any] = {name: [values[k] for k in index] for name in names if (values := getattr(self, name))}
+        return replace(self, photographs=Photographs.of(lists["sensors"]), **lists)
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
@@ -106,7 +117,8 @@ class Capture:
             if before == scale:
                 return result
             self._remembered -= self._decoded.pop(k)[1][2].numel()
-        linear, saturated = decode(self.images[k], self.linear[k], self.sensors[k].saturation)
+        sensor = self.sensors[k]
+        linear, saturated = decode(self.images[k], self.linear[k], sensor.saturation, sensor.gamma)
         mask, own = self.masks[k], self.valid[k]
         mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
         valid = None

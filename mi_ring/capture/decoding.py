@@ -9,14 +9,18 @@ from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, read_image, srgb_to_linear
 
 
-def decode(image: np.ndarray, linear: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape."""
+def decode(image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape.
+
+    `gamma`: of the camera's curve, by which linear values are radiance to this power.
+    """
     if image.dtype == np.float32:
         value = image
     else:
         full = np.iinfo(image.dtype).max
         value = np.arange(full + 1, dtype=np.float32) / full
     lookup = value if linear else srgb_to_linear(value)
+    lookup = lookup if gamma == 1 else np.maximum(lookup, 0) ** np.float32(1 / gamma)
     saturated = value >= saturation
     return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
 

@@ -109,5 +109,6 @@ def write_example(folder: Path, spp: int = SPP) -> None:
         name = f"{k:03}"
         write_image(to_bytes(linear_to_srgb(picture[..., :3])), folder / "images" / f"{name}.png")
         write_image(to_bytes(picture[..., 3:] > 0.5), folder / "masks" / f"{name}.png")
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png"))
+        files = f"images/{name}.png", f"masks/{name}.png"
+        elements.append(photograph_element(name, files[0], camera, light, files[1], calibrated=True))
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

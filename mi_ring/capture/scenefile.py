@@ -2,7 +2,7 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
-from mi_ring.rendering.lights import Light
+from mi_ring.rendering.lights import Light, Lights
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
@@ -20,7 +20,8 @@ Element = ElementTree.Element
 
 def photograph_element(
     name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
-    encoding: str | None = None, saturation: float | None = None, valid: str | None = None,
+    encoding: str | None = None, saturation: float | None = None, valid: str | None = None, gamma: float = 1.0,
+    calibrated: bool = False,
 ) -> Element:  # fmt: skip
     """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
     element = ElementTree.Element("sensor", type="photograph", id=name)
@@ -28,8 +29,11 @@ def photograph_element(
         if value:
             ElementTree.SubElement(element, "string", name=field, value=value)
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
-    for field, value in (fields | ({} if saturation is None else {"saturation": saturation})).items():
+    fields |= ({} if saturation is None else {"saturation": saturation}) | ({} if gamma == 1 else {"gamma": gamma})
+    for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
+    if calibrated:
+        ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
     add_pose(element, camera)
     add_film(element, *camera.size)
     if light:
@@ -114,6 +118,23 @@ def load_element(element: Element) -> mi.Object:
 def numbers(values: ArrayLike) -> str:
     """As XML has them."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
+
+
+def recalibrated_xml(scene: bytes, sensors: Sequence) -> bytes:
+    """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order."""
+    root = ElementTree.fromstring(scene)
+    photographs = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
+    named = {sensor.id(): sensor for sensor in sensors}
+    for old, sensor in zip(photographs, sensors, strict=True):
+        sensor = named.get(old.get("id", ""), sensor)
+        new = photograph_element("", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma)
+        fields = {child.get("name"): child for child in new if child.tag in ("float", "transform")}
+        for child in list(old):
+            lit = child.tag == "emitter" or (child.tag == "ref" and root.find(f".//emitter[@id='{child.get('id')}']"))
+            if lit or child.get("name") in ("gamma", *fields):
+                old.remove(child)
+        old.extend([*fields.values(), *new.findall("emitter")])
+    return scene_bytes(root)
 
 
 def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 from mi_ring.errors import InputError
 
 #: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
-WEIGHTS = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01}
+WEIGHTS = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class Config:
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
     """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
-    flow is, the paper's lambda."""
+    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
     while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while
@@ -78,6 +78,15 @@ class Config:
     GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
+    refine: tuple[Literal["auto", "none", "cameras", "focal", "light", "power", "curve"], ...] = ("auto",)
+    """What else is unknown. cameras: their places and directions; focal: focal lengths, one for each lens; light: where
+    a flash is that moves with the camera, else the place or direction of each light; power: strength and colour of the
+    light, photograph by photograph; curve: one exponent of the camera's, for all. auto: light, power and curve, unless
+    the scene says that it is calibrated; none: nothing."""
+    holdout: int = 0
+    """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
+    thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.
+    0: none."""
     deterministic: bool = False
     """The same result bit for bit on the same machine, on one thread."""
 
@@ -101,6 +110,7 @@ class Config:
             require(0 <= getattr(self, name) < math.inf, name, "0 or more")
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
+        require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
         for name in ("widths", "shares"):
@@ -142,5 +152,6 @@ PRESETS: dict[str, dict] = {
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
+        "refine": ("none",),
     },
 }  # fmt: skip

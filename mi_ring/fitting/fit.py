@@ -14,11 +14,13 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
+from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.schedule import stages_of
-from mi_ring.fitting.start import require_view_from_outside, starting_surface
+from mi_ring.fitting.start import require_networks, require_view_from_outside, starting_surface
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.brdfnet import ReflectanceMap
@@ -39,6 +41,7 @@ STRONGEST = -0.3  #: the least `calm`
 RETREAT, CATCH_UP = 2.0, 3.0  #: how fast the regulariser strengthens then, and weakens afterwards; 1 is as planned
 RECENT = 0.1  #: weight of an iteration in the mean of what is unexplained
 LATE = 0.6  #: progress after which a surface that crosses itself says that the regulariser is too weak
+RAMP = 0.05  #: over how much of a fit refinement sets in
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -84,12 +87,21 @@ class Fit:
             recompute_normals(capture.scene)
         self.random = torch.Generator().manual_seed(self.config.seed)
         torch.manual_seed(self.config.seed)
-        self.exposure = capture.exposure()
-        self.ring = ring_of(state["ring"]) if state else self.new_ring(networks)
+        every, several = self.config.holdout, len(capture)
+        #: Photographs that are kept out, and all others.
+        self.held_out = np.arange(several)[every // 2 :: every] if every else np.arange(0)
+        self.fitted = np.setdiff1d(np.arange(several), self.held_out)
+        seen = capture.part(self.fitted) if every else capture
+        self.exposure = seen.exposure()
+        self.ring = ring_of(state["ring"]) if state else self.new_ring(seen, networks)
         self.device = device()
         self.ring.to(self.device)
         self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
+        self.calibration: Calibration | None = None
+        if refined := refined_of(capture, self.config):
+            self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure)
+            self.optimizers.append(self.calibration.optimizer())
         self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
@@ -99,13 +111,14 @@ class Fit:
         self.calm: float = 0.0  #: how far the regulariser has weakened: like `progress`, but for holding back
         self.held = False  # did it cross itself late?
         self.unexplained: float = 1.0  #: share of the object's light that is not as predicted, of the last iterations
+        self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
 
-    def new_ring(self, networks: tuple[Flow, ReflectanceMap] | None) -> Ring:
-        """The networks before the first iteration, on the surface that the fit starts from."""
-        capture, config = self.capture, self.config
+    def new_ring(self, capture: Capture, networks: tuple[Flow, ReflectanceMap] | None) -> Ring:
+        """The networks before the first iteration, on the surface that a fit of these photographs starts from."""
+        config = self.config
         domain, center, radius = starting_surface(capture, config.domain)
         require_view_from_outside(capture, domain, center, radius)
         parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
@@ -155,6 +168,8 @@ class Fit:
         self.hold(it)
         self.iteration += 1
         self.seconds += time.perf_counter() - started
+        if it.number == self.iterations and len(self.held_out):
+            self.confirmed = confirm(self)
         if it.number % LOG_EVERY == 0 or it.number == self.iterations:
             self.log.append(it.entry())
         for callback in self.callbacks:
@@ -175,12 +190,17 @@ class Fit:
         seen = self.capture.observe(index, scale).to(self.device)
         photographs = self.capture.photographs.select(index, size, scale)
         self.surface.set_faces(faces)
+        calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
+        if calibration:
+            photographs = bridge.calibrated(photographs, calibration)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
-            shadows=config.shadows and self.capture.shadows,
+            shadows=config.shadows and self.capture.shadows, calibration=calibration,
         )  # fmt: skip
         if self.ring.indirect:
             predicted = predicted + bridge.interreflection(self.surface, photographs, coverage, self.new_seed())
+        if self.calibration:
+            predicted = self.calibration.recorded(predicted)
         return Iteration(
             self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
             *seen, predicted, coverage,
@@ -188,9 +208,9 @@ class Fit:
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the photographs of one iteration, all of one size (width, height)."""
-        first = int(torch.randint(len(self.capture), (), generator=self.random))
+        first = self.fitted[int(torch.randint(len(self.fitted), (), generator=self.random))]
         size = self.capture.sensors[first].size
-        alike = self.capture.sizes[size]
+        alike = np.intersect1d(self.capture.sizes[size], self.fitted)
         order = torch.randperm(len(alike), generator=self.random)[: self.config.batch]
         return alike[order.numpy()], size
 
@@ -235,7 +255,8 @@ class Fit:
             raise InputError(f"{self.capture.path}: diverged at iteration {self.iteration}; try a lower {rate}")
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = group["initial_lr"] * self.config.decay**progress
+                begun = min(1.0, max(0.0, (progress - group.get("start", -1.0)) / RAMP))
+                group["lr"] = group["initial_lr"] * self.config.decay**progress * begun
             if healthy:
                 optimizer.step()
 
@@ -258,6 +279,10 @@ class Fit:
         if math.isfinite(unexplained):
             self.unexplained += RECENT * (unexplained - self.unexplained)
 
+    def calibrated(self) -> Capture:
+        """The capture with cameras, lights and curve as refined by now."""
+        return self.calibration.applied(self.capture) if self.calibration else self.capture
+
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.
 
@@ -265,7 +290,7 @@ class Fit:
         term, for whose backward pass the renderer keeps what it rendered.
         """
         self.surface.show(self.ring, *self.ring.domain.sample(level))
-        photograph = self.capture.photograph(k, -(-self.capture.sensors[k].size[0] // width))
+        photograph = self.calibrated().photograph(k, -(-self.capture.sensors[k].size[0] // width))
         rgb, _ = bridge.draw(self.surface, photograph, spp, shadows=self.capture.shadows, indirect=self.ring.indirect)
         return rgb[0].numpy()
 
@@ -291,6 +316,8 @@ class Fit:
             "calm": self.calm,
             "held": self.held,
             "unexplained": self.unexplained,
+            "calibration": self.calibration and self.calibration.state_dict(),
+            "confirmed": self.confirmed,
         }
         return copy.deepcopy(state)  # which the next iteration would change
 
@@ -302,19 +329,6 @@ class Fit:
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
         self.crossing, self.calm, self.held = state["crossing"], state["calm"], state["held"]
-        self.unexplained = state["unexplained"]
-
-
-def require_networks(ring: Ring) -> None:
-    """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
-    s = torch.zeros(2, 3, device=next(ring.parameters()).device)
-    with torch.no_grad():
-        moved = ring.shape_net(s)
-        if moved.shape != s.shape:
-            raise InputError(f"networks: {type(ring.shape_net).__name__}: gives {tuple(moved.shape)} for points (2, 3)")
-        brdf_net = ring.brdf_net
-        evaluate = getattr(brdf_net, "evaluate", None)  # networks may do without
-        if evaluate and (found := evaluate(s).shape[-1]) != brdf_net.outputs:
-            names = ", ".join(p.name for p in brdf_net.bsdf_parameters)
-            raise InputError(f"networks: {type(brdf_net).__name__}: has {found} outputs, {names} need "
-                             f"{brdf_net.outputs}")  # fmt: skip
+        self.unexplained, self.confirmed = state["unexplained"], state["confirmed"]
+        if self.calibration:
+            self.calibration.load_state_dict(state["calibration"])

@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
+from mi_ring.ring.ring import Ring
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
@@ -50,3 +52,18 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
                 f'{capture.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, '
                 f"of radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
             )
+
+
+def require_networks(ring: Ring) -> None:
+    """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
+    s = torch.zeros(2, 3, device=next(ring.parameters()).device)
+    with torch.no_grad():
+        moved = ring.shape_net(s)
+        if moved.shape != s.shape:
+            raise InputError(f"networks: {type(ring.shape_net).__name__}: gives {tuple(moved.shape)} for points (2, 3)")
+        brdf_net = ring.brdf_net
+        evaluate = getattr(brdf_net, "evaluate", None)  # networks may do without
+        if evaluate and (found := evaluate(s).shape[-1]) != brdf_net.outputs:
+            names = ", ".join(p.name for p in brdf_net.bsdf_parameters)
+            raise InputError(f"networks: {type(brdf_net).__name__}: has {found} outputs, {names} need "
+                             f"{brdf_net.outputs}")  # fmt: skip

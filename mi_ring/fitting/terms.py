@@ -108,6 +108,11 @@ def velocity(it: Iteration) -> Tensor:
     return velocity_loss(net.velocity, x, fit.config.laplacian_scale)
 
 
+def calibration(it: Iteration) -> Tensor | None:
+    """The prior of what is refined besides surface and material."""
+    return it.fit.calibration.prior() if it.fit.calibration else None
+
+
 def strength(it: Iteration) -> float:
     """Of the regulariser: it weakens as the fit goes on, but not while much of the light is unexplained.
 
@@ -123,4 +128,5 @@ default_terms: dict[str, Term] = {
     "rgb": Term(rgb),
     "mask": Term(mask),
     "velocity": Term(velocity, schedule=strength),
+    "calibration": Term(calibration),
 }

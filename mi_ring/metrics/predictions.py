@@ -24,9 +24,10 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     views: list[dict] = []
     for k, name in enumerate(capture.names):
         rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
-        predicted = to_bytes(linear_to_srgb(rgb[0].numpy())) / 255
+        gamma = capture.sensors[k].gamma
+        predicted = to_bytes(linear_to_srgb(rgb[0].numpy() ** gamma)) / 255
         seen = capture.observe([k])
-        observed = linear_to_srgb(seen.rgb[0].numpy())
+        observed = linear_to_srgb(seen.rgb[0].numpy() ** gamma)
         if seen.valid is not None:  # what shows nothing is no error
             predicted = np.where(seen.valid[0, ..., None].numpy(), predicted, observed)
         squares.append(np.mean((predicted - observed) ** 2))

@@ -16,8 +16,10 @@ from scipy import ndimage
 from skimage.measure import block_reduce
 from skimage.registration import phase_cross_correlation
 
+from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
+from mi_ring.ring.ring import Ring
 from mi_ring.system.command import scene_name
 from mi_ring.version import __version__
 
@@ -45,10 +47,10 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
 
     `unseen`: the share of its area that no photograph shows.
     """
-    capture, ring = fit.capture, fit.ring
+    capture, ring = fit.calibrated(), fit.ring
     rows, errors = [], []
     for k in capture.spread():
-        row, error = panel_of(fit, k, capture.names[k])
+        row, error = panel_of(fit, capture, k)
         rows.append(row)
         errors.append(error)
     masked = [row.iou for row in rows if row.iou is not None]
@@ -63,6 +65,7 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
+        **({"Refined": refined_text(fit.calibration)} if fit.calibration else {}),
         "Made by": f"mi_ring {__version__}",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
     }
@@ -71,16 +74,34 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
     return template.render(
         name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
         settings=fit.config.settings(), findings=fit_findings(rows, fit.iteration, fit.iterations),
-        view=first_view(fit), glb=glb and base64.b64encode(glb).decode(),
+        view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
 
 
-def first_view(fit: Any) -> dict[str, list[float]]:
+def refined_text(calibration: Any) -> str:
+    """What a fit has refined, in words."""
+    parts = []
+    if "light" in calibration.refined:
+        moved = calibration.value("light").detach().norm(dim=-1).max()
+        parts.append(f"light, by {moved:.1%} of the cameras' distance")
+    if "power" in calibration.refined:
+        parts.append(f"its power, by {calibration.value('power').detach().std():.1%}")
+    if "cameras" in calibration.refined:
+        turn, move = (calibration.value(name).detach().norm(dim=-1).max() for name in ("turn", "move"))
+        parts.append(f"cameras, by at most {math.degrees(turn):.2f}° and {move:.2%} of their distance")
+    if "focal" in calibration.refined:
+        parts.append(f"focal length, by {calibration.value('focal').detach().abs().max():.2%}")
+    if "curve" in calibration.refined:
+        parts.append(f"the camera's curve, whose exponent is {calibration.gamma.detach():.2f}")
+    return "; ".join(parts) + " (calibration.json)"
+
+
+def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
-    eye = fit.capture.sensors[0].camera.position
-    irradiance = np.median(fit.capture.photographs.lights.irradiance(fit.ring.center.cpu().numpy()), axis=0)
-    return {"up": fit.capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
+    eye = capture.sensors[0].camera.position
+    irradiance = np.median(capture.photographs.lights.irradiance(ring.center.cpu().numpy()), axis=0)
+    return {"up": capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
 
 
 def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -> list[str]:
@@ -134,16 +155,16 @@ def sides(x: float, y: float) -> str:
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
-def panel_of(fit: Any, k: int, name: str) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k`, and its mean squared error over all pixels of the sRGB image."""
-    capture = fit.capture
+def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float]:
+    """The row of photograph `k` of the calibrated capture, and its mean squared error over all pixels as sRGB."""
     seen = capture.observe([k])
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
     predicted, coverage = (t[0].numpy() for t in bridge.draw(
         fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
     ))  # fmt: skip
-    photo, guess = linear_to_srgb(observed), linear_to_srgb(predicted * valid[..., None])
+    gamma = capture.sensors[k].gamma
+    photo, guess = linear_to_srgb(observed**gamma), linear_to_srgb(predicted**gamma * valid[..., None])
     found = (coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
@@ -162,12 +183,12 @@ def panel_of(fit: Any, k: int, name: str) -> tuple[PhotographPanel, float]:
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
-    error = float(np.mean((photo - guess)[valid] ** 2))
+    error = float(np.mean((photo[valid] - guess[valid]) ** 2))
     row = PhotographPanel(
-        name=name,
+        name=capture.names[k],
         psnr=-10 * np.log10(max(error, 1e-10)),
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
-        saturated=float(saturated.any(-1)[inside].mean()) if inside.any() else 0.0,
+        saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
         shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mi_ring.capture.scenefile import fitted_scene_xml
+from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.output import gltf, report
@@ -111,10 +111,19 @@ def write_inputs(path: Path, fit: Any) -> None:
 
 
 def write(folder: Path, fit: Any, scene: bytes) -> None:
-    """ring.pt, mesh.ply, scene.xml and report.html of a fit, finished or not."""
+    """ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
+
+    `scene`: its `fitted_scene`, of which cameras and lights are those from before the fit.
+    """
     write_state(ring_state(fit.ring, fit.config.settings()), folder / "ring.pt")
-    views = fit.capture.views
+    capture = fit.calibrated()
+    views = capture.views
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
+    if fit.calibration:
+        scene = recalibrated_xml(scene, capture.sensors)
+        summary = fit.calibration.summary(fit.capture, fit.ring.center.cpu().numpy(), float(fit.ring.radius))
+        summary |= {"held_out": fit.confirmed} if fit.confirmed else {}
+        write_file(folder / "calibration.json", json.dumps(summary, indent=1))
     write_file(folder / "scene.xml", scene)
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)

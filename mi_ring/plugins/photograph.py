@@ -36,6 +36,10 @@ class Photograph(mi.Sensor):
                                   ``srgb`` for 8-bit files, ``linear`` for 16-bit PNG/TIFF and EXR
     ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped:
                                   they only say "at least this bright". Default: 1
+    ``gamma``        float        exponent of the camera's curve: a pixel, decoded as ``encoding`` says,
+                                  is radiance to this power. Default: 1
+    ``calibrated``   boolean      are camera and light exact? Then a fit leaves them alone unless told
+                                  otherwise. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P
     (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone;      P, ∂
                                   exposed as ``light``. Default: a point light of intensity 1 at the
@@ -93,6 +97,8 @@ class Photograph(mi.Sensor):
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = number(props, "saturation", 1.0, positive=True)
+        self.gamma = number(props, "gamma", 1.0, positive=True)
+        self.calibrated = props.get("calibrated", False)
 
         width, height = (int(s) for s in self.film().size())
         self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))

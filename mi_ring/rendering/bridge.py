@@ -109,15 +109,23 @@ def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
 
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *attributes):
-        gradients = any(t.requires_grad for t in (vertices, *attributes))
+    def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *tensors):
+        gradients = any(t.requires_grad for t in (vertices, *tensors))
+        attributes, calibration = tensors[: len(names)], tensors[len(names) :]
         arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
+        if calibration:
+            buffers = [to_drjit(t) for t in calibration]
+            for buffer, tensor in zip(buffers, calibration):
+                if tensor.requires_grad:
+                    dr.enable_grad(buffer)
+            photographs = photographs.moved(*buffers)
+            arrays += buffers
         if gradients:
             surface.edges = Edges.of(surface.scene, surface.edges)
         edges = surface.edges if gradients else None
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows, edges)
         dr.eval(channels)
-        ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *attributes)])
+        ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *tensors)])
         return pictures([to_torch(channel) for channel in channels], photographs)
 
     @staticmethod
@@ -141,19 +149,26 @@ class _Render(torch.autograd.Function):
 
 def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
-    seed: int = 0, shadows: bool = True,
+    seed: int = 0, shadows: bool = True, calibration: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Predicted photographs of the surface, each under its own light, differentiable.
 
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
-    samples.
+    samples. `calibration`: other cameras and lights of all photographs, as `Photographs.moved` takes them: (P, 3, 4),
+    (P, 4) [px of these sizes], (P, 3), (P, 3).
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage; by one backward pass,
     before the surface is written again, else RuntimeError.
     """
-    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values())
+    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values(),
+                         *calibration)  # fmt: skip
+
+
+def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photographs:
+    """Photographs with these cameras and lights, without gradients."""
+    return photographs.moved(*map(to_drjit, calibration))
 
 
 def draw(

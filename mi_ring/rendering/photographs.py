@@ -60,6 +60,11 @@ class Photographs:
             index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale),
         )  # fmt: skip
 
+    def moved(self, cameras, intrinsics, places, strengths) -> "Photographs":
+        """The same with other buffers of cameras and lights; no light is taken to be exactly at its camera."""
+        lights = replace(self.lights, places=places, strengths=strengths)
+        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False)
+
     def __len__(self) -> int:
         return dr.width(self.index)
 

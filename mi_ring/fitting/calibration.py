@@ -1,0 +1,188 @@
+"""Cameras, lights and the camera's curve as unknowns: what a fit refines besides surface and material.
+
+The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
+against albedo (the logarithms of `power` have the mean zero in each colour); where the whole is, how it is turned and
+how large it is, which only the priors hold; focal length against distance, likewise.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mi_ring.capture.calibrated import with_calibration
+from mi_ring.capture.capture import Capture
+from mi_ring.fitting.config import Config
+from mi_ring.geometry.camera import Camera
+from mi_ring.rendering.lights import Light
+
+#: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
+UNKNOWNS: dict[str, dict[str, float]] = {
+    "cameras": {
+        "turn": 0.01,  # about each axis of the camera [rad]
+        "move": 0.005,  # along each axis of the camera [median distance from the cameras to the object]
+    },
+    "focal": {"focal": 0.01},  # logarithm, one for each lens
+    "light": {"light": 0.1},  # along each axis [the same distance]; of distant ones [rad]
+    "power": {"power": 0.1},  # logarithm, of each photograph and colour
+    "curve": {"curve": 0.2},  # logarithm of the exponent
+}
+AUTO = "light", "power", "curve"  #: what is refined by default
+RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
+DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
+START, SETTLED = 0.2, 0.4  #: progress of the fit when refinement begins, and when that of cameras does
+RATE = 0.1  #: of Adam at first, in standard deviations an iteration
+
+
+def refined_of(capture: Capture, config: Config) -> tuple[str, ...]:
+    """Names of what a fit refines: as `Config.refine` says, `auto` by what the capture says of itself."""
+    if "auto" in config.refine:
+        return () if capture.known else AUTO
+    return tuple(name for name in UNKNOWNS if name in config.refine)
+
+
+class Calibrated(NamedTuple):
+    """Cameras and lights of all P photographs."""
+
+    cameras: Tensor  #: (P, 3, 4) camera-to-world
+    intrinsics: Tensor  #: (P, 4) fx, fy, cx, cy [px]
+    places: Tensor  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
+    strengths: Tensor  #: (P, 3) intensities, of distant ones irradiances
+
+
+class Calibration(nn.Module):
+    """The unknowns, each in units of its prior's standard deviation: zero where the capture is right."""
+
+    base: Calibrated
+
+    def __init__(self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float) -> None:
+        """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays."""
+        super().__init__()
+        self.refined, self.exposure = tuple(refined), exposure
+        cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
+        to_world = np.stack([camera.to_world[:3] for camera in cameras])
+        intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
+        arrays = to_world, intrinsics, lights.positions(), lights.rgb()
+        self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
+        self.finite = torch.from_numpy(lights.is_finite())[:, None]
+        self.distance = float(np.median(np.linalg.norm(to_world[:, :, 3] - center, axis=1)))
+        inside = torch.einsum("pji,pj->pi", self.base.cameras[:, :, :3], self.base.places - self.base.cameras[:, :, 3])
+        #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
+        spread = float((inside.amax(0) - inside.amin(0)).max())
+        self.flash = inside if self.finite.all() and spread < RIGID * self.distance else None
+        lenses = np.unique(intrinsics[:, :2].round(3), axis=0, return_inverse=True)[1].ravel()
+        places = np.unique(lights.positions().round(6), axis=0, return_inverse=True)[1].ravel()
+        places = places if self.flash is None else np.zeros_like(places)
+        self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
+        count = len(cameras)
+        shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
+                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": ()}  # fmt: skip
+        self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
+        for name in self.widths:
+            self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
+
+    def value(self, name: str) -> Tensor:
+        """An unknown in its own unit; 0 if it is none."""
+        return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
+
+    def forward(self) -> Calibrated:
+        """Cameras and lights as they are by now."""
+        cameras, intrinsics, places, strengths = self.base
+        if "cameras" in self.refined:
+            turned = cameras[:, :, :3] @ rotations(self.value("turn"))
+            moved = cameras[:, :, 3:] + cameras[:, :, :3] @ (self.value("move") * self.distance)[..., None]
+            cameras = torch.cat([turned, moved], 2)
+        if "focal" in self.refined:
+            factor = self.value("focal").exp()[self.lens, None]
+            intrinsics = torch.cat([intrinsics[:, :2] * factor, intrinsics[:, 2:]], 1)
+        offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
+        if self.flash is not None:
+            places = cameras[:, :, 3] + (cameras[:, :, :3] @ (self.flash + offset * self.distance)[..., None])[..., 0]
+        else:
+            moved = places + offset * torch.where(self.finite, self.distance, 1.0)
+            places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
+        power = self.value("power")
+        strengths = strengths * (power - (power.mean(0) if power.ndim else 0)).exp()
+        return Calibrated(cameras, intrinsics, places, strengths)
+
+    def scaled(self, scale: int) -> Calibrated:
+        """For photographs `scale` times smaller."""
+        calibrated = self()
+        return calibrated._replace(intrinsics=calibrated.intrinsics / scale)
+
+    @property
+    def gamma(self) -> Tensor:
+        """The exponent of the camera's curve: a file's value, decoded, goes like radiance to its power."""
+        return self.value("curve").exp()
+
+    def recorded(self, radiance: Tensor) -> Tensor:
+        """Radiance as the camera's curve records it, which leaves the mean of the object as it is."""
+        if "curve" not in self.refined:
+            return radiance
+        relative = radiance / self.exposure
+        slope = relative.clamp(min=DARKEST) ** (self.gamma - 1)
+        return radiance * slope
+
+    def prior(self) -> Tensor:
+        """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""
+        total = sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(()))
+        return total / 2 / len(self.lens)
+
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Adam, whose groups say when they begin."""
+        groups = [{"params": [getattr(self, name) for name in UNKNOWNS[group]], "initial_lr": RATE,
+                   "start": SETTLED if group == "cameras" else START} for group in self.refined]  # fmt: skip
+        return torch.optim.Adam(groups, lr=RATE)
+
+    def applied(self, capture: Capture) -> Capture:
+        """The capture with cameras, lights and curve as they are by now."""
+        with torch.no_grad():
+            matrices, intrinsics, places, strengths = (part.double().numpy() for part in self())
+            gamma = float(self.gamma)
+        # The curve's fixed point is the exposure here, full scale in a scene file.
+        strengths = strengths * self.exposure ** ((1 - gamma) / gamma)
+        cameras, lights = [], []
+        for k, sensor in enumerate(capture.sensors):
+            to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
+            cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size))
+            point = bool(self.finite[k])
+            lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
+        return with_calibration(capture, cameras, lights, gamma)
+
+    def summary(self, capture: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
+        """What was refined, as plain numbers: shared unknowns, and of each photograph how far it moved.
+
+        `center` (3,), `radius` [scene units]: of the object, whose pixels count.
+        """
+        with torch.no_grad():
+            result: dict[str, Any] = {"refined": list(self.refined), "unit": self.distance}
+            for name in ("focal", "light", "curve"):
+                if name in self.widths:
+                    value = self.value(name)
+                    result[name] = (value.exp() if name != "light" else value).tolist()
+            power = self.value("power")
+            factors = (power - power.mean(0)).exp() if power.ndim else None
+        after = self.applied(capture).sensors
+        corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
+        result["photographs"] = {}
+        for k, (old, new) in enumerate(zip(capture.sensors, after)):
+            shift = new.camera.project(corners)[0] - old.camera.project(corners)[0]
+            entry: dict[str, Any] = {"moved_px": float(np.linalg.norm(shift, axis=1).mean())}
+            if "cameras" in self.refined:
+                turn = np.linalg.norm(self.value("turn")[k].detach().numpy())
+                move = np.linalg.norm(self.value("move")[k].detach().numpy()) * self.distance
+                entry |= {"turned_degrees": float(np.degrees(turn)), "moved": float(move)}
+            if factors is not None:
+                entry["power"] = factors[k].tolist()
+            result["photographs"][capture.names[k]] = entry
+        return result
+
+
+def rotations(vectors: Tensor) -> Tensor:
+    """(P, 3, 3) rotation matrices of rotation vectors (P, 3) [rad]."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3))

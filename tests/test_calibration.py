@@ -1,0 +1,281 @@
+"""Cameras, lights and curve as unknowns: their gradients, what they do to a capture, and whether fits find them."""
+
+import json
+import shutil
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from test_bridge import OFF_CAMERA, Setting, tensor
+
+import mi_ring
+from mi_ring import fit
+from mi_ring.capture.decoding import decode
+from mi_ring.capture.scenefile import recalibrated_xml
+from mi_ring.fitting import holdout
+from mi_ring.fitting.calibration import UNKNOWNS, Calibration, rotations
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
+from mi_ring.rendering import bridge
+
+CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
+FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes
+
+
+def edited(scene, folder, edit):
+    """A copy of a scene whose photographs, as XML, `edit` has changed."""
+    shutil.copytree(scene.parent, folder)
+    path = folder / scene.name
+    tree = ElementTree.parse(path)
+    for element in tree.getroot().iter("sensor"):
+        edit(element)
+    tree.write(path)
+    return path
+
+
+def move_light(element, offset):
+    """The light of a photograph, as XML, `offset` farther along the camera's axes."""
+    matrix = np.array(element.find(".//matrix").get("value").split(), float).reshape(4, 4)
+    point = element.find("emitter/point")
+    for axis, value in zip("xyz", matrix[:3, :3] @ offset):
+        point.set(axis, str(float(point.get(axis)) + value))
+
+
+def losses(setting, calibration, vertices, spp=16, seed=5):
+    rgb, alpha = bridge.render(
+        setting.surface, setting.photographs, vertices, setting.material, spp, seed, setting.shadows, calibration
+    )
+    return (setting.radiance_weight * rgb).sum(), (setting.coverage_weight * alpha).sum()
+
+
+def calibration_of(setting):
+    photographs = setting.photographs
+    shapes = {"cameras": (-1, 3, 4), "intrinsics": (-1, 4)}
+    tensors = [tensor(np.array(getattr(photographs, name))).reshape(shape) for name, shape in shapes.items()]
+    tensors += [tensor(photographs.lights.positions()), tensor(photographs.lights.rgb())]
+    return [t.requires_grad_() for t in tensors]
+
+
+def test_pictures_are_those_of_the_photographs_own_cameras_and_lights():
+    setting = Setting(OFF_CAMERA, shadows=True)
+    given = bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3)
+    same = bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3,
+                         calibration=[t.detach() for t in calibration_of(setting)])  # fmt: skip
+    for a, b in zip(given, same):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["places", "strengths"])
+def test_gradients_of_lights_equal_finite_differences(name):
+    """The same rays hit the same points, and there are no shadows that move."""
+    setting, which = Setting(OFF_CAMERA, shadows=False), {"places": 2, "strengths": 3}[name]
+    calibration = calibration_of(setting)
+    losses(setting, calibration, setting.vertices)[0].backward()
+    step = tensor(np.random.default_rng(2).uniform(0.2, 1, (2, 3))) * (0.01 if name == "places" else 0.1)
+    if name == "places":  # the direction toward a distant light stays a unit vector
+        away = calibration[2][1].detach()
+        step[1] -= away * (step[1] @ away)
+    sides = []
+    for sign in (1, -1):
+        moved = [t.detach() for t in calibration]
+        moved[which] = moved[which] + sign * step
+        sides.append(losses(setting, moved, setting.vertices)[0])
+    difference = ((sides[0] - sides[1]) / 2).item()
+    assert (calibration[which].grad * step).sum().item() == pytest.approx(difference, rel=0.01)
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_gradients_of_cameras_and_lights_balance_those_of_the_surface(shadows):
+    """The world may be moved and turned as a whole: nothing is to be seen of it."""
+    setting = Setting(OFF_CAMERA, shadows=shadows)
+    vertices = setting.vertices.clone().requires_grad_()
+    calibration = calibration_of(setting)
+    sum(losses(setting, calibration, vertices)).backward()
+    cameras, _, places, _ = calibration
+    axis = tensor([0.4, -0.7, 0.5])
+    motions = {
+        "shift": (axis.expand_as(vertices), torch.cat([torch.zeros(2, 3, 3), axis.expand(2, 3)[..., None]], -1),
+                  torch.stack([axis, torch.zeros(3)])),
+        "turn": (torch.cross(axis.expand_as(vertices), vertices.detach(), dim=-1),
+                 torch.cross(axis[None, :, None].expand(2, 3, 4), cameras.detach(), dim=1),
+                 torch.cross(axis.expand(2, 3), places.detach(), dim=-1)),
+    }  # fmt: skip
+    for steps in motions.values():
+        parts = [(t.grad * step).sum().item() for t, step in zip((vertices, cameras, places), steps)]
+        assert sum(parts) == pytest.approx(0, abs=2e-3 * max(map(abs, parts)))
+        assert max(map(abs, parts)) > 10
+
+
+def test_gradient_of_the_focal_length_is_that_of_a_surface_that_comes_nearer():
+    """Of coverage, which depends on x / z alone: in one photograph depths are divided by what f is multiplied by."""
+    setting = Setting(OFF_CAMERA, shadows=False)
+    vertices, calibration = setting.vertices.clone().requires_grad_(), calibration_of(setting)
+    setting.coverage_weight[1] = 0
+    losses(setting, calibration, vertices)[1].backward()
+    camera = calibration[0][0].detach()
+    depth = (vertices.detach() - camera[:, 3]) @ camera[:, 2]
+    nearer = (vertices.grad * (-depth[:, None] * camera[:, 2])).sum().item()
+    focal = (calibration[1].grad[0, :2] * calibration[1][0, :2].detach()).sum().item()
+    assert focal == pytest.approx(nearer, rel=2e-3) and abs(focal) > 1
+    assert (calibration[1].grad[1] == 0).all()
+
+
+def test_rotations_are_scipys():
+    vectors = np.random.default_rng(1).normal(size=(5, 3))
+    np.testing.assert_allclose(rotations(tensor(vectors)).numpy(), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-6)
+
+
+def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    calibration = Calibration(capture, tuple(UNKNOWNS), CENTER, 0.3)
+    np.testing.assert_allclose(calibration.flash.mean(0).numpy(), FLASH, atol=1e-3)
+    same = calibration()
+    for got, sensor, light in zip(zip(*same), capture.sensors, capture.photographs.lights):
+        camera = sensor.camera
+        np.testing.assert_allclose(got[0].detach().numpy(), camera.to_world[:3], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(got[2].detach().numpy(), light.vector, rtol=1e-5)
+        np.testing.assert_allclose(got[3].detach().numpy(), light.rgb, rtol=1e-5)
+    distance = np.median([np.linalg.norm(s.camera.position - CENTER) for s in capture.sensors])
+    assert calibration.distance == pytest.approx(distance, rel=1e-5)
+    widths = {name: width for group in UNKNOWNS.values() for name, width in group.items()}
+    with torch.no_grad():
+        calibration.turn[3] = tensor([0, 0, np.pi / 2 / widths["turn"]])  # about the optical axis
+        calibration.move[3] = tensor([0, 0, 2])
+        calibration.light[0] = tensor([0.5, 0, 0])
+        calibration.focal[0] = 3
+        calibration.power[:] = tensor(np.random.default_rng(2).normal(size=(12, 3)))
+    cameras, intrinsics, places, strengths = (t.detach().numpy() for t in calibration())
+    old = capture.sensors[3].camera.to_world[:3]
+    x, y, z, position = old.T
+    moved = position + 2 * widths["move"] * distance * z
+    np.testing.assert_allclose(cameras[3].T, [y, -x, z, moved], atol=1e-4)
+    offset = FLASH + np.array([0.5 * widths["light"] * distance, 0, 0])
+    np.testing.assert_allclose(places[3], moved + offset @ [y, -x, z], rtol=1e-5)
+    np.testing.assert_allclose(intrinsics[:, 0], 60 * np.exp(3 * widths["focal"]), rtol=1e-5)
+    factors = np.log(strengths / np.stack([light.rgb for light in capture.photographs.lights]))
+    np.testing.assert_allclose(factors.mean(0), 0, atol=1e-5)  # brightness against albedo
+    assert factors.std() == pytest.approx(widths["power"], rel=0.3)
+
+
+def test_prior_expects_one_half_of_each_unknown(small_capture):
+    calibration = Calibration(mi_ring.load_capture(small_capture), ("cameras",), CENTER, 0.3)
+    with torch.no_grad():
+        for unknown in calibration.parameters():
+            unknown.fill_(1)  # a standard deviation, each of six
+    assert calibration.prior().item() == pytest.approx(6 / 2)
+
+
+def test_distant_lights_keep_their_length_and_each_place_has_one_unknown(small_capture, tmp_path):
+    def lamp(element):
+        emitter = element.find("emitter")
+        element.remove(emitter)
+        k = int(element.get("id"))
+        new = ElementTree.SubElement(element, "emitter", type="directional" if k % 2 else "point")
+        tag, name = ("vector", "direction") if k % 2 else ("point", "position")
+        ElementTree.SubElement(new, tag, name=name, x="0.6", y=f"{0.8 if k % 4 == 1 else 8}", z="0")
+
+    capture = mi_ring.load_capture(edited(small_capture, tmp_path / "lamps", lamp), images=False)
+    calibration = Calibration(capture, ("light", "cameras"), CENTER, 0.3)
+    assert calibration.flash is None and calibration.light.shape == (3, 3)
+    with torch.no_grad():
+        calibration.light[:] = 1
+        calibration.move[:] = 1  # which moves no lamp
+    moved = calibration().places.detach().numpy()
+    np.testing.assert_allclose(moved[0] - [0.6, 8, 0], 0.1 * calibration.distance, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(moved[1::2], axis=1), 1, rtol=1e-6)
+    toward = -np.array([0.6, 0.8, 0])
+    np.testing.assert_allclose(moved[1], (toward + 0.1) / np.linalg.norm(toward + 0.1), rtol=1e-5)
+
+
+def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    calibration = Calibration(capture, ("curve",), CENTER, 0.3)
+    radiance = torch.tensor([0.0, 1e-6, 0.01, 0.3, 0.7], requires_grad=True)
+    np.testing.assert_allclose(calibration.recorded(radiance).detach(), radiance.detach())
+    with torch.no_grad():
+        calibration.curve.fill_(-1.5)
+    gamma = np.exp(-1.5 * 0.2)
+    expected = 0.3 * (np.array([0.01, 0.3, 0.7]) / 0.3) ** gamma
+    recorded = calibration.recorded(radiance)
+    np.testing.assert_allclose(recorded[2:].detach(), expected, rtol=1e-5)
+    recorded.sum().backward()
+    assert radiance.grad.isfinite().all()
+    sensor = calibration.applied(capture).sensors[4]
+    assert sensor.gamma == pytest.approx(gamma, rel=1e-5)
+    # What the photograph then says of a lit surface, by the strength of its light then.
+    factor = sensor.light and float(np.ravel(mi.traverse(sensor.light)["intensity.value"])[0])
+    factor /= float(np.ravel(mi.traverse(capture.sensors[4].light)["intensity.value"])[0])
+    decoded, _ = decode(expected.astype(np.float32), True, 2.0, sensor.gamma)
+    np.testing.assert_allclose(decoded, factor * np.array([0.01, 0.3, 0.7]), rtol=1e-4)
+
+
+def test_calibration_survives_the_scene_file(small_capture, tmp_path):
+    capture = mi_ring.load_capture(small_capture)
+    calibration = Calibration(capture, tuple(UNKNOWNS), CENTER, 0.3)
+    with torch.no_grad():
+        for unknown in calibration.parameters():
+            unknown.copy_(tensor(np.random.default_rng(3).normal(size=unknown.shape)))
+    applied = calibration.applied(capture)
+    path = small_capture.parent / "recalibrated.xml"
+    path.write_bytes(recalibrated_xml(small_capture.read_bytes(), applied.sensors))
+    read = mi_ring.load_capture(path)
+    path.unlink()
+    for a, b in ((applied.photographs, read.photographs), (applied.photographs.lights, read.photographs.lights)):
+        for name in ("cameras", "intrinsics", "places", "strengths"):
+            if hasattr(a, name):
+                np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
+    assert [s.gamma for s in read.sensors] == pytest.approx([s.gamma for s in applied.sensors])
+    assert [s.mask for s in read.sensors] == [s.mask for s in capture.sensors]
+    summary = calibration.summary(capture, CENTER, 25.0)
+    assert len(summary["photographs"]) == 12 and summary["photographs"]["003.png"]["moved_px"] > 0.1
+    json.dumps(summary)
+
+
+def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, tmp_path):
+    wrong = np.array([-6.0, -16.0, 4.0])  # beyond a tenth of the distance
+    scene = edited(small_capture, tmp_path / "wrong", lambda element: move_light(element, wrong))
+    config = Config(iterations=150, levels=(3,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3)
+    running = Fit(mi_ring.load_capture(scene), config)
+    for _ in running:
+        pass
+    off = running.calibration.flash.mean(0) + running.calibration.value("light")[0] * running.calibration.distance
+    assert np.linalg.norm(off.detach().numpy() - FLASH) < 0.35 * np.linalg.norm(wrong)
+
+
+def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_capture, monkeypatch):
+    capture = mi_ring.load_capture(small_capture)
+    config = Config(iterations=4, levels=(2,), widths=(56,), shares=(1,), refine=("light", "curve"), holdout=5)
+    running = Fit(capture, config)
+    assert running.held_out.tolist() == [2, 7]
+    drawn = {k for _ in range(20) for k in running.choose()[0]}
+    assert drawn == set(range(12)) - {2, 7}
+    with torch.no_grad():
+        running.calibration.light.fill_(1)
+        running.calibration.curve.fill_(1)
+    shares = {(1.0, 1.0): 0.3, (0.0, 1.0): 0.4, (1.0, 0.0): 0.2, (0.0, 0.0): 0.5}
+
+    def state():
+        return tuple(float(getattr(running.calibration, name).detach().flatten()[0]) for name in ("light", "curve"))
+
+    def unexplained(fit, capture):
+        return 0.5 if capture is fit.capture else shares[state()]
+
+    monkeypatch.setattr(holdout, "unexplained", unexplained)
+    assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": ["curve"]}
+    assert state() == (1.0, 0.0)
+
+
+def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_capture, tmp_path):
+    def declare(element):
+        ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
+
+    capture = mi_ring.load_capture(edited(small_capture, tmp_path / "known", declare))
+    assert Fit(capture).calibration is None
+    assert Fit(capture, Config(refine=("cameras",))).calibration.refined == ("cameras",)
+    unknown = mi_ring.load_capture(small_capture)
+    assert Fit(unknown).calibration.refined == ("light", "power", "curve")
+    assert Fit(unknown, Config(refine=("none",))).calibration is None
+    assert fit.parse_options(["scene.xml", "--refine", "light", "cameras"]).refine == ("light", "cameras")
