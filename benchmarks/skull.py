@@ -21,6 +21,8 @@ from mi_ring.system.files import write_file
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 REFERENCE = SHARED / "data/real/flash_skull"
 
+EVERY = 8  #: one of so many photographs is held out
+
 
 def run(*arguments: object) -> None:
     """A command of mi_ring, which must end well; `check` may find something."""
@@ -30,19 +32,16 @@ def run(*arguments: object) -> None:
         sys.exit(f"failed: {' '.join(command)}")
 
 
-def split(capture: Path) -> tuple[Path, Path, list[str]]:
-    """The scene without the photographs held out, and these alone, uncropped; and their names."""
-    names = []
-    trees = [ElementTree.parse(capture / "scene.xml") for _ in range(2)]
-    sensors = sorted(sensor.get("id") for sensor in trees[0].getroot().findall("sensor"))
-    held = set(sensors[4::8])
-    for tree, keep in zip(trees, (set(sensors) - held, held)):
-        for sensor in tree.getroot().findall("sensor"):
-            if sensor.get("id") not in keep:
-                tree.getroot().remove(sensor)
-    for sensor in trees[1].getroot().findall("sensor"):
-        names.append(sensor.get("id"))
-        width, height = uncropped(capture)
+def held_out(capture: Path, result: Path) -> Path:
+    """A scene of the photographs held out alone, uncropped, with the cameras and lights that the fit has found."""
+    tree = ElementTree.parse(result / "scene.xml")
+    sensors = tree.getroot().findall("sensor")
+    held = sorted(sensor.get("id") for sensor in sensors)[EVERY // 2 :: EVERY]
+    width, height = uncropped(capture)
+    for sensor in sensors:
+        if sensor.get("id") not in held:
+            tree.getroot().remove(sensor)
+            continue
         for field, value in (("cx", width / 2), ("cy", height / 2)):
             sensor.find(f"float[@name='{field}']").set("value", str(value))
         for field, value in (("width", width), ("height", height)):
@@ -50,10 +49,9 @@ def split(capture: Path) -> tuple[Path, Path, list[str]]:
         for string in sensor.findall("string"):
             if string.get("name") != "filename":
                 sensor.remove(string)
-    paths = capture / "fitted.xml", capture / "held_out.xml"
-    for path, tree in zip(paths, trees):
-        write_file(path, ElementTree.tostring(tree.getroot()))
-    return *paths, names
+    path = result / "held_out.xml"
+    write_file(path, ElementTree.tostring(tree.getroot()))
+    return path
 
 
 def uncropped(capture: Path) -> tuple[int, int]:
@@ -116,10 +114,10 @@ def main() -> None:
         run("mi_ring.photos", options.photos, capture, *offset)
     if REFERENCE.is_dir():
         print(cameras_off(capture), masks_off(capture), sep="\n", flush=True)
-    fitted, held_out, _ = split(capture)
     result = capture / f"fit_{options.preset}"
-    run("mi_ring.fit", fitted, "--preset", options.preset, "--out", result, *options.fit)
-    run("mi_ring.render", result, held_out, result / "held_out")
+    run("mi_ring.fit", capture / "scene.xml", "--preset", options.preset, "--holdout", EVERY, "--out", result,
+        *options.fit)  # fmt: skip
+    run("mi_ring.render", result, held_out(capture, result), result / "held_out")
     if REFERENCE.is_dir():
         photographs = capture / "reference"
         if not photographs.is_dir():

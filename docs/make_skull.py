@@ -1,0 +1,117 @@
+"""The pictures of docs/skull.md, of what `python benchmarks/skull.py PHOTOS OUT` left in OUT.
+
+python docs/make_skull.py PHOTOS OUT docs/skull
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import pycolmap
+from make_picture import labelled, opened
+from PIL import Image
+
+import mi_ring
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.rendering import bridge
+
+SHOWN = "01", "09", "17", "25", "33", "42", "50", "58"  #: photographs that show each step
+HELD_OUT = "05", "29", "53"  #: photographs that the fit has not seen, beside what it predicts
+WIDTH = 300  #: of each [px]
+
+
+def table(pictures: list[np.ndarray]) -> np.ndarray:
+    """Pictures (H, W, 3) in two rows."""
+    half = len(pictures) // 2
+    return np.concatenate([np.concatenate(row, 1) for row in (pictures[:half], pictures[half:])])
+
+
+def photograph(path: Path) -> np.ndarray:
+    """(H, WIDTH, 3) uint8."""
+    image = Image.open(path).convert("RGB")
+    return np.array(image.resize((WIDTH, round(WIDTH * image.height / image.width)), Image.Resampling.LANCZOS))
+
+
+def outlined(path: Path, mask: Path) -> np.ndarray:
+    """A photograph with its mask's outline in green, in red around what is unsure; what is outside is darker."""
+    rgb = photograph(path)
+    shade = np.array(Image.open(mask).resize(rgb.shape[1::-1], Image.Resampling.NEAREST))
+    result = np.where((shade == 255)[..., None], rgb, rgb // 3)
+    for value, colour in ((255, (60, 255, 60)), (128, (255, 60, 60))):
+        lines, _ = cv2.findContours((shade == value).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        result = cv2.drawContours(np.ascontiguousarray(result), lines, -1, colour, 1)
+    return result
+
+
+def cameras(sparse: Path, picture: Path) -> None:
+    """Cameras and points from above and from aside, in the frame of structure from motion."""
+    model = pycolmap.Reconstruction(sparse)
+    images = [image for image in model.images.values() if image.has_pose]
+    centres = np.array([image.projection_center() for image in images])
+    downs = np.array([image.cam_from_world().rotation.matrix()[1] for image in images])
+    up = -downs.mean(0) / np.linalg.norm(downs.mean(0))
+    across = np.linalg.svd(centres - centres.mean(0) - np.outer((centres - centres.mean(0)) @ up, up))[2][:2]
+    axes = np.stack([*across, up])
+    points = np.array([p.xyz for p in model.points3D.values() if p.track.length() > 3])
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4.5))
+    for panel, (i, j), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from aside")):
+        panel.scatter(*(points @ axes.T).T[[i, j]], s=0.3, c="0.4")
+        panel.scatter(*(centres @ axes.T).T[[i, j]], s=14, c="tab:orange")
+        panel.set_aspect("equal")
+        panel.set_title(name)
+        spread = np.abs((centres - centres.mean(0)) @ axes.T).max() * 1.15
+        middle = axes @ centres.mean(0)
+        panel.set_xlim(middle[i] - spread, middle[i] + spread)
+        panel.set_ylim(middle[j] - spread, middle[j] + spread)
+        panel.set_xticks([])
+        panel.set_yticks([])
+    figure.tight_layout()
+    figure.savefig(picture, dpi=80)
+
+
+def results(out: Path) -> np.ndarray:
+    """Photographs held out, beside what the fit predicts, its normals and its diffuse colour."""
+    capture, (_, ring, _) = mi_ring.load_capture(out / "fit_default/scene.xml"), opened(out / "fit_default")
+    surface, rows = bridge.Surface(capture.scene, capture.shape, ring), []
+    for name in HELD_OUT:
+        k = next(k for k, sensor in enumerate(capture.sensors) if sensor.id() == name)
+        scale = -(-capture.sensors[k].size[0] // WIDTH)
+        surface.show(ring, *ring.domain.sample(ring.subdivisions))
+        shot = capture.photograph(k, scale)
+        maps = {what: values[0] for what, values in bridge.maps(surface, shot).items()}
+        rgb, coverage = bridge.draw(surface, shot, spp=64, indirect=ring.indirect)
+        seen = coverage[0].numpy()[..., None] > 0.5
+        diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
+        rows.append(labelled({
+            f"photograph {name}": linear_to_srgb(capture.observe([k], scale).rgb[0].numpy()),
+            "prediction": linear_to_srgb(rgb[0].numpy()), "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
+            "diffuse": linear_to_srgb(np.where(seen, diffuse, 0)),
+        }))  # fmt: skip
+    return np.concatenate(rows)
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("photos", type=Path, help="the photographs")
+    parser.add_argument("out", type=Path, help="folder that benchmarks/skull.py has written")
+    parser.add_argument("pictures", type=Path)
+    options = parser.parse_args()
+    options.pictures.mkdir(exist_ok=True)
+    files = {path.stem: path for path in options.photos.iterdir()}
+    masks = options.out / "work/masks"
+    sheets = {
+        "photographs": table([photograph(files[name]) for name in SHOWN]),
+        "masks": table([outlined(files[name], masks / f"{name}.png") for name in SHOWN]),
+        "result": results(options.out),
+    }
+    for name, sheet in sheets.items():
+        rgb = sheet if sheet.dtype == np.uint8 else to_bytes(sheet)
+        Image.fromarray(rgb).save(options.pictures / f"{name}.jpg", quality=88)
+    cameras(options.out / "work/sparse", options.pictures / "cameras.png")
+
+
+if __name__ == "__main__":
+    main()
