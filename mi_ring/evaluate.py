@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -34,6 +34,9 @@ class EvaluateConfig:
     """Scene of photographs that the fit has not seen."""
     seen: bool = False
     """Leave out of Chamfer distance and F-score what no photograph of the fit shows, of both surfaces."""
+    align: Literal["rigid", "similarity"] | None = None
+    """Move the true surface onto the fitted one first, rigidly or scaled as well: refined cameras do not say where the
+    object as a whole is. All figures of surfaces are then after alignment."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs."""
     out: Path | None = None
@@ -52,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
     if out.suffix.lower() != ".json":
         raise InputError(f"{out}: --out: must end in .json")
     require_place(out, "--out")
-    numbers = rounded(evaluate_fit(config.run, config.mesh, config.novel, config.spp, config.seen))
+    numbers = rounded(evaluate_fit(config.run, config.mesh, config.novel, config.spp, config.seen, config.align))
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)

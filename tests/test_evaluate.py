@@ -70,6 +70,21 @@ def test_spheres_of_two_radii():
 # Triangles that cross.
 
 
+def test_alignment_finds_the_motion_between_two_samplings_of_one_surface():
+    fine, coarse = trimesh.creation.icosphere(4), trimesh.creation.icosphere(5)
+    for ball in (fine, coarse):
+        x, y, z = ball.vertices.T
+        bumps = 1 + 0.3 * np.sin(2 * x + 1) + 0.2 * np.cos(3 * y - z)
+        ball.vertices = ball.vertices * bumps[:, None] * [30, 20, 25] + [400, -150, 90]
+    motion = trimesh.transformations.rotation_matrix(np.radians(2), [1, 2, -1], [390, -140, 90])
+    motion[:3, 3] += [0.4, -0.3, 0.5]
+    scaled = motion @ trimesh.transformations.scale_matrix(1.02, [400, -150, 90])
+    for similarity, true in ((False, motion), (True, scaled)):
+        found = surfaces.alignment(coarse, fine.copy().apply_transform(true), similarity)
+        off = trimesh.transform_points(fine.vertices, found) - trimesh.transform_points(fine.vertices, true)
+        assert np.linalg.norm(off, axis=1).max() < 0.15  # of 80; it was 2 off
+
+
 def self_intersections(mesh):
     return int(crossings.crossing_triangles(mesh.vertices, mesh.faces).sum())
 

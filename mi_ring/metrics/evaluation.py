@@ -4,35 +4,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.predictions import SPP, compare_photographs
-from mi_ring.metrics.surfaces import THRESHOLDS, compare_shapes, compare_surfaces, load_true_mesh
+from mi_ring.metrics.surfaces import THRESHOLDS, alignment, compare_shapes, compare_surfaces, load_true_mesh
 from mi_ring.rendering.crossings import crossing_triangles
+from mi_ring.rendering.plain_mesh import scene_of
 from mi_ring.ring.saved import load_fit
 
 LINES = {  # of the table
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
+    "aligned": "truth moved by °, % of the diagonal, factor",
     "chamfer": "Chamfer distance, % of the diagonal",
     **{f"f_score_{t}": f"F-score at {t} % of the diagonal" for t in THRESHOLDS}, "genus": "genus",
     "self_intersections": "triangles that cross others", "psnr": "PSNR, dB", "ssim": "SSIM",
 }  # fmt: skip
 
 
-def evaluate_fit(run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False) -> dict:
+def evaluate_fit(
+    run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False, align: str | None = None
+) -> dict:
     """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
 
     `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
-    genus of a surface that is not closed, for instance.
+    genus of a surface that is not closed, for instance. `align`: move the truth onto the result first, "rigid" or also
+    scaled ("similarity"); by how much is under `aligned_*`.
     """
     ring = load_fit(run)
     capture = load_capture(run / "scene.xml")
     unseen = novel and load_capture(novel)
     truth_mesh, truth = load_true_mesh(mesh)
     guess_mesh, guess = load_true_mesh(run / "mesh.ply")
-    numbers, views = compare_surfaces(capture, guess, truth, float(np.linalg.norm(truth_mesh.extents)))
+    diagonal, moved = float(np.linalg.norm(truth_mesh.extents)), {}
+    if align:
+        matrix = alignment(truth_mesh, guess_mesh, align == "similarity")
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        angle = Rotation.from_matrix(matrix[:3, :3] / scale).magnitude()
+        before = truth_mesh.bounds.mean(0)
+        truth_mesh.apply_transform(matrix)
+        shift = np.linalg.norm(matrix[:3, :3] @ before + matrix[:3, 3] - before)
+        moved = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
+                 "aligned_scale": scale}  # fmt: skip
+        truth, diagonal = scene_of(truth_mesh.vertices, truth_mesh.faces), diagonal * scale
+    numbers, views = compare_surfaces(capture, guess, truth, diagonal)
+    numbers |= moved
     numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None)
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
@@ -18,6 +19,7 @@ from mi_ring.rendering.visibility import View, Visibility
 from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
+ALIGNED, ALIGNMENTS = 20_000, 20  #: points that align two surfaces, and steps of doing so
 THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
@@ -27,6 +29,34 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
     if not len(mesh.faces):
         raise InputError(f"{path}: mesh: has no triangles; give a surface")
     return mesh, scene_of(mesh.vertices, mesh.faces)
+
+
+def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
+    """The motion (4, 4), perhaps with a scale, that brings a surface nearest to another, which is near already.
+
+    By points of the one and the tangent planes where they are nearest to the other (Chen and Medioni, 1992), each
+    weighed by its distance so that parts that only one of them has do not pull.
+    """
+    middle, unit = onto.bounds.mean(0), np.linalg.norm(onto.extents)
+    normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
+    end = np.asarray((onto.vertices - middle) / unit), np.asarray(onto.faces, np.int32)
+    start = trimesh.transform_points(trimesh.sample.sample_surface(mesh, ALIGNED, seed=0)[0], normalise)
+    squared_distance = need("gpytoolbox", "the distance of surfaces").squared_distance
+    total = np.eye(4)
+    for _ in range(ALIGNMENTS):
+        points = trimesh.transform_points(start, total)
+        squared, nearest, _ = squared_distance(points, *end, use_cpp=True)
+        normals = onto.face_normals[nearest]
+        gaps = np.einsum("ij,ij->i", end[0][end[1][nearest, 0]] - points, normals)
+        weights = 1 / (np.sqrt(squared) + np.sqrt(np.median(squared)) + 1e-9)
+        columns = [np.cross(points, normals), normals, np.einsum("ij,ij->i", points, normals)[:, None]]
+        design = np.concatenate(columns if similarity else columns[:2], 1)
+        step = np.linalg.lstsq(design * weights[:, None], gaps * weights)[0]
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() * (np.exp(step[6]) if similarity else 1)
+        move[:3, 3] = step[3:6]
+        total = move @ total
+    return np.linalg.inv(normalise) @ total @ normalise
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
