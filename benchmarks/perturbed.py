@@ -1,0 +1,142 @@
+"""Captures whose calibration is wrong by a known amount: what refinement finds, and what it is worth.
+
+    python benchmarks/perturbed.py CAPTURE [MORE …] --wrong cameras|light|power [--by 0.5] [--seeds 0 1 2]
+        [--preset default] [--out out/perturbed]
+
+cameras: each turned about each of its axes by a normal angle of so many degrees, and moved along each by a normal share
+of so many per cent of its distance from the object. light: all flashes by so many per cent of that distance, in one
+random direction of the cameras' axes. power: each photograph's light by a lognormal factor of so many per cent. For
+each seed four fits: exact calibration as it is and refined, wrong calibration as it is and refined; in a table the
+normals' mean error after rigid alignment, and what is left of the perturbation. A capture is a folder with scene.xml
+and truth/mesh.ply.
+"""
+
+import argparse
+import datetime
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+from accuracy import processor, product_speed, scene_file, table, truth_of
+from scipy.spatial.transform import Rotation
+
+import mi_ring
+from mi_ring.capture.calibrated import with_calibration
+from mi_ring.capture.scenefile import recalibrated_xml
+from mi_ring.rendering.lights import Lights
+from mi_ring.system.files import relative_to
+
+REFINED = {"cameras": ["cameras"], "light": ["light"], "power": ["power"]}
+
+
+def perturbed(capture, wrong: str, by: float, seed: int):
+    """The capture with other cameras or lights."""
+    random = np.random.default_rng(seed)
+    center, _ = capture.sphere()
+    cameras, lights = [sensor.camera for sensor in capture.sensors], list(Lights.of(capture.sensors))
+    direction = random.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    for k, (camera, light) in enumerate(zip(cameras, lights)):
+        distance = np.linalg.norm(camera.position - center)
+        if wrong == "cameras":
+            to_world = camera.to_world.copy()
+            to_world[:3, :3] @= Rotation.from_rotvec(np.radians(random.normal(0, by, 3))).as_matrix()
+            shift = camera.to_world[:3, :3] @ random.normal(0, by / 100 * distance, 3)
+            to_world[:3, 3] += shift
+            cameras[k] = camera._replace(to_world=to_world)
+            # A flash stays where it is in the camera's axes.
+            own = camera.to_world[:3, :3].T @ (light.vector - camera.position)
+            lights[k] = light._replace(vector=to_world[:3, :3] @ own + to_world[:3, 3])
+        elif wrong == "light":
+            shift = camera.to_world[:3, :3] @ direction * by / 100 * distance
+            lights[k] = light._replace(vector=light.vector + shift)
+        else:
+            lights[k] = light._replace(rgb=light.rgb * np.exp(random.normal(0, by / 100)))
+    return with_calibration(capture, cameras, lights)
+
+
+def write(capture, path: Path) -> None:
+    """A scene file of a capture, with the photographs where they are."""
+    root = ElementTree.parse(capture.path).getroot()
+    for string in root.iter("string"):
+        file = capture.path.parent / string.get("value")
+        if file.is_file():
+            string.set("value", relative_to(path.parent.resolve(), file.resolve()))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.sensors))
+
+
+def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list[str]) -> dict:
+    """Numbers of a fit, which is not made again if it is there."""
+    result = out / "numbers.json"
+    if not result.exists():
+        module = [sys.executable, "-m"]
+        fit = [*module, "mi_ring.fit", scene, "--out", out, "--refine", *refine, *options]
+        subprocess.run([str(a) for a in fit], check=True, stdout=sys.stderr)
+        evaluate = [*module, "mi_ring.evaluate", out, "--mesh", truth / "mesh.ply", "--align", "rigid", "--spp", 4]
+        done = subprocess.run([str(a) for a in evaluate], check=True, stdout=subprocess.PIPE)
+        result.write_bytes(done.stdout)
+    return json.loads(result.read_text())
+
+
+def left(true, found, wrong: str) -> float:
+    """What is left of the perturbation: [°] of cameras, [% of the distance] of lights, [%] of powers."""
+    center, _ = true.sphere()
+    a, b = ([sensor.camera for sensor in capture.sensors] for capture in (true, found))
+    if wrong == "cameras":  # as a whole they may have turned
+        turns = Rotation.from_matrix([x.to_world[:3, :3] @ y.to_world[:3, :3].T for x, y in zip(a, b)])
+        return float(np.degrees(np.sqrt(np.mean((turns * turns.mean().inv()).magnitude() ** 2))))
+    lights = [Lights.of(capture.sensors) for capture in (true, found)]
+    if wrong == "light":
+        own = [
+            np.stack([c.to_world[:3, :3].T @ (p - c.position) for c, p in zip(cameras, light.positions())])
+            for cameras, light in zip((a, b), lights)
+        ]
+        distance = np.median([np.linalg.norm(camera.position - center) for camera in a])
+        return float(100 * np.linalg.norm((own[1] - own[0]).mean(0)) / distance)
+    ratio = np.log(lights[1].rgb() / lights[0].rgb())
+    return float(100 * (ratio - ratio.mean(0)).std())
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("captures", nargs="+", type=scene_file)
+    parser.add_argument("--wrong", choices=tuple(REFINED), required=True)
+    parser.add_argument("--by", type=float, default=0.5)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--out", type=Path, default=Path("out/perturbed"))
+    options, rest = parser.parse_known_args()
+    rows = []
+    for path in options.captures:
+        truth, name = truth_of(path), path.stem if path.stem != "scene" else path.parent.name
+        true = mi_ring.load_capture(path, images=False)
+        for seed in options.seeds:
+            folder = options.out / f"{name}_{options.wrong}_{options.by}_{seed}"
+            wrong = perturbed(true, options.wrong, options.by, seed)
+            write(true, folder / "exact.xml")
+            write(wrong, folder / "wrong.xml")
+            cells = [f"{name}, seed {seed}"]
+            for kind in ("exact", "wrong"):
+                for refine in (["none"], REFINED[options.wrong]):
+                    out = folder / f"{kind}_{refine[0]}"
+                    numbers = fitted(folder / f"{kind}.xml", out, truth, refine, [*rest, "--seed", str(seed)])
+                    cells.append(f"{numbers['normal_mean']:.2f}°, {numbers.get('psnr_input', np.nan):.1f} dB")
+            found = mi_ring.load_capture(out / "scene.xml", images=False)
+            cells.append(f"{left(true, wrong, options.wrong):.3f} → {left(true, found, options.wrong):.3f}")
+            rows.append(cells)
+            print(cells, file=sys.stderr, flush=True)
+    import torch
+
+    speed = product_speed(4096, 4096, torch.float32) / 1e9
+    print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.wrong} wrong by {options.by}; "
+          f"mi_ring.fit {' '.join(rest)}\n")  # fmt: skip
+    heads = ["normals, photographs", "exact", "exact, refined", "wrong", "wrong, refined", "wrong by, before → after"]
+    print(table(heads, rows))
+
+
+if __name__ == "__main__":
+    main()

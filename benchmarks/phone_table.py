@@ -1,0 +1,110 @@
+"""What each disturbance of a simulated phone capture costs, and all of them at once, by `phone.py`.
+
+    python benchmarks/phone_table.py OUT [--objects pot2 bunny spot] [--views 24] [--size 960x720] [--preset fast]
+
+A row for the exact capture, one for each disturbance alone, with exact calibration and masks, and one for all of them
+at three strengths of the room's light, for which `mi_ring.photos` finds calibration and masks. In each: mean error of
+the normals and of the depth where both surfaces are seen, and how often that of the exact capture the former is. It
+goes on where it stopped.
+"""
+
+import argparse
+import datetime
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from accuracy import processor, product_speed, table
+from phone import DISTURBANCES
+
+HERE = Path(__file__).parent
+AMBIENT = 0.0, 0.03, 0.1  #: of the flash's light
+ALONE = [d for d in DISTURBANCES if d != "failures"]  # what fails does not belong to a calibrated capture
+
+
+def run(*arguments: object, log: Path, allowed: tuple[int, ...] = (0,)) -> str:
+    """Standard output of a Python command; what else it says goes into a log.
+
+    Raises RuntimeError with the last line of the log for another exit status than those allowed.
+    """
+    with log.open("a") as file:
+        done = subprocess.run([sys.executable, *map(str, arguments)], stdout=subprocess.PIPE, stderr=file, text=True)
+    if done.returncode not in allowed:
+        raise RuntimeError(log.read_text().rstrip().splitlines()[-1])
+    return done.stdout
+
+
+def evaluated(scene: Path, preset: str, log: Path) -> dict[str, float]:
+    """Errors of the fit of a scene whose truth is in truth/ of the capture's folder."""
+    folder = log.parent
+    run("-m", "mi_ring.fit", scene, "--preset", preset, "--out", scene.parent / "fit", log=log)
+    mesh = folder / "truth/mesh.ply"
+    numbers = json.loads(run("-m", "mi_ring.evaluate", scene.parent / "fit", "--mesh", mesh, "--spp", 1, log=log))
+    return {name: numbers[name] for name in ("normal_mean", "depth_mean")}
+
+
+def measure(folder: Path, made: list[object], found: bool, preset: str) -> dict[str, dict]:
+    """Make a capture and fit it, by calibration that is `found` (and the exact one of the same views) or known."""
+    result, log = folder / "result.json", folder / "log.txt"
+    if result.exists():
+        return json.loads(result.read_text())
+    folder.mkdir(parents=True, exist_ok=True)
+    run(HERE / "phone.py", folder, *made, log=log)
+    numbers = {}
+    if found:
+        numbers["exact"] = evaluated(folder / "exact/scene.xml", preset, log)
+        try:
+            run("-m", "mi_ring.photos", folder / "photos", folder / "found", log=log, allowed=(0, 1))
+            numbers["this"] = evaluated(folder / "found/scene.xml", preset, log)
+        except RuntimeError as error:
+            numbers["this"] = {"failed": str(error)}
+    else:
+        known = folder / "known/scene.xml"
+        run("-m", "mi_ring.convert", "transforms", folder / "truth/transforms.json", known, log=log, allowed=(0, 1))
+        numbers["this"] = evaluated(known, preset, log)
+    result.write_text(json.dumps(numbers))
+    return numbers
+
+
+def cell(numbers: dict, exact: dict) -> str:
+    """Normals, depth, and the normals' ratio to the exact capture's."""
+    if "failed" in numbers:
+        return numbers["failed"]
+    ratio = numbers["normal_mean"] / exact["normal_mean"]
+    return f"{numbers['normal_mean']:.2f}° / {numbers['depth_mean']:.2f} % ({ratio:.2f})"
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--objects", nargs="+", default=["pot2", "bunny", "spot"])
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--size", default="960x720")
+    parser.add_argument("--preset", default="fast")
+    options = parser.parse_args()
+    rows = {f"all, room {ambient:.0%}": ("all", ambient, True) for ambient in AMBIENT}
+    rows |= {f"{name} alone": (name, AMBIENT[1], False) for name in ALONE}
+    results = {}
+    for row, (disturbances, ambient, found) in rows.items():
+        for name in options.objects:
+            made = ["--object", name, "--disturbances", disturbances, "--ambient", ambient, "--views", options.views,
+                    "--size", options.size]  # fmt: skip
+            folder = options.out / name / row.replace(", ", "_").replace(" ", "_").rstrip("%")
+            results[row, name] = measure(folder, made, found, options.preset)
+            print(f"{name}, {row}: {results[row, name]}", file=sys.stderr, flush=True)
+    exact = {name: results["all, room 3%", name]["exact"] for name in options.objects}
+    lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]]
+    for row in rows:
+        lines.append([row, *(cell(results[row, name]["this"], exact[name]) for name in options.objects)])
+    import torch
+
+    speed = product_speed(4096, 4096, torch.float32) / 1e9
+    print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.views} photographs of {options.size} "
+          f"px, --preset {options.preset}\n")  # fmt: skip
+    print(table(["normals / depth (times exact)", *options.objects], lines))
+
+
+if __name__ == "__main__":
+    main()
