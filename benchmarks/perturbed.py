@@ -25,9 +25,8 @@ from scipy.spatial.transform import Rotation
 
 import mi_ring
 from mi_ring.capture.calibrated import with_calibration
-from mi_ring.capture.scenefile import recalibrated_xml
+from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.lights import Lights
-from mi_ring.system.files import relative_to
 
 REFINED = {"cameras": ["cameras"], "light": ["light"], "power": ["power"]}
 
@@ -61,10 +60,7 @@ def perturbed(capture, wrong: str, by: float, seed: int):
 def write(capture, path: Path) -> None:
     """A scene file of a capture, with the photographs where they are."""
     root = ElementTree.parse(capture.path).getroot()
-    for string in root.iter("string"):
-        file = capture.path.parent / string.get("value")
-        if file.is_file():
-            string.set("value", relative_to(path.parent.resolve(), file.resolve()))
+    move_names(root, capture.path.parent, path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.sensors))
 

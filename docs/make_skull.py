@@ -13,7 +13,6 @@ import pycolmap
 from make_picture import labelled, opened
 from PIL import Image
 
-import mi_ring
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
 
@@ -73,12 +72,12 @@ def cameras(sparse: Path, picture: Path) -> None:
 
 def results(out: Path) -> np.ndarray:
     """Photographs held out, beside what the fit predicts, its normals and its diffuse colour."""
-    capture, (_, ring, _) = mi_ring.load_capture(out / "fit_default/scene.xml"), opened(out / "fit_default")
-    surface, rows = bridge.Surface(capture.scene, capture.shape, ring), []
+    capture, ring, surface = opened(out / "fit_default")
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    rows = []
     for name in HELD_OUT:
         k = next(k for k, sensor in enumerate(capture.sensors) if sensor.id() == name)
         scale = -(-capture.sensors[k].size[0] // WIDTH)
-        surface.show(ring, *ring.domain.sample(ring.subdivisions))
         shot = capture.photograph(k, scale)
         maps = {what: values[0] for what, values in bridge.maps(surface, shot).items()}
         rgb, coverage = bridge.draw(surface, shot, spp=64, indirect=ring.indirect)

@@ -229,7 +229,7 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
                 np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
     assert [s.gamma for s in read.sensors] == pytest.approx([s.gamma for s in applied.sensors])
     assert [s.mask for s in read.sensors] == [s.mask for s in capture.sensors]
-    summary = calibration.summary(capture, CENTER, 25.0)
+    summary = calibration.summary(capture, applied, CENTER, 25.0)
     assert len(summary["photographs"]) == 12 and summary["photographs"]["003.png"]["moved_px"] > 0.1
     json.dumps(summary)
 

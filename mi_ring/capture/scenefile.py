@@ -137,6 +137,14 @@ def recalibrated_xml(scene: bytes, sensors: Sequence) -> bytes:
     return scene_bytes(root)
 
 
+def move_names(root: Element, source: Path, folder: Path) -> None:
+    """Rewrite the names of files that are relative to the folder `source` to be relative to another."""
+    for element in root.iter("string"):
+        file = source / element.get("value", "")
+        if element.get("value") and file.is_file():
+            element.set("value", relative_to(folder.resolve(), file.resolve()))
+
+
 def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
     """The scene file `source` with the fitted object and its `bsdf`, file names rewritten to be relative to `folder`.
 
@@ -144,10 +152,7 @@ def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -
     """
     tree = ElementTree.parse(source)
     old_bsdf, _ = bsdf_element(tree.getroot(), source)
-    for element in tree.iter("string"):
-        file = source.parent / element.get("value", "")
-        if element.get("value") and file.is_file():
-            element.set("value", relative_to(folder.resolve(), file.resolve()))
+    move_names(tree.getroot(), source.parent, folder)
     shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
     for element in list(shape):
         if element.get("name") in ("weights", "to_world"):

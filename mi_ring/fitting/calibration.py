@@ -152,10 +152,11 @@ class Calibration(nn.Module):
             lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
         return with_calibration(capture, cameras, lights, gamma)
 
-    def summary(self, capture: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
+    def summary(self, capture: Capture, refined: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
         """What was refined, as plain numbers: shared unknowns, and of each photograph how far it moved.
 
-        `center` (3,), `radius` [scene units]: of the object, whose pixels count.
+        `refined`: the capture with all of it `applied`; `center` (3,), `radius` [scene units]: of the object, whose
+        pixels count.
         """
         with torch.no_grad():
             result: dict[str, Any] = {"refined": list(self.refined), "unit": self.distance}
@@ -165,10 +166,9 @@ class Calibration(nn.Module):
                     result[name] = (value.exp() if name != "light" else value).tolist()
             power = self.value("power")
             factors = (power - power.mean(0)).exp() if power.ndim else None
-        after = self.applied(capture).sensors
         corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
         result["photographs"] = {}
-        for k, (old, new) in enumerate(zip(capture.sensors, after)):
+        for k, (old, new) in enumerate(zip(capture.sensors, refined.sensors)):
             shift = new.camera.project(corners)[0] - old.camera.project(corners)[0]
             entry: dict[str, Any] = {"moved_px": float(np.linalg.norm(shift, axis=1).mean())}
             if "cameras" in self.refined:

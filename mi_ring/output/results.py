@@ -121,7 +121,8 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         scene = recalibrated_xml(scene, capture.sensors)
-        summary = fit.calibration.summary(fit.capture, fit.ring.center.cpu().numpy(), float(fit.ring.radius))
+        center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
+        summary = fit.calibration.summary(fit.capture, capture, center, radius)
         summary |= {"held_out": fit.confirmed} if fit.confirmed else {}
         write_file(folder / "calibration.json", json.dumps(summary, indent=1))
     write_file(folder / "scene.xml", scene)
