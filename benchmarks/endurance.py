@@ -50,7 +50,7 @@ def main() -> None:
             rgb, coverage = bridge.render(
                 surface, scene.photographs, tensors[0], dict(zip(material, tensors[1:])), 1, iteration
             )
-            rgb = rgb + bridge.interreflection(surface, scene.photographs, coverage, iteration)
+            rgb = rgb + bridge.surroundings(surface, scene.photographs, coverage, iteration).interreflection
             ((rgb * weights).sum() + coverage.sum()).backward()
             compiled += sum(not kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
         if iteration in (1, 10) or iteration % 50 == 0:

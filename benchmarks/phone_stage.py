@@ -220,7 +220,6 @@ class Shot:
         k1, k2 = self.distortion
         return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
 
-
     def around(self, points: np.ndarray) -> "Window":
         """The part of the picture that holds points (n, 3) and a margin."""
         pixels, size = self.project(points), self.camera.size

@@ -53,7 +53,8 @@ def measure(folder: Path, made: list[object], found: bool, preset: str) -> dict[
     run(HERE / "phone.py", folder, *made, log=log)
     numbers = {}
     if found:
-        numbers["exact"] = evaluated(folder / "exact/scene.xml", preset, log)
+        if made[made.index("--ambient") + 1] == AMBIENT[1]:  # it is the same whatever the room
+            numbers["exact"] = evaluated(folder / "exact/scene.xml", preset, log)
         try:
             run("-m", "mi_ring.photos", folder / "photos", folder / "found", log=log, allowed=(0, 1))
             numbers["this"] = evaluated(folder / "found/scene.xml", preset, log)

@@ -54,6 +54,7 @@ PUBLIC = {name: f"mi_ring.{module}.{name}" for name, module in mi_ring._API.item
 PLUGINS = {
     "photograph": "mi_ring.plugins.photograph.Photograph",
     "flash": "mi_ring.plugins.flash.Flash",
+    "room": "mi_ring.plugins.room.Room",
     "shapenet": "mi_ring.plugins.shapenet.ShapeNetMesh",
     "cooktorrance": "mi_ring.plugins.cooktorrance.CookTorrance",
     "photometric": "mi_ring.plugins.photometric.Photometric",

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str]) -> None:
     with writing(config.out):
         for folder in {(config.out if config.film else config.out / view.name).parent for view in views}:
             folder.mkdir(parents=True, exist_ok=True)
-    pictures = render_views(surface, ring, views, integrator, capture.shadows, config)
+    pictures = render_views(surface, ring, views, integrator, capture.shadows, config, capture.photographs.room)
     if config.film:
         write_film(pictures, config.out, views[0].sensor.size, config.fps)
         print(config.out)

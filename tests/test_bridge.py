@@ -247,7 +247,7 @@ def test_nothing_is_compiled_and_nothing_kept_after_the_first_iterations():
             material = {key: m.clone().requires_grad_() for key, m in setting.material.items()}
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
                 rgb, alpha = bridge.render(setting.surface, setting.photographs, vertices, material, 1, seed)
-                rgb = rgb + bridge.interreflection(setting.surface, setting.photographs, alpha, seed)
+                rgb = rgb + bridge.surroundings(setting.surface, setting.photographs, alpha, seed).interreflection
                 (rgb.sum() + alpha.sum()).backward()
                 compiled += sum(not k["cache_hit"] for k in dr.kernel_history([dr.KernelType.JIT]))
         return compiled

@@ -20,6 +20,7 @@ from mi_ring.fitting.calibration import UNKNOWNS, Calibration, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.rendering import bridge
+from mi_ring.rendering.rooms import BASIS
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
 FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes
@@ -218,11 +219,16 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     with torch.no_grad():
         for unknown in calibration.parameters():
             unknown.copy_(tensor(np.random.default_rng(3).normal(size=unknown.shape)))
+        calibration.room.harmonics.copy_(tensor(np.random.default_rng(4).normal(size=(BASIS, 3))))
     applied = calibration.applied(capture)
+    assert capture.photographs.room is None and np.abs(applied.photographs.room).min() > 0
     path = small_capture.parent / "recalibrated.xml"
-    path.write_bytes(recalibrated_xml(small_capture.read_bytes(), applied.sensors))
+    scene = recalibrated_xml(small_capture.read_bytes(), applied.sensors, applied.photographs.room / 2)
+    path.write_bytes(recalibrated_xml(scene, applied.sensors, applied.photographs.room))  # in the place of the former
     read = mi_ring.load_capture(path)
     path.unlink()
+    np.testing.assert_allclose(read.photographs.room, applied.photographs.room, rtol=1e-5)
+    np.testing.assert_allclose(read.part([3, 1]).photographs.room, applied.photographs.room, rtol=1e-5)
     for a, b in ((applied.photographs, read.photographs), (applied.photographs.lights, read.photographs.lights)):
         for name in ("cameras", "intrinsics", "places", "strengths"):
             if hasattr(a, name):
@@ -276,6 +282,6 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
     assert Fit(capture).calibration is None
     assert Fit(capture, Config(refine=("cameras",))).calibration.refined == ("cameras",)
     unknown = mi_ring.load_capture(small_capture)
-    assert Fit(unknown).calibration.refined == ("light", "power", "curve")
+    assert Fit(unknown).calibration.refined == ("light", "power", "curve", "ambient")
     assert Fit(unknown, Config(refine=("none",))).calibration is None
     assert fit.parse_options(["scene.xml", "--refine", "light", "cameras"]).refine == ("light", "cameras")

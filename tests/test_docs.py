@@ -22,7 +22,7 @@ import trimesh
 
 from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
-from mi_ring.plugins import cooktorrance, flash, photograph, photometric, shapenet
+from mi_ring.plugins import cooktorrance, flash, photograph, photometric, room, shapenet
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 def plugins():
     """By name; the modules are loaded anew with each variant, so that they must be asked each time."""
     return {
-        "photograph": photograph.Photograph, "flash": flash.Flash, "shapenet": shapenet.ShapeNetMesh,
+        "photograph": photograph.Photograph, "flash": flash.Flash, "room": room.Room, "shapenet": shapenet.ShapeNetMesh,
         "cooktorrance": cooktorrance.CookTorrance, "photometric": photometric.Photometric,
     }  # fmt: skip
 
@@ -138,6 +138,7 @@ def values(tmp_path):
             "film": film, "emitter": light,
         }],
         "flash": [{}],
+        "room": [{"harmonics": " ".join(["0.1"] * 27), "frame": "camera"}],
         "shapenet": [
             {"weights": str(tmp_path / "ring.pt"), "subdivisions": 1, "to_world": moved, "flash": False},
             {"domain": str(tmp_path / "ball.ply"), "center": [1, 2, 3], "radius": 2.0, "subdivisions": 1,

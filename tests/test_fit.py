@@ -37,8 +37,17 @@ from mi_ring.ring.saved import load_fit
 from mi_ring.system import files, machine
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
-FILES = ["scene.xml", "ring.pt", "mesh.ply", "config.json", "log.jsonl", "inputs.png", "report.html", "checkpoint.pt",
-         "calibration.json"]
+FILES = [
+    "scene.xml",
+    "ring.pt",
+    "mesh.ply",
+    "config.json",
+    "log.jsonl",
+    "inputs.png",
+    "report.html",
+    "checkpoint.pt",
+    "calibration.json",
+]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
-from mi_ring.photogrammetry import masks, table
+from mi_ring.photogrammetry import masks, table, trial
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.motion import Motion, pairs_to_match
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, windows, write_shot
@@ -99,6 +99,24 @@ def test_masks_of_a_dim_room_with_lamps():
     np.testing.assert_allclose(found.body.points.mean(0), CENTER, atol=0.15)
 
 
+def test_a_trial_fit_covers_the_object_without_any_mask():
+    random = np.random.default_rng(5)
+    views, true = [], []
+    for k, pose in enumerate(poses(20)):
+        rgb, mask = in_a_dim_room(pose, random)
+        views.append(view(str(k), pose, rgb))
+        true.append(mask)
+    directions = random.normal(size=(200, 3))
+    points = CENTER + AXES * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    space = masks.Space.seen_by(views)
+    assert trial.sphere_of(points[:20], space.center, space.reach) is None
+    center, radius = trial.sphere_of(points, space.center, space.reach)
+    np.testing.assert_allclose(center, CENTER, atol=0.5)
+    assert AXES.min() < radius < AXES.max()
+    covered = trial.coverages(views, center, radius, lambda things, *_: things)
+    assert np.median([masks.overlap(c, t) for c, t in zip(covered, true)]) > 0.9
+
+
 def test_nothing_in_common_is_no_object():
     random = np.random.default_rng(0)
     views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
@@ -162,7 +180,7 @@ def test_a_table_that_the_flash_lights_is_no_object(bare):
     random = np.random.default_rng(1)
     views = [view(str(k), pose, on_a_table(pose, random, 1.0, bare)[0]) for k, pose in enumerate(poses(20, lowest=30))]
     plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
-    body = find_body(masks.Space.seen_by(views), Hints(plane), False, lambda things, *_: things)
+    body = find_body(masks.Space.seen_by(views), np.zeros((0, 3)), Hints(plane), False, lambda things, *_: things)
     if bare:
         assert body is None
     else:

@@ -35,6 +35,11 @@ class Observation(NamedTuple):
     masked: Tensor  #: (n,) bool: which have a mask
     valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None if all do. Others are black and clipped
 
+    def surely(self, coverage: Tensor) -> Tensor:
+        """(n, H, W) bool: where pixels are wholly object, by their masks, if they have any, and by a `coverage`."""
+        mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
+        return torch.minimum(mask, coverage) > 0.99
+
     def to(self, device: torch.device) -> "Observation":
         """The same on a device."""
         return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
@@ -91,7 +96,7 @@ class Capture:
         """The photographs of these indices alone."""
         names = "sensors", "images", "linear", "masks", "valid"
         lists: dict[str, Any] = {name: [values[k] for k in index] for name in names if (values := getattr(self, name))}
-        return replace(self, photographs=Photographs.of(lists["sensors"]), **lists)
+        return replace(self, photographs=Photographs.of(lists["sensors"], self.photographs.room), **lists)
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""

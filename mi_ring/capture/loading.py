@@ -14,6 +14,7 @@ from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.rooms import room_of
 from mi_ring.rendering.visibility import View
 from mi_ring.system import llvm
 
@@ -39,7 +40,7 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
             require_attributes(shape)
         if images:
             Edges(scene)  # refuses shapes without gradients
-        photographs = Photographs.of(sensors)
+        photographs = Photographs.of(sensors, room_of(scene))
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
     shadows = getattr(scene.integrator(), "shadows", True)

@@ -13,6 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
 from mi_ring.rendering.lights import Light, Lights
+from mi_ring.rendering.rooms import COUNT
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
@@ -120,8 +121,11 @@ def numbers(values: ArrayLike) -> str:
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
-def recalibrated_xml(scene: bytes, sensors: Sequence) -> bytes:
-    """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order."""
+def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = None) -> bytes:
+    """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order.
+
+    `room`: the light of their room, as `mi_ring.rendering.rooms` has it.
+    """
     root = ElementTree.fromstring(scene)
     photographs = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
     named = {sensor.id(): sensor for sensor in sensors}
@@ -134,7 +138,22 @@ def recalibrated_xml(scene: bytes, sensors: Sequence) -> bytes:
             if lit or child.get("name") in ("gamma", *fields):
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
+    for emitter in root.findall("emitter[@type='room']"):
+        root.remove(emitter)
+    if room is not None:
+        root.extend(room_elements(room))
     return scene_bytes(root)
+
+
+def room_elements(room: np.ndarray) -> list[Element]:
+    """The light of a room as XML: what is fixed in the world, and what is in the camera."""
+    elements = []
+    for frame, harmonics in (("world", room[:COUNT]), ("camera", np.vstack([np.zeros((1, 3)), room[COUNT:]]))):
+        element = ElementTree.Element("emitter", type="room")
+        ElementTree.SubElement(element, "string", name="frame", value=frame)
+        ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))
+        elements.append(element)
+    return elements
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:

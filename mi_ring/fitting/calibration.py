@@ -1,10 +1,12 @@
-"""Cameras, lights and the camera's curve as unknowns: what a fit refines besides surface and material.
+"""Cameras, lights, room and camera curve as unknowns: what a fit refines besides surface and material.
 
 The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
 against albedo (the logarithms of `power` have the mean zero in each colour); where the whole is, how it is turned and
-how large it is, which only the priors hold; focal length against distance, likewise.
+how large it is, which only the priors hold; focal length against distance, likewise. A room that is alike from all
+sides is in the world's axes and in the camera's: it counts as the world's.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,8 +18,10 @@ from torch.nn import functional as F
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera
 from mi_ring.rendering.lights import Light
+from mi_ring.rendering.rooms import BASIS
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
 UNKNOWNS: dict[str, dict[str, float]] = {
@@ -29,11 +33,13 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "light": {"light": 0.1},  # along each axis [the same distance]; of distant ones [rad]
     "power": {"power": 0.1},  # logarithm, of each photograph and colour
     "curve": {"curve": 0.2},  # logarithm of the exponent
+    "ambient": {},  # `Room`
 }
-AUTO = "light", "power", "curve"  #: what is refined by default
+AUTO = "light", "power", "curve", "ambient"  #: what is refined by default
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
 START, SETTLED = 0.2, 0.4  #: progress of the fit when refinement begins, and when that of cameras does
+LIT = 0.15  #: and when that of the room's light does
 RATE = 0.1  #: of Adam at first, in standard deviations an iteration
 
 
@@ -67,6 +73,7 @@ class Calibration(nn.Module):
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
         arrays = to_world, intrinsics, lights.positions(), lights.rgb()
         self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
+        self.center = torch.from_numpy(np.asarray(center)).float()
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
         self.distance = float(np.median(np.linalg.norm(to_world[:, :, 3] - center, axis=1)))
         inside = torch.einsum("pji,pj->pi", self.base.cameras[:, :, :3], self.base.places - self.base.cameras[:, :, 3])
@@ -83,6 +90,8 @@ class Calibration(nn.Module):
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
+        given = capture.photographs.room
+        self.room = Room(torch.zeros(BASIS, 3) if given is None else torch.from_numpy(given).float(), exposure)
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""
@@ -126,16 +135,38 @@ class Calibration(nn.Module):
         slope = relative.clamp(min=DARKEST) ** (self.gamma - 1)
         return radiance * slope
 
+    def linear(self, recorded: Tensor) -> Tensor:
+        """Radiance of what the camera's curve recorded; without gradients."""
+        if "curve" not in self.refined:
+            return recorded
+        relative, gamma = recorded / self.exposure, float(self.gamma.detach())
+        return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
+
+    def room_share(self) -> Tensor:
+        """(3,) the room's light on the object, mean over all directions, by that of the flash where it faces it."""
+        with torch.no_grad():
+            _, _, places, strengths = self()
+            distance2 = torch.where(self.finite, (places - self.center).square().sum(-1, keepdim=True), 1.0)
+            mean = self.room.harmonics[0].cpu() / math.sqrt(4 * math.pi)
+            return math.pi * mean / (strengths / distance2).median(0).values
+
     def prior(self) -> Tensor:
         """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""
         total = sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(()))
         return total / 2 / len(self.lens)
 
-    def optimizer(self) -> torch.optim.Optimizer:
-        """Adam, whose groups say when they begin."""
-        groups = [{"params": [getattr(self, name) for name in UNKNOWNS[group]], "initial_lr": RATE,
-                   "start": SETTLED if group == "cameras" else START} for group in self.refined]  # fmt: skip
-        return torch.optim.Adam(groups, lr=RATE)
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        """Adam, whose groups say when they begin; none if least squares finds all."""
+        groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE,
+                   "start": SETTLED if group == "cameras" else START}
+                  for group, names in UNKNOWNS.items() if names and group in self.refined]  # fmt: skip
+        return [torch.optim.Adam(groups, lr=RATE)] if groups else []
+
+    def unknown(self, name: str) -> tuple[Tensor, Tensor]:
+        """An unknown of all photographs as it is, to be changed in place, and as the capture says."""
+        if name == "ambient":
+            return self.room.harmonics, self.room.given
+        return getattr(self, name), torch.zeros_like(getattr(self, name))
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with cameras, lights and curve as they are by now."""
@@ -150,7 +181,10 @@ class Calibration(nn.Module):
             cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size))
             point = bool(self.finite[k])
             lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
-        return with_calibration(capture, cameras, lights, gamma)
+        room = None
+        if "ambient" in self.refined or capture.photographs.room is not None:
+            room = self.room.harmonics.double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
+        return with_calibration(capture, cameras, lights, gamma, room)
 
     def summary(self, capture: Capture, refined: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
         """What was refined, as plain numbers: shared unknowns, and of each photograph how far it moved.
@@ -166,6 +200,8 @@ class Calibration(nn.Module):
                     result[name] = (value.exp() if name != "light" else value).tolist()
             power = self.value("power")
             factors = (power - power.mean(0)).exp() if power.ndim else None
+            if "ambient" in self.refined:
+                result["ambient"] = {"share": self.room_share().tolist(), "harmonics": self.room.harmonics.tolist()}
         corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
         result["photographs"] = {}
         for k, (old, new) in enumerate(zip(capture.sensors, refined.sensors)):

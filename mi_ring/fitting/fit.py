@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import Calibration, refined_of
+from mi_ring.fitting.calibration import LIT, Calibration, refined_of
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
@@ -28,6 +28,8 @@ from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
 from mi_ring.rendering.crossings import crossing_triangles
+from mi_ring.rendering.indirect import BOUNCES
+from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device
@@ -101,7 +103,8 @@ class Fit:
         self.calibration: Calibration | None = None
         if refined := refined_of(capture, self.config):
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure)
-            self.optimizers.append(self.calibration.optimizer())
+            self.optimizers += self.calibration.optimizers()
+            self.calibration.room.to(self.device)
         self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
@@ -197,14 +200,34 @@ class Fit:
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
         )  # fmt: skip
-        if self.ring.indirect:
-            predicted = predicted + bridge.interreflection(self.surface, photographs, coverage, self.new_seed())
+        predicted = self.add_surroundings(predicted, coverage, photographs, seen)
         if self.calibration:
             predicted = self.calibration.recorded(predicted)
         return Iteration(
             self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
             *seen, predicted, coverage,
         )  # fmt: skip
+
+    def add_surroundings(
+        self, predicted: Tensor, coverage: Tensor, photographs: Photographs, seen: Observation
+    ) -> Tensor:
+        """Predicted photographs with interreflection and the light of the room, which is found by the way."""
+        calibration = self.calibration if self.calibration and "ambient" in self.calibration.refined else None
+        lit = calibration is not None or photographs.room is not None
+        if not (self.ring.indirect or lit):
+            return predicted
+        around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
+                                     bounces=BOUNCES if self.ring.indirect else 1)  # fmt: skip
+        if self.ring.indirect:
+            predicted = predicted + around.interreflection
+        if calibration:
+            if self.iteration / self.iterations >= LIT:
+                telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
+                calibration.room.see(around, predicted.detach(), calibration.linear(seen.rgb), telling)
+            return predicted + around.room(calibration.room.harmonics)
+        if photographs.room is not None:
+            predicted = predicted + around.room(torch.from_numpy(photographs.room).to(predicted))
+        return predicted
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the photographs of one iteration, all of one size (width, height)."""

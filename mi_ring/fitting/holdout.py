@@ -11,7 +11,12 @@ from mi_ring.rendering import bridge
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
-SHARED = "focal", "light", "curve"  #: unknowns of all photographs; those of one are not known where it is kept out
+SHARED = (
+    "focal",
+    "light",
+    "curve",
+    "ambient",
+)  #: unknowns of all photographs; those of one are not known where it is kept out
 WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
 
 
@@ -26,8 +31,7 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
         rgb, coverage = bridge.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=fit.ring.indirect)  # fmt: skip
         seen, gamma = capture.observe([k], scale), capture.sensors[k].gamma
-        mask = torch.where(seen.masked[:, None, None], seen.mask, 1.0)
-        inside = (torch.minimum(mask, coverage) > 0.99) & ~seen.clipped.any(-1)
+        inside = seen.surely(coverage) & ~seen.clipped.any(-1)
         observed, predicted = seen.rgb[inside] ** gamma, rgb[inside] ** gamma  # as the file has them
         if len(observed):
             factor = (observed * predicted).sum() / predicted.square().sum().clamp(min=1e-12)
@@ -47,10 +51,10 @@ def confirm(fit: "Fit") -> dict:
     if calibration is None:
         return {"unexplained": now, "put_back": back}
     for name in [name for name in SHARED if name in calibration.refined]:
-        unknown = getattr(calibration, name)
+        unknown, given = calibration.unknown(name)
         found = unknown.detach().clone()
         with torch.no_grad():
-            unknown.zero_()
+            unknown.copy_(given)
             without = unexplained(fit, fit.calibrated())
             if without <= now:
                 now, back = without, [*back, name]

@@ -16,8 +16,13 @@ def optimizers_of(networks: nn.Module, config: Config, device: torch.device) -> 
     Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear ones.
     """
     lists = [getattr(part, "hidden", None) for part in networks.modules()]
-    hidden: list[Any] = [layer.weight for layers in lists if isinstance(layers, nn.ModuleList)
-                         for layer in layers if isinstance(layer, nn.Linear)]
+    hidden: list[Any] = [
+        layer.weight
+        for layers in lists
+        if isinstance(layers, nn.ModuleList)
+        for layer in layers
+        if isinstance(layer, nn.Linear)
+    ]
     hidden = hidden if config.optimizer == "muon" else []
     rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
     result: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=config.learning_rate)]

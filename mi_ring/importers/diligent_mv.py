@@ -1,6 +1,5 @@
 """DiLiGenT-MV's objects."""
 
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

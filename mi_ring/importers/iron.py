@@ -1,6 +1,5 @@
 """cam_dict_norm.json of IRON."""
 
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -31,7 +31,16 @@ class PhotographQuality:
 
 
 HEADS = (
-    "photograph", "distance", "light", "angle", "object", "clipped", "dark", "background", "brightness", "agreement",
+    "photograph",
+    "distance",
+    "light",
+    "angle",
+    "object",
+    "clipped",
+    "dark",
+    "background",
+    "brightness",
+    "agreement",
 )
 
 

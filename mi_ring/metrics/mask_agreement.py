@@ -89,9 +89,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
     for first, change in MATRICES.items():
         for second, axes in AXES.items():
             name = "; then ".join(part for part in (first, second) if part)
-            guesses[name] = [
-                with_camera(s, to_world=change(s.camera.to_world) @ np.diag([*axes, 1.0])) for s in some
-            ]
+            guesses[name] = [with_camera(s, to_world=change(s.camera.to_world) @ np.diag([*axes, 1.0])) for s in some]
     as_it_is = share_agreed(guesses.pop(""))
     scores = {name: share_agreed(guess) for name, guess in guesses.items()}
     best = max(scores, key=scores.__getitem__)

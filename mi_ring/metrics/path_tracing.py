@@ -15,6 +15,7 @@ from mi_ring.rendering.attributes import attributes_of, require_attributes
 from mi_ring.rendering.photographs import Photographs, pixel_rays
 from mi_ring.rendering.pictures import render_photographs
 from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.shading import is_room
 
 BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
 LANES = 1 << 21  #: rays per launch, at most
@@ -39,9 +40,17 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(sensors)
-        return with_flash(scene), sensors
+        return with_flash(without_rooms(scene)), sensors
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def without_rooms(scene: mi.Scene) -> mi.Scene:
+    """The scene without `room` emitters: what they add is path traced either way (`render_indirect`)."""
+    emitters = own_emitters(scene)
+    if not any(map(is_room, emitters)):
+        return scene
+    return assembled(scene.shapes(), [emitter for emitter in emitters if not is_room(emitter)])
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:

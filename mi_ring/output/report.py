@@ -56,11 +56,14 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
     masked = [row.iou for row in rows if row.iou is not None]
     s, faces = ring.domain.sample(ring.subdivisions)
     numbers = {
-        "Photographs": f"{len(capture)}" + (f"; below are {len(rows)} of them, as are the next two numbers"
-                                             if len(rows) < len(capture) else ""),
+        "Photographs": f"{len(capture)}"
+        + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
         "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels, 4 samples each)",
-        "Silhouettes": (f"{np.mean(masked):.4f} intersection over union with the masks"
-                        if masked else "no masks of the whole object"),
+        "Silhouettes": (
+            f"{np.mean(masked):.4f} intersection over union with the masks"
+            if masked
+            else "no masks of the whole object"
+        ),
         "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
@@ -94,6 +97,8 @@ def refined_text(calibration: Any) -> str:
         parts.append(f"focal length, by {calibration.value('focal').detach().abs().max():.2%}")
     if "curve" in calibration.refined:
         parts.append(f"the camera's curve, whose exponent is {calibration.gamma.detach():.2f}")
+    if "ambient" in calibration.refined:
+        parts.append(f"the room's light, {calibration.room_share().mean():.1%} of the flash's")
     return "; ".join(parts) + " (calibration.json)"
 
 

@@ -120,7 +120,7 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     views = capture.views
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
-        scene = recalibrated_xml(scene, capture.sensors)
+        scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room)
         center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
         summary = fit.calibration.summary(fit.capture, capture, center, radius)
         summary |= {"held_out": fit.confirmed} if fit.confirmed else {}

@@ -22,7 +22,7 @@ from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.scenes import assembled, own_emitters
-from mi_ring.rendering.shading import is_flash
+from mi_ring.rendering.shading import is_flash, is_room
 from mi_ring.ring.material import MaterialOptions
 from mi_ring.ring.ring import Ring
 
@@ -183,9 +183,9 @@ def lit_surface(capture: Capture, ring: Ring, config: RenderConfig) -> bridge.Su
 
 def render_views(
     surface: bridge.Surface, ring: Ring, views: list[View], integrator: mi.Integrator | None, shadows: bool,
-    config: RenderConfig,
+    config: RenderConfig, room: np.ndarray | None = None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """The pictures, (H, W, 3) linear radiance each."""
+    """The pictures, (H, W, 3) linear radiance each; `room`: its light, as `Photographs` have it."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(tqdm(views, desc="rendering", unit="picture")):
@@ -195,7 +195,7 @@ def render_views(
         if integrator:
             yield in_passes(surface.scene, view.sensor, integrator, config.spp, seed=k)
         else:
-            one = Photographs.of([view.sensor])
+            one = Photographs.of([view.sensor], room)
             rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 
@@ -228,7 +228,7 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
-    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e))]
+    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring)

@@ -1,7 +1,8 @@
 """The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
 
+import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from mi_ring.photogrammetry.folder import Picture, relative_exposures, turned_wi
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
 from mi_ring.photogrammetry.table import FLAT, Plane, Table, find_plane
+from mi_ring.photogrammetry.trial import coverages, sphere_of
 from mi_ring.photogrammetry.views import around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
@@ -29,8 +31,6 @@ FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
 PAPER = 0.8  #: albedo of white paper
 DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
-
-
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -193,9 +193,7 @@ class Hints(NamedTuple):
         return allowed
 
 
-def find_object(
-    pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress
-) -> Object:
+def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress) -> Object:
     """The object and its masks.
 
     Masks that `folder` has already are taken as they are; anybody may have painted in them.
@@ -264,7 +262,7 @@ def searched(
     First in whole photographs, reduced; then closer to what was found. `sheet`: is the plane that of the sheet?
     """
     folder, plane = pictures[0].path.parent, hints.plane
-    body = find_body(space, hints, sheet, progress)
+    body = find_body(space, motion.points, hints, sheet, progress)
     covered = [(p, body.coverage(view)) for p, view in zip(pictures, space.views)] if body else []
     showing = [(picture, cover) for picture, cover in covered if cover.any()]
     if body is None or len(showing) < len(pictures) / 2:
@@ -295,21 +293,30 @@ def searched(
     return found.body, shades
 
 
-def find_body(space: masks.Space, hints: Hints, sheet: bool, progress: Progress) -> masks.Body | None:
-    """The object by what differs from the table that it stands on; else by brightness.
+def find_body(
+    space: masks.Space, points: np.ndarray, hints: Hints, sheet: bool, progress: Progress
+) -> masks.Body | None:
+    """The object by what differs from the table that it stands on; else by brightness; else by a trial fit.
 
-    Not so on a `sheet`, which differs from any object: there it would be the paper. Elsewhere what has the table's
-    pattern is left out, for the flash lights the middle of the table, too.
+    Not by brightness on a `sheet`, which differs from any object: there it would be the paper. Elsewhere what has the
+    table's pattern is left out, for the flash lights the middle of the table, too. `points` (N, 3): the sparse ones,
+    which say where the trial begins.
     """
-    tables, guesses = masks.nothing(space.views), []
     space.allowed = hints.allow(space.grid, space.distance)
-    if hints.plane:
-        table = Table(space.views, hints.plane, space.center, space.reach, progress)
-        tables = table.patterns()
-        guesses.append(table.others())
-    if not sheet:
-        guesses.append([masks.bright(view) & (1 - known) for view, known in zip(space.views, tables)])
-    for guess in guesses:
+    table = Table(space.views, hints.plane, space.center, space.reach, progress) if hints.plane else None
+    tables = table.patterns() if table else masks.nothing(space.views)
+
+    def guesses() -> Iterator[list[np.ndarray]]:
+        if table:
+            yield table.others()
+        if not sheet:
+            yield [masks.bright(view) & (1 - known) for view, known in zip(space.views, tables)]
+        sphere = sphere_of(points[hints.allow(points, space.distance)], space.center, space.reach)
+        with contextlib.suppress(InputError):  # it diverged
+            if sphere:
+                yield coverages(space.views, *sphere, progress)
+
+    for guess in guesses():
         found = masks.settle(space, guess, tables, progress)
         if found and found.quality >= SURE:
             return found.body

@@ -59,7 +59,7 @@ class Photometric(ADIntegrator):
     def sample(self, mode, scene, sampler, ray, depth=None, δL=None, state_in=None, active=True, **kwargs):
         self.require_attributes(scene)
         si = scene.ray_intersect(mi.Ray3f(ray), active)
-        radiance = shade(scene, si, flash_light, sampler.next_2d, self.shadows)
+        radiance = shade(scene, si, flash_light, sampler.next_2d, self.shadows, rooms=True)
         return radiance, si.is_valid(), [], None
 
     def require_attributes(self, scene):

@@ -18,3 +18,15 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
         return float(value)
     wanted = "a positive number" if positive else "a number"
     raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {value}, must be {wanted}')
+
+
+def number_list(props, name: str, count: int) -> list[float]:
+    """A property of a plugin that is so many finite numbers. Raises ValueError, which names it, if it is not."""
+    text = str(props.get(name, ""))
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if len(values) == count and np.isfinite(values).all():
+        return values
+    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is "{text[:60]}", must be {count} numbers')

@@ -1,6 +1,7 @@
 """The one seam between torch and Dr.Jit: from torch tensors to photographs, and the gradients back."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ from mi_ring.images import blur
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
 from mi_ring.rendering.attributes import load_bsdf, require_attributes
 from mi_ring.rendering.edges import Edges
-from mi_ring.rendering.indirect import render_indirect
+from mi_ring.rendering.indirect import BOUNCES, render_indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
@@ -177,9 +178,9 @@ def draw(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Like `render`, of the surface as last written, without gradients, in the processor's memory.
 
-    `indirect`: with interreflection. However many pixels and samples, it takes about a gigabyte
-    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take; `indirect` adds about
-    100 MB for each photograph.
+    `indirect`: with interreflection; the light of the photographs' room is always part of them. However many pixels
+    and samples, it takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures
+    themselves take; `indirect` or a room add about 100 MB for each photograph.
     """
     parts = []
     for pixels in photographs.chunks(spp):
@@ -187,31 +188,67 @@ def draw(
         dr.eval(channels)
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
-    if indirect:
-        rgb = rgb + interreflection(surface, photographs, coverage, seed + 1, width=128, spp=32)
+    if indirect or photographs.room is not None:
+        around = surroundings(surface, photographs, coverage, seed + 1, 128, 32, BOUNCES if indirect else 1,
+                              photographs.room is not None)  # fmt: skip
+        rgb = rgb + (around.interreflection if indirect else 0)
+        if photographs.room is not None:
+            rgb = (rgb + around.room(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
     return rgb.cpu(), coverage.cpu()
 
 
-def interreflection(
-    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16
-) -> Tensor:
-    """What interreflection adds to pictures of the surface as last written: linear radiance (N, H, W, 3).
+@dataclass(frozen=True)
+class Surroundings:
+    """What reaches the camera from a surface by other ways than from its photograph's light at once; small pictures."""
 
-    `photographs`: as they were rendered; `coverage` (N, H, W): of that picture, through which alone gradients flow: the
-    outline feels this light too, shape and material do not (they are corrected for it, as in "Shape from
-    Interreflections", Nayar, Ikeuchi and Kanade, IJCV 1991). It varies slowly: it is rendered at most `width` pixels
-    wide (a few good pixels did better than many noisy ones), smoothed, and spread over what the object covers, so that
-    its edges are those of the picture.
+    radiance: Tensor  #: (N, h, w, 3) of interreflection
+    harmonics: (
+        Tensor | None
+    )  #: (BASIS, N, h, w, 3) of a room whose radiance is one harmonic of `mi_ring.rendering.rooms`
+    alpha: Tensor  #: (N, h, w) coverage
+    coverage: Tensor  #: (N, H, W) of the large picture
+    factor: int  #: by which it is larger
+
+    @property
+    def interreflection(self) -> Tensor:
+        """What interreflection adds to the large picture: linear radiance (N, H, W, 3)."""
+        return self.spread(self.radiance)
+
+    def room(self, harmonics: Tensor) -> Tensor:
+        """What a room adds to it, whose radiance is `harmonics` (BASIS, 3)."""
+        assert self.harmonics is not None
+        return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics, harmonics))
+
+    def spread(self, rgb: Tensor) -> Tensor:
+        """Pictures (N, h, w, 3) of light that varies slowly over what the large picture's object covers.
+
+        Its edges are then those of the large picture, through whose coverage alone gradients flow: the outline feels
+        this light too, shape and material do not (they are corrected for it, as in "Shape from Interreflections",
+        Nayar, Ikeuchi and Kanade, IJCV 1991).
+        """
+        images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
+        images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
+        images = F.interpolate(images, scale_factor=self.factor, mode="bilinear", align_corners=False)
+        below, right = self.coverage.shape[1] - images.shape[2], self.coverage.shape[2] - images.shape[3]
+        images = F.pad(images, (0, right, 0, below), mode="replicate")
+        return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * self.coverage[..., None]
+
+
+def surroundings(
+    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16,
+    bounces: int = BOUNCES, room: bool = False,
+) -> Surroundings:  # fmt: skip
+    """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
+
+    `photographs`: as they were rendered; `coverage` (N, H, W): of that picture. This light varies slowly: it is
+    rendered at most `width` pixels wide (a few good pixels did better than many noisy ones), and smoothed.
     """
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)
-    rgb, alpha = pictures([to_torch(c) for c in render_indirect(surface.scene, small, spp, seed)], small)
-    images = torch.cat([rgb, alpha[..., None]], -1).movedim(-1, 1)
-    images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
-    images = F.interpolate(images, scale_factor=factor, mode="bilinear", align_corners=False)
-    below, right = coverage.shape[1] - images.shape[2], coverage.shape[2] - images.shape[3]
-    images = F.pad(images, (0, right, 0, below), mode="replicate")
-    return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * coverage[..., None]
+    channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room)]
+    rgb, alpha = pictures(channels[:4], small)
+    harmonics = torch.stack(channels[4:]).reshape(-1, 3, *alpha.shape).movedim(1, -1) if room else None
+    return Surroundings(rgb, harmonics, alpha, coverage, factor)
 
 
 def pictures(channels: list[Tensor], photographs: Photographs) -> tuple[Tensor, Tensor]:

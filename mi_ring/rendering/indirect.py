@@ -1,48 +1,65 @@
-"""Interreflection: light that reaches the camera by way of more than one point of the scene."""
+"""Interreflection, light that reaches the camera by way of more than one point of the scene; and that of the room."""
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.rendering.photographs import pixel_rays
+from mi_ring.rendering.rooms import BASIS, harmonics_toward
 from mi_ring.rendering.shading import next_2d, shade
 
 BOUNCES = 3  # after the first surface
 
 
-def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES):
+def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False):
     """Light that has been reflected more than once: [R, G, B, coverage], Floats of N·H·W pixels, no gradients.
 
     Paths are traced from the camera, the BSDFs sampled, and shaded directly lit wherever they arrive (the light of
     each photograph casts shadows); `bounces` more points after the first. Box-filtered linear radiance, unbiased but
     for the light of longer paths.
+
+    `room`: followed by R, G, B for each of the harmonics of `mi_ring.rendering.rooms`, of what the surface shows of a
+    room whose radiance is that harmonic: what paths meet that escape after at most `bounces` points.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
         covered = dr.select(hit.is_valid(), mi.Float(1), 0)
         lane = dr.compress(hit.is_valid())  # the background costs nothing from here on
-        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3)]
+        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3 + 3 * BASIS * room)]
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
-            for channel, value in zip(channels, reflect(scene, si, view, photographs, bounces, seed)):
+            radiance, escaped, direction = reflect(scene, si, view, photographs, bounces, seed)
+            values = [*radiance]
+            if room:
+                harmonics = harmonics_toward(direction, photographs.camera(view)[0])
+                values += [harmonic * weight for harmonic in harmonics for weight in escaped]
+            for channel, value in zip(channels, values):
                 dr.scatter(channel, value, lane)
-        channels.append(covered)
+        channels.insert(3, covered)
         dr.schedule(channels)
         return [dr.block_sum(c, spp) / spp for c in channels]
 
 
 def reflect(scene, si, view, photographs, bounces, seed):
-    """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane."""
+    """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane.
+
+    And where the paths that escape go: (radiance, their throughput, 0 for those that do not, and their direction).
+    """
     random = next_2d(seed ^ 0x2545F491, dr.width(view))
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
+    escaped, direction = mi.Color3f(0), mi.Vector3f(0, 0, 1)
     for _ in range(bounces):
         sample, weight = si.bsdf().sample(context, si, random().x, random(), active)
         throughput = dr.select(active, throughput * weight, 0)
-        si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active & dr.any(throughput > 0))
+        out = si.spawn_ray(si.to_world(sample.wo))
+        active &= dr.any(throughput > 0)
+        si = scene.ray_intersect(out, active)
+        leaves = active & ~si.is_valid()
+        escaped, direction = dr.select(leaves, throughput, escaped), dr.select(leaves, out.d, direction)
         active = si.is_valid()
         # Rays that escape to an environment bring nothing: its light was counted where the surface was shaded.
         lit = shade(scene, si, lambda si: photographs.light(view, si), random, True)
         radiance += dr.select(active, throughput * lit, 0)
-    return radiance
+    return radiance, escaped, direction

@@ -26,9 +26,10 @@ class Photographs:
     index: object
     size: tuple[int, int]
     colocated: bool  #: is every light at its camera's centre? Then nothing that is seen is in shadow
+    room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
 
     @classmethod
-    def of(cls, sensors: Sequence) -> "Photographs":
+    def of(cls, sensors: Sequence, room: np.ndarray | None = None) -> "Photographs":
         """All `photograph` sensors of a scene; `size` is the first one's, `select` those of equal size."""
         cameras = [sensor.camera for sensor in sensors]
         matrices = np.stack([camera.to_world[:3] for camera in cameras])
@@ -38,7 +39,7 @@ class Photographs:
         off = np.abs(lights.positions() - matrices[:, :, 3]).max(1) > 1e-6 * np.abs(matrices[:, :, 3]).max()
         return cls(
             mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
-            dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(),
+            dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(), room,
         )  # fmt: skip
 
     @classmethod

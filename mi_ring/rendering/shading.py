@@ -8,8 +8,11 @@ from mi_ring.rendering.curves import leave
 MIN_COSINE = 1e-3  #: grazing cosines are clamped here: see `CookTorrance`
 
 
-def shade(scene, si, light, next_2d, shadows):
-    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²)."""
+def shade(scene, si, light, next_2d, shadows, rooms=False):
+    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²).
+
+    `rooms`: and under the scene's `room` emitters, by one sample each; `render_indirect` does so with less noise.
+    """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. Black there would be an edge of its own.
     rim = (si.wi.z < MIN_COSINE) & (dr.dot(si.wi, si.to_local(si.n)) > 0)
@@ -23,21 +26,29 @@ def shade(scene, si, light, next_2d, shadows):
         return dr.select(lit, value * weight, 0)
 
     radiance = reflected(*light(si), shadows)
-    for emitter in lamps(scene):
+    for emitter in lamps(scene, rooms):
         radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
             radiance += dr.select(active, 0, emitter.eval(si, ~active))
     return radiance
 
 
-def lamps(scene) -> list:
-    """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own."""
-    return [emitter for emitter in scene.emitters() if not is_flash(emitter)]
+def lamps(scene, rooms: bool = False) -> list:
+    """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own.
+
+    Without `rooms`, which `Photographs` hold, none of `room` either.
+    """
+    return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
 
 
 def is_flash(emitter) -> bool:
     """Is it a `flash`, whatever the variant that its class belongs to?"""
     return getattr(emitter, "of_photographs", False)
+
+
+def is_room(emitter) -> bool:
+    """Is it a `room`, whatever the variant that its class belongs to?"""
+    return getattr(emitter, "of_rooms", False)
 
 
 def sees(scene, si, ds, active=True):

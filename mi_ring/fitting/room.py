@@ -1,0 +1,58 @@
+"""The light of the room as an unknown: spherical harmonics, by linear least squares in the course of a fit."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.rooms import BASIS
+
+MEMORY = 0.95  #: weight of what was seen before, by iteration: the surface was another
+RIDGE = 0.01  #: pull toward what the capture says, by the mean of what the photographs say of a harmonic
+DIM = 0.3  #: radiance, in units of the exposure, below which errors count no more than there
+ROBUST = 0.2  #: relative error from which it counts as its root
+SURELY = 0.99  #: share of a pixel that must be object
+
+
+class Room(nn.Module):
+    """The harmonics of `mi_ring.rendering.rooms`, and the normal equations of all that was seen, which it forgets."""
+
+    given: Tensor  #: (BASIS, 3) as the capture says
+    harmonics: Tensor  #: (BASIS, 3) as found
+    matrix: Tensor  #: (3, BASIS, BASIS) of the normal equations, by colour
+    vector: Tensor  #: (3, BASIS), their right sides
+
+    def __init__(self, given: Tensor, exposure: float) -> None:
+        """`exposure`: mean radiance of the object."""
+        super().__init__()
+        self.exposure = exposure
+        self.register_buffer("given", given, persistent=False)
+        self.register_buffer("harmonics", given.clone())
+        self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
+        self.register_buffer("vector", torch.zeros(3, BASIS))
+
+    @torch.no_grad()
+    def see(self, around: Surroundings, predicted: Tensor, observed: Tensor, telling: Tensor) -> None:
+        """Solve anew, with photographs (N, H, W, 3) as `observed` and as `predicted` without the room; linear.
+
+        `telling` (N, H, W): where they say something of the object.
+        """
+        height, width = around.alpha.shape[1:]
+
+        def small(pictures: Tensor) -> Tensor:
+            pooled = F.avg_pool2d(pictures.movedim(-1, 1), around.factor, ceil_mode=True, count_include_pad=False)
+            return pooled[:, :, :height, :width].movedim(1, -1)
+
+        inside = torch.minimum(small(telling.float()[..., None])[..., 0], around.alpha) > SURELY
+        missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
+        assert around.harmonics is not None
+        basis = around.harmonics[:, inside]  # (BASIS, n, 3)
+        scale = light + DIM * self.exposure
+        left = missing - torch.einsum("jnc,jc->nc", basis, self.harmonics)
+        weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
+        self.matrix = MEMORY * self.matrix + torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
+        self.vector = MEMORY * self.vector + torch.einsum("jnc,nc,n->cj", basis, missing, weight)
+        ridge = RIDGE * self.matrix.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(BASIS).to(self.matrix)
+        if bool((ridge.amax((1, 2)) > 0).all()):
+            right = self.vector[..., None] + ridge @ self.given.T[..., None]
+            self.harmonics = torch.linalg.solve(self.matrix + ridge, right)[..., 0].T.contiguous()
