@@ -28,6 +28,7 @@ from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
+from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.output import results
@@ -255,10 +256,7 @@ def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_
 
 
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
-    def glare(surface, photographs, coverage, seed):
-        return 1000 * coverage[..., None].expand(*coverage.shape, 3)
-
-    monkeypatch.setattr(bridge, "interreflection", glare)
+    monkeypatch.setattr(bridge.Surroundings, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
     for options, bright in (([], True), (["--no-indirect"], False)):
         first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *QUICK, *options]))
         assert (first.step().terms["rgb"] > 100) == bright
@@ -606,13 +604,14 @@ def test_paper_preset_is_the_papers():
 
 
 def test_regulariser_is_relaxed_and_nothing_else():
-    state = SimpleNamespace(config=Config(velocity_decay=0.04), calm=0.5, unexplained=0.06)
+    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04), restraint=Restraint()))
+    it.fit.restraint.calm, it.fit.restraint.unexplained = 0.5, 0.06
     schedule = terms.default_terms["velocity"].schedule
-    assert schedule(SimpleNamespace(fit=state)) == pytest.approx(0.2)
-    state.unexplained = 0.18  # photographs that disagree with the model
-    assert schedule(SimpleNamespace(fit=state)) == pytest.approx(0.9**4)
-    state.unexplained = 0.5
-    assert schedule(SimpleNamespace(fit=state)) == 1
+    assert schedule(it) == pytest.approx(0.2)
+    it.fit.restraint.unexplained = 0.18  # photographs that disagree with the model
+    assert schedule(it) == pytest.approx(0.9**4)
+    it.fit.restraint.unexplained = 0.5
+    assert schedule(it) == 1
     assert all(term.schedule is None for name, term in terms.default_terms.items() if name != "velocity")
 
 
@@ -632,14 +631,15 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
 def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up_unless_it_is_late():
     ball = trimesh.creation.icosphere(2)
     two = ball + trimesh.creation.icosphere(2).apply_translation([0.5, 0, 0])
-    state = SimpleNamespace(iterations=200, crossing=0.0, calm=0.0, held=False, unexplained=0.5)
+    state = Restraint()
+    state.unexplained = 0.5
 
     def go(numbers, mesh):
         for number in numbers:
             vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
             share = 0.1 if number < 20 else math.nan
-            Fit.hold(state, SimpleNamespace(number=number, progress=(number - 1) / 200, vertices=vertices, faces=faces,
-                                            unexplained=lambda share=share: share))  # fmt: skip
+            state.note(SimpleNamespace(number=number, progress=(number - 1) / 200, vertices=vertices, faces=faces,
+                                       unexplained=lambda share=share: share), 200)  # fmt: skip
 
     go(range(1, 20), ball)
     assert state.calm == pytest.approx(19 / 200)  # as planned

@@ -1,6 +1,7 @@
 """The XML of scene files: the one place that writes photographs, cameras and lights."""
 
 import math
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -160,7 +161,7 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
     """Rewrite the names of files that are relative to the folder `source` to be relative to another."""
     for element in root.iter("string"):
         file = source / element.get("value", "")
-        if element.get("value") and file.is_file():
+        if element.get("value") and os.path.isfile(file):  # Path.is_file raises for what is too long for a name
             element.set("value", relative_to(folder.resolve(), file.resolve()))
 
 

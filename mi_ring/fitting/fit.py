@@ -19,6 +19,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
+from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import require_networks, require_view_from_outside, starting_surface
 from mi_ring.fitting.terms import Term, default_terms
@@ -27,7 +28,6 @@ from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.rendering.crossings import crossing_triangles
 from mi_ring.rendering.indirect import BOUNCES
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.ring import Ring
@@ -37,12 +37,6 @@ from mi_ring.system.machine import autocast, device
 LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
-CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
-CROSSING_EVERY = 20  #: iterations between counts of them
-STRONGEST = -0.3  #: the least `calm`
-RETREAT, CATCH_UP = 2.0, 3.0  #: how fast the regulariser strengthens then, and weakens afterwards; 1 is as planned
-RECENT = 0.1  #: weight of an iteration in the mean of what is unexplained
-LATE = 0.6  #: progress after which a surface that crosses itself says that the regulariser is too weak
 RAMP = 0.05  #: over how much of a fit refinement sets in
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
@@ -110,10 +104,7 @@ class Fit:
         self.autocast = autocast(self.config.precision, self.device)
         self.iteration, self.seconds = 0, 0.0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.crossing: float = 0.0  #: share of the triangles that cross others, when they were counted last
-        self.calm: float = 0.0  #: how far the regulariser has weakened: like `progress`, but for holding back
-        self.held = False  # did it cross itself late?
-        self.unexplained: float = 1.0  #: share of the object's light that is not as predicted, of the last iterations
+        self.restraint = Restraint()
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
@@ -168,7 +159,7 @@ class Fit:
         self.descend(loss, it.progress)
         it.loss = float(loss.detach())
         it.detach()
-        self.hold(it)
+        self.restraint.note(it, self.iterations)
         self.iteration += 1
         self.seconds += time.perf_counter() - started
         if it.number == self.iterations and len(self.held_out):
@@ -283,25 +274,6 @@ class Fit:
             if healthy:
                 optimizer.step()
 
-    def hold(self, it: Iteration) -> None:
-        """Let the regulariser weaken as the fit goes on; hold it and strengthen it while the surface crosses itself.
-
-        Where photographs disagree with the model a weak one lets the surface fold. Limbs that grow cross in passing,
-        early: afterwards the regulariser catches up with its plan. Where they cross late it does not. How much they
-        disagree is noted as well, see `terms.strength`.
-        """
-        step = 1 / self.iterations
-        if it.number % CROSSING_EVERY == 0:
-            self.crossing = float(crossing_triangles(it.vertices.cpu().numpy(), it.faces).mean())
-            self.held |= self.crossing > CROSSING and it.progress > LATE
-        if self.crossing > CROSSING:
-            self.calm = max(STRONGEST, self.calm - RETREAT * step)
-        else:
-            self.calm = min(it.number * step, self.calm + (1.0 if self.held else CATCH_UP) * step)
-        unexplained = it.unexplained()
-        if math.isfinite(unexplained):
-            self.unexplained += RECENT * (unexplained - self.unexplained)
-
     def calibrated(self) -> Capture:
         """The capture with cameras, lights and curve as refined by now."""
         return self.calibration.applied(self.capture) if self.calibration else self.capture
@@ -335,10 +307,7 @@ class Fit:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "log": self.log,
-            "crossing": self.crossing,
-            "calm": self.calm,
-            "held": self.held,
-            "unexplained": self.unexplained,
+            "restraint": vars(self.restraint),
             "calibration": self.calibration and self.calibration.state_dict(),
             "confirmed": self.confirmed,
         }
@@ -351,7 +320,7 @@ class Fit:
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
-        self.crossing, self.calm, self.held = state["crossing"], state["calm"], state["held"]
-        self.unexplained, self.confirmed = state["unexplained"], state["confirmed"]
+        vars(self.restraint).update(state["restraint"])
+        self.confirmed = state["confirmed"]
         if self.calibration:
             self.calibration.load_state_dict(state["calibration"])

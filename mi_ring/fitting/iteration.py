@@ -50,8 +50,8 @@ class Iteration:
         return {
             "iteration": self.number, "seconds": round(fit.seconds, 3), "loss": self.loss, **self.terms,
             "weights": self.weights, "learning_rate": fit.optimizers[0].param_groups[0]["lr"],
-            "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices), "crossing": fit.crossing,
-            "unexplained": fit.unexplained,
+            "stage": fit.stages.index(self.stage) + 1, "vertices": len(self.vertices),
+            "crossing": fit.restraint.crossing, "unexplained": fit.restraint.unexplained,
         }  # fmt: skip
 
     def unexplained(self) -> float:

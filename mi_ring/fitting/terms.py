@@ -13,7 +13,6 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.images import blur
 
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
-UNEXPLAINED = 0.2  #: share of the object's light from which the regulariser does not weaken; exact captures end at .07
 
 
 def rgb_loss(
@@ -114,13 +113,8 @@ def calibration(it: Iteration) -> Tensor | None:
 
 
 def strength(it: Iteration) -> float:
-    """Of the regulariser: it weakens as the fit goes on, but not while much of the light is unexplained.
-
-    What no surface explains (lights that are elsewhere, a room that is not dark) a weak one would explain by terraces
-    and folds.
-    """
-    fit = it.fit
-    return max(fit.config.velocity_decay**fit.calm, min(1.0, (fit.unexplained / UNEXPLAINED) ** 4))
+    """Of the regulariser, as `mi_ring.fitting.restraint` has it."""
+    return it.fit.restraint.strength(it.fit.config.velocity_decay)
 
 
 #: What a fit minimises unless told otherwise. Their weights are those of `Config.weights`.
