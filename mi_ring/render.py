@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.output.film import write_film, write_picture
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str]) -> None:
         print(config.out)
     else:
         for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
-            write_picture(picture, config.out / view.name, view.sensor.gamma)
+            write_picture(recorded(picture, view.sensor), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import mitsuba as mi
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from test_bridge import OFF_CAMERA, Setting, tensor
+from test_bridge import HEIGHT, OFF_CAMERA, WIDTH, Setting, tensor
 
 import mi_ring
 from mi_ring import fit
-from mi_ring.capture.decoding import decode
+from mi_ring.capture.decoding import decode, recorded
 from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import holdout
 from mi_ring.fitting.calibration import UNKNOWNS, Calibration, rotations
@@ -88,6 +89,85 @@ def test_gradients_of_lights_equal_finite_differences(name):
     assert (calibration[which].grad * step).sum().item() == pytest.approx(difference, rel=0.01)
 
 
+def test_gradient_of_the_flashs_cone_equals_finite_differences_and_its_picture_is_the_cosines_power():
+    setting = Setting([OFF_CAMERA[0], OFF_CAMERA[0]], shadows=False)
+    falloff = tensor([1.3, 0.0]).requires_grad_()
+    calibration = [*(t.detach() for t in calibration_of(setting)), falloff]
+    losses(setting, calibration, setting.vertices)[0].backward()
+    step = tensor([0.02, -0.03])
+
+    def picture(falloff):
+        return bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3, False,
+                             [*calibration[:4], falloff])[0]  # fmt: skip
+
+    moved = [(falloff + sign * step).detach() for sign in (1, -1)]
+    high, low = (losses(setting, [*calibration[:4], value], setting.vertices)[0] for value in moved)
+    assert (falloff.grad * step).sum().item() == pytest.approx(((high - low) / 2).item(), rel=0.01)
+    # Exponent 2: the squared cosine between where the camera looks and where the ray from the light ends.
+    pictures = [picture(tensor([n, 0.0])) for n in (0.0, 2.0)]
+    camera = setting.scene.sensors()[0].camera
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    directions = camera.directions(np.stack([u.ravel(), v.ravel()], 1))
+    si = setting.surface.scene.ray_intersect(
+        mi.Ray3f(mi.Point3f(*map(float, camera.position)), mi.Vector3f(*directions.T))
+    )
+    points = np.array(si.p).T
+    away = points - np.array(OFF_CAMERA[0]["position"])
+    cosines = away @ camera.forward / np.linalg.norm(away, axis=1)
+    plain, conical = (picture[0][..., 1].numpy().ravel() for picture in pictures)
+    lit = (plain > 0.05) & np.array(si.is_valid())
+    assert lit.sum() > 50 and np.ptp(cosines[lit]) > 0.05
+    # Where the surface bends away within a pixel, its central ray is not its mean.
+    error = np.abs(conical[lit] / plain[lit] / cosines[lit] ** 2 - 1)
+    assert np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.03
+    torch.testing.assert_close(pictures[1][1], pictures[0][1], rtol=1e-4, atol=1e-5)
+
+
+def test_path_tracer_sees_the_flashs_cone_as_photometric_does():
+    sensor = Setting(OFF_CAMERA[:1], False).photograph(0, OFF_CAMERA[0]) | {"falloff": 2.5}
+    ball = {"type": "shapenet", "id": "ball", "subdivisions": 3, "bsdf": {"type": "cooktorrance"}}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sensor": sensor | {"to_world": mi.ScalarTransform4f().look_at(
+        [1.4, 0.5, 3.2], [0.4, 0.2, 0], [0, 1, 0])}})  # fmt: skip
+    params = mi.traverse(scene)
+    pictures = {}
+    for falloff in (0.0, 2.5):
+        params["000.falloff"] = mi.Float(falloff)
+        params.update()
+        for integrator in ({"type": "photometric"}, {"type": "path", "max_depth": 2}):
+            picture = mi.render(scene, spp=64, seed=2, integrator=mi.load_dict(integrator))
+            pictures[falloff, integrator["type"]] = np.array(picture)[..., :3]
+    for falloff in (0.0, 2.5):
+        a, b = (pictures[falloff, name] for name in ("photometric", "path"))
+        assert a.mean() > 0.01 and np.abs(a - b).mean() < 0.01 * a.mean()
+    assert pictures[2.5, "path"].mean() < 0.95 * pictures[0.0, "path"].mean()
+
+
+def test_vignetting_and_curve_are_undone_in_a_file_that_they_made(small_capture):
+    """v = (R · cosⁿ)^γ, cosine by hand; what a fit predicts is what such a file says, decoded without."""
+    capture = mi_ring.load_capture(small_capture)
+    calibration = Calibration(capture, ("curve", "vignetting"), CENTER, 0.3)
+    with torch.no_grad():
+        calibration.curve.fill_(0.8)
+        calibration.vignetting.fill_(2.0)
+    sensor = calibration.applied(capture).sensors[4]
+    gamma, n, (width, height) = np.exp(0.8 * 0.2), 2.0, sensor.size
+    assert (sensor.gamma, sensor.vignetting) == (pytest.approx(gamma), pytest.approx(n))
+    radiance = np.random.default_rng(3).uniform(0.05, 0.9, (height, width, 3)).astype(np.float32)
+    (fx, fy), (cx, cy) = sensor.camera.focal, sensor.camera.centre
+    cosine = np.array([[1 / np.sqrt(1 + ((u + 0.5 - cx) / fx) ** 2 + ((v + 0.5 - cy) / fy) ** 2)
+                        for u in range(width)] for v in range(height)])[..., None]  # fmt: skip
+    file = (radiance * cosine**n) ** gamma
+    np.testing.assert_allclose(recorded(radiance, sensor), file, rtol=1e-4)
+    changed = replace(capture, sensors=[sensor], images=[file.astype(np.float32)], linear=[True], masks=[None])
+    np.testing.assert_allclose(changed.observe([0]).rgb[0], radiance, rtol=1e-4)
+    relative = 0.3 * (radiance * cosine**n / 0.3) ** gamma
+    mean = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
+    np.testing.assert_allclose(mean[0].detach(), relative, rtol=1e-4)
+    np.testing.assert_allclose(calibration.linear(mean.detach(), [4], 1)[0], radiance, rtol=1e-4)
+    half = calibration.recorded(torch.ones(1, height // 2, width // 2, 3), [4], 2)
+    assert half.min() < half.max()
+
+
 @pytest.mark.parametrize("shadows", [False, True])
 def test_gradients_of_cameras_and_lights_balance_those_of_the_surface(shadows):
     """The world may be moved and turned as a whole: nothing is to be seen of it."""
@@ -148,7 +228,8 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
         calibration.light[0] = tensor([0.5, 0, 0])
         calibration.focal[0] = 3
         calibration.power[:] = tensor(np.random.default_rng(2).normal(size=(12, 3)))
-    cameras, intrinsics, places, strengths = (t.detach().numpy() for t in calibration())
+        calibration.falloff.fill_(2)
+    cameras, intrinsics, places, strengths, falloff = (t.detach().numpy() for t in calibration())
     old = capture.sensors[3].camera.to_world[:3]
     x, y, z, position = old.T
     moved = position + 2 * widths["move"] * distance * z
@@ -159,6 +240,7 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
     factors = np.log(strengths / np.stack([light.rgb for light in capture.photographs.lights]))
     np.testing.assert_allclose(factors.mean(0), 0, atol=1e-5)  # brightness against albedo
     assert factors.std() == pytest.approx(widths["power"], rel=0.3)
+    np.testing.assert_allclose(falloff, 2 * widths["falloff"], rtol=1e-5)
 
 
 def test_prior_expects_one_half_of_each_unknown(small_capture):
@@ -195,12 +277,12 @@ def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(
     capture = mi_ring.load_capture(small_capture)
     calibration = Calibration(capture, ("curve",), CENTER, 0.3)
     radiance = torch.tensor([0.0, 1e-6, 0.01, 0.3, 0.7], requires_grad=True)
-    np.testing.assert_allclose(calibration.recorded(radiance).detach(), radiance.detach())
+    np.testing.assert_allclose(calibration.curved(radiance).detach(), radiance.detach())
     with torch.no_grad():
         calibration.curve.fill_(-1.5)
     gamma = np.exp(-1.5 * 0.2)
     expected = 0.3 * (np.array([0.01, 0.3, 0.7]) / 0.3) ** gamma
-    recorded = calibration.recorded(radiance)
+    recorded = calibration.curved(radiance)
     np.testing.assert_allclose(recorded[2:].detach(), expected, rtol=1e-5)
     recorded.sum().backward()
     assert radiance.grad.isfinite().all()

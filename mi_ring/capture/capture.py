@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.decoding import decode
+from mi_ring.capture.decoding import decode, shade
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import NoParallax, nearest_point
 from mi_ring.geometry.hull import Hull, Silhouette, evenly
@@ -124,6 +124,7 @@ class Capture:
             self._remembered -= self._decoded.pop(k)[1][2].numel()
         sensor = self.sensors[k]
         linear, saturated = decode(self.images[k], self.linear[k], sensor.saturation, sensor.gamma)
+        linear = linear / shade(sensor)
         mask, own = self.masks[k], self.valid[k]
         mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
         valid = None

@@ -25,6 +25,19 @@ def decode(image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.
     return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
 
 
+def shade(sensor: Any, scale: int = 1) -> np.ndarray | float:
+    """What the lens of a photograph leaves of light, (H, W, 1) of a picture `scale` times smaller; 1 if all of it."""
+    if not sensor.vignetting:
+        return 1.0
+    cosines = sensor.camera.shrunk(scale).cosines()
+    return (cosines[..., None] ** sensor.vignetting).astype(np.float32)
+
+
+def recorded(radiance: np.ndarray, sensor: Any, scale: int = 1) -> np.ndarray:
+    """Linear radiance (H, W, 3) as the lens and the curve of a photograph's camera record it, `scale` times smaller."""
+    return (radiance * shade(sensor, scale)) ** sensor.gamma
+
+
 def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
     """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32, all the bits that the file has.
 

@@ -2,7 +2,8 @@
 
 The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
 against albedo (the logarithms of `power` have the mean zero in each colour); where the whole is, how it is turned and
-how large it is, which only the priors hold; focal length against distance, likewise. A room that is alike from all
+how large it is, which only the priors hold; focal length against distance, likewise; the cone of a flash against
+vignetting, nearly, where it is beside the lens. A room that is alike from all
 sides is in the world's axes and in the camera's: it counts as the world's.
 """
 
@@ -17,6 +18,7 @@ from torch.nn import functional as F
 
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera
@@ -30,8 +32,11 @@ UNKNOWNS: dict[str, dict[str, float]] = {
         "move": 0.005,  # along each axis of the camera [median distance from the cameras to the object]
     },
     "focal": {"focal": 0.01},  # logarithm, one for each lens
+    "principal": {"principal": 0.01},  # along both axes of the picture, one for each lens [focal lengths]
     "light": {"light": 0.1},  # along each axis [the same distance]; of distant ones [rad]
     "power": {"power": 0.1},  # logarithm, of each photograph and colour
+    "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
+    "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
     "curve": {"curve": 0.2},  # logarithm of the exponent
     "ambient": {},  # `Room`
 }
@@ -57,6 +62,7 @@ class Calibrated(NamedTuple):
     intrinsics: Tensor  #: (P, 4) fx, fy, cx, cy [px]
     places: Tensor  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
     strengths: Tensor  #: (P, 3) intensities, of distant ones irradiances
+    falloff: Tensor  #: (P,) exponents of flashes' cones
 
 
 class Calibration(nn.Module):
@@ -71,7 +77,8 @@ class Calibration(nn.Module):
         cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
-        arrays = to_world, intrinsics, lights.positions(), lights.rgb()
+        cones = np.array([sensor.cone for sensor in capture.sensors])
+        arrays = to_world, intrinsics, lights.positions(), lights.rgb(), cones
         self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
         self.center = torch.from_numpy(np.asarray(center)).float()
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
@@ -80,12 +87,18 @@ class Calibration(nn.Module):
         #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
         spread = float((inside.amax(0) - inside.amin(0)).max())
         self.flash = inside if self.finite.all() and spread < RIGID * self.distance else None
+        if "falloff" in refined and self.flash is None:
+            raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
+                             "falloff is for a flash that does; leave it out")  # fmt: skip
+        self.sizes = [sensor.size for sensor in capture.sensors]
+        self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
         lenses = np.unique(intrinsics[:, :2].round(3), axis=0, return_inverse=True)[1].ravel()
         places = np.unique(lights.positions().round(6), axis=0, return_inverse=True)[1].ravel()
         places = places if self.flash is None else np.zeros_like(places)
         self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
         count = len(cameras)
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
+                  "principal": (int(lenses.max()) + 1, 2), "falloff": (), "vignetting": (),
                   "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": ()}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
@@ -99,7 +112,7 @@ class Calibration(nn.Module):
 
     def forward(self) -> Calibrated:
         """Cameras and lights as they are by now."""
-        cameras, intrinsics, places, strengths = self.base
+        cameras, intrinsics, places, strengths, falloff = self.base
         if "cameras" in self.refined:
             turned = cameras[:, :, :3] @ rotations(self.value("turn"))
             moved = cameras[:, :, 3:] + cameras[:, :, :3] @ (self.value("move") * self.distance)[..., None]
@@ -107,6 +120,9 @@ class Calibration(nn.Module):
         if "focal" in self.refined:
             factor = self.value("focal").exp()[self.lens, None]
             intrinsics = torch.cat([intrinsics[:, :2] * factor, intrinsics[:, 2:]], 1)
+        if "principal" in self.refined:
+            shift = self.value("principal")[self.lens] * intrinsics[:, :2]
+            intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
         offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
             places = cameras[:, :, 3] + (cameras[:, :, :3] @ (self.flash + offset * self.distance)[..., None])[..., 0]
@@ -115,7 +131,7 @@ class Calibration(nn.Module):
             places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
         power = self.value("power")
         strengths = strengths * (power - (power.mean(0) if power.ndim else 0)).exp()
-        return Calibrated(cameras, intrinsics, places, strengths)
+        return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"))
 
     def scaled(self, scale: int) -> Calibrated:
         """For photographs `scale` times smaller."""
@@ -127,25 +143,54 @@ class Calibration(nn.Module):
         """The exponent of the camera's curve: a file's value, decoded, goes like radiance to its power."""
         return self.value("curve").exp()
 
-    def recorded(self, radiance: Tensor) -> Tensor:
-        """Radiance as the camera's curve records it, which leaves the mean of the object as it is."""
+    def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """(N, H, W, 1) of the angles between the optical axis and the rays of photographs, `scale` times smaller."""
+        width, height = (size // scale for size in self.sizes[index[0]])
+        fx, fy, cx, cy = (self.scaled(scale).intrinsics[index].detach().T)[..., None, None]
+        x = (torch.arange(width) + 0.5 - cx) / fx
+        y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
+        return (1 + x**2 + y**2)[..., None] ** -0.5
+
+    def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """Radiance (N, H, W, 3) as lens and curve record it, decoded by what the capture says of both.
+
+        The curve leaves the mean of the object as it is. `index`, `scale`: which photographs, how much smaller.
+        """
+        if "vignetting" in self.refined:
+            cosines, given = self.cosines(index, scale).to(radiance), self.dimmed[index].to(radiance)
+            given = cosines ** given[:, None, None, None]
+            radiance = self.curved(radiance * given * cosines ** self.value("vignetting").to(radiance)) / given
+            return radiance
+        return self.curved(radiance)
+
+    def curved(self, radiance: Tensor) -> Tensor:
+        """Radiance as the curve records it."""
         if "curve" not in self.refined:
             return radiance
         relative = radiance / self.exposure
         slope = relative.clamp(min=DARKEST) ** (self.gamma - 1)
         return radiance * slope
 
-    def linear(self, recorded: Tensor) -> Tensor:
-        """Radiance of what the camera's curve recorded; without gradients."""
+    @torch.no_grad()
+    def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """Radiance of what lens and curve recorded, the inverse of `recorded`; without gradients."""
+        if "vignetting" in self.refined:
+            cosines, given = self.cosines(index, scale).to(recorded), self.dimmed[index].to(recorded)
+            given = cosines ** given[:, None, None, None]
+            return self.straight(recorded * given) / given / cosines ** self.value("vignetting").to(recorded)
+        return self.straight(recorded)
+
+    def straight(self, recorded: Tensor) -> Tensor:
+        """Radiance of what the curve recorded."""
         if "curve" not in self.refined:
             return recorded
-        relative, gamma = recorded / self.exposure, float(self.gamma.detach())
+        relative, gamma = recorded / self.exposure, float(self.gamma)
         return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
 
     def room_share(self) -> Tensor:
         """(3,) the room's light on the object, mean over all directions, by that of the flash where it faces it."""
         with torch.no_grad():
-            _, _, places, strengths = self()
+            _, _, places, strengths, _ = self()
             distance2 = torch.where(self.finite, (places - self.center).square().sum(-1, keepdim=True), 1.0)
             mean = self.room.harmonics[0].cpu() / math.sqrt(4 * math.pi)
             return math.pi * mean / (strengths / distance2).median(0).values
@@ -171,8 +216,8 @@ class Calibration(nn.Module):
     def applied(self, capture: Capture) -> Capture:
         """The capture with cameras, lights and curve as they are by now."""
         with torch.no_grad():
-            matrices, intrinsics, places, strengths = (part.double().numpy() for part in self())
-            gamma = float(self.gamma)
+            matrices, intrinsics, places, strengths, falloff = (part.double().numpy() for part in self())
+            gamma, vignetting = float(self.gamma), float(self.value("vignetting"))
         # The curve's fixed point is the exposure here, full scale in a scene file.
         strengths = strengths * self.exposure ** ((1 - gamma) / gamma)
         cameras, lights = [], []
@@ -184,7 +229,7 @@ class Calibration(nn.Module):
         room = None
         if "ambient" in self.refined or capture.photographs.room is not None:
             room = self.room.harmonics.double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
-        return with_calibration(capture, cameras, lights, gamma, room)
+        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting)
 
     def summary(self, capture: Capture, refined: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
         """What was refined, as plain numbers: shared unknowns, and of each photograph how far it moved.
@@ -194,10 +239,10 @@ class Calibration(nn.Module):
         """
         with torch.no_grad():
             result: dict[str, Any] = {"refined": list(self.refined), "unit": self.distance}
-            for name in ("focal", "light", "curve"):
+            for name in ("focal", "principal", "light", "falloff", "vignetting", "curve"):
                 if name in self.widths:
                     value = self.value(name)
-                    result[name] = (value.exp() if name != "light" else value).tolist()
+                    result[name] = (value.exp() if name in ("focal", "curve") else value).tolist()
             power = self.value("power")
             factors = (power - power.mean(0)).exp() if power.ndim else None
             if "ambient" in self.refined:

@@ -78,12 +78,14 @@ class Config:
     GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
-    refine: tuple[Literal["auto", "none", "cameras", "focal", "light", "power", "curve", "ambient"], ...] = ("auto",)
-    """What else is unknown. cameras: their places and directions; focal: focal lengths, one for each lens; light: where
-    a flash is that moves with the camera, else the place or direction of each light; power: strength and colour of the
-    light, photograph by photograph; curve: one exponent of the camera's, for all; ambient: the light of the room,
-    which is the same for all, fixed in the world or in the camera. auto: light, power, curve and ambient, unless the
-    scene says that it is calibrated; none: nothing."""
+    refine: tuple[Literal["auto", "none", "cameras", "focal", "principal", "light", "power", "falloff", "vignetting",
+                          "curve", "ambient"], ...] = ("auto",)  # fmt: skip
+    """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point
+    of each lens; light: where a flash is that moves with the camera, else the place or direction of each light; power:
+    strength and colour of the light, photograph by photograph; falloff: how much less a flash shines to the sides;
+    vignetting: how much darker the lens is toward the borders; curve: one exponent of the camera's, for all; ambient:
+    the light of the room, which is the same for all, fixed in the world or in the camera. auto: light, power, curve and
+    ambient, unless the scene says that it is calibrated; none: nothing."""
     holdout: int = 0
     """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
     thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.

@@ -191,17 +191,18 @@ class Fit:
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
         )  # fmt: skip
-        predicted = self.add_surroundings(predicted, coverage, photographs, seen)
+        predicted = self.add_surroundings(predicted, coverage, photographs, seen, index, scale)
         if self.calibration:
-            predicted = self.calibration.recorded(predicted)
+            predicted = self.calibration.recorded(predicted, index, scale)
         return Iteration(
             self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
             *seen, predicted, coverage,
         )  # fmt: skip
 
     def add_surroundings(
-        self, predicted: Tensor, coverage: Tensor, photographs: Photographs, seen: Observation
-    ) -> Tensor:
+        self, predicted: Tensor, coverage: Tensor, photographs: Photographs, seen: Observation, index: np.ndarray,
+        scale: int,
+    ) -> Tensor:  # fmt: skip
         """Predicted photographs with interreflection and the light of the room, which is found by the way."""
         calibration = self.calibration if self.calibration and "ambient" in self.calibration.refined else None
         lit = calibration is not None or photographs.room is not None
@@ -214,7 +215,7 @@ class Fit:
         if calibration:
             if self.iteration / self.iterations >= LIT:
                 telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
-                calibration.room.see(around, predicted.detach(), calibration.linear(seen.rgb), telling)
+                calibration.room.see(around, predicted.detach(), calibration.linear(seen.rgb, index, scale), telling)
             return predicted + around.room(calibration.room.harmonics)
         if photographs.room is not None:
             predicted = predicted + around.room(torch.from_numpy(photographs.room).to(predicted))

@@ -6,17 +6,17 @@ import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import recorded
+from mi_ring.fitting.calibration import UNKNOWNS
 from mi_ring.rendering import bridge
 
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
-SHARED = (
-    "focal",
-    "light",
-    "curve",
-    "ambient",
-)  #: unknowns of all photographs; those of one are not known where it is kept out
+SHARED = set(UNKNOWNS) - {
+    "cameras",
+    "power",
+}  #: of all photographs; what is of one is not known where it is out
 WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
 
 
@@ -30,12 +30,12 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
         scale = -(-capture.sensors[k].size[0] // WIDTH)
         rgb, coverage = bridge.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=fit.ring.indirect)  # fmt: skip
-        seen, gamma = capture.observe([k], scale), capture.sensors[k].gamma
+        seen, sensor = capture.observe([k], scale), capture.sensors[k]
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)
-        observed, predicted = seen.rgb[inside] ** gamma, rgb[inside] ** gamma  # as the file has them
+        observed, predicted = (recorded(linear[0].numpy(), sensor, scale)[inside[0]] for linear in (seen.rgb, rgb))
         if len(observed):
-            factor = (observed * predicted).sum() / predicted.square().sum().clamp(min=1e-12)
-            shares.append(float((factor * predicted - observed).abs().sum() / observed.sum()))
+            factor = (observed * predicted).sum() / max((predicted**2).sum(), 1e-12)
+            shares.append(float(np.abs(factor * predicted - observed).sum() / observed.sum()))
     return float(np.mean(shares)) if shares else np.nan
 
 
@@ -50,7 +50,7 @@ def confirm(fit: "Fit") -> dict:
     back: list[str] = []
     if calibration is None:
         return {"unexplained": now, "put_back": back}
-    for name in [name for name in SHARED if name in calibration.refined]:
+    for name in [name for name in calibration.refined if name in SHARED]:
         unknown, given = calibration.unknown(name)
         found = unknown.detach().clone()
         with torch.no_grad():

@@ -46,6 +46,13 @@ class Camera(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
             return self.centre - self.focal * np.stack([x, y], 1) / z[:, None], z
 
+    def cosines(self) -> np.ndarray:
+        """(H, W) cosines of the angles between the pixels' rays and the optical axis."""
+        width, height = self.size
+        x = (np.arange(width) + 0.5 - self.centre[0]) / self.focal[0]
+        y = (np.arange(height) + 0.5 - self.centre[1]) / self.focal[1]
+        return (1 + x**2 + y[:, None] ** 2) ** -0.5
+
     def shrunk(self, scale: int) -> "Camera":
         """Of the same photograph, `scale` times smaller."""
         size = self.size[0] // scale, self.size[1] // scale

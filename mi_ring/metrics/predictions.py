@@ -4,6 +4,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
@@ -24,10 +25,9 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     views: list[dict] = []
     for k, name in enumerate(capture.names):
         rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
-        gamma = capture.sensors[k].gamma
-        predicted = to_bytes(linear_to_srgb(rgb[0].numpy() ** gamma)) / 255
+        predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
         seen = capture.observe([k])
-        observed = linear_to_srgb(seen.rgb[0].numpy() ** gamma)
+        observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))
         if seen.valid is not None:  # what shows nothing is no error
             predicted = np.where(seen.valid[0, ..., None].numpy(), predicted, observed)
         squares.append(np.mean((predicted - observed) ** 2))

@@ -14,10 +14,10 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.system.files import writing
 
 
-def write_picture(linear: np.ndarray, path: Path, gamma: float = 1.0) -> None:
-    """Write (H, W, 3) linear radiance to the power of the camera's `gamma`: EXR as it is, anything else 8-bit sRGB."""
-    exr, recorded = path.suffix.lower() == ".exr", linear**gamma
-    write_image(recorded.astype(np.float32) if exr else to_bytes(linear_to_srgb(recorded)), path)
+def write_picture(linear: np.ndarray, path: Path) -> None:
+    """Write (H, W, 3) linear values: EXR as they are, anything else as 8-bit sRGB."""
+    exr = path.suffix.lower() == ".exr"
+    write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 
 
 def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:

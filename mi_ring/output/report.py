@@ -17,6 +17,7 @@ from skimage.measure import block_reduce
 from skimage.registration import phase_cross_correlation
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
@@ -95,6 +96,11 @@ def refined_text(calibration: Any) -> str:
         parts.append(f"cameras, by at most {math.degrees(turn):.2f}° and {move:.2%} of their distance")
     if "focal" in calibration.refined:
         parts.append(f"focal length, by {calibration.value('focal').detach().abs().max():.2%}")
+    if "principal" in calibration.refined:
+        parts.append(f"principal point, by {calibration.value('principal').detach().norm(dim=-1).max():.2%} of it")
+    for name, what in (("falloff", "the flash's cone"), ("vignetting", "vignetting")):
+        if name in calibration.refined:
+            parts.append(f"{what}, whose exponent has changed by {calibration.value(name).detach():+.2f}")
     if "curve" in calibration.refined:
         parts.append(f"the camera's curve, whose exponent is {calibration.gamma.detach():.2f}")
     if "ambient" in calibration.refined:
@@ -168,8 +174,8 @@ def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float
     predicted, coverage = (t[0].numpy() for t in bridge.draw(
         fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
     ))  # fmt: skip
-    gamma = capture.sensors[k].gamma
-    photo, guess = linear_to_srgb(observed**gamma), linear_to_srgb(predicted**gamma * valid[..., None])
+    sensor = capture.sensors[k]
+    photo, guess = (linear_to_srgb(recorded(linear, sensor)) for linear in (observed, predicted * valid[..., None]))
     found = (coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))

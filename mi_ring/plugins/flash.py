@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_ring.plugins.photograph import SHUTTER, Photograph
-from mi_ring.rendering.lights import FAR
+from mi_ring.rendering.lights import FAR, cone
 
 
 def flash_light(it, sample=(0, 0), active=True):
@@ -14,11 +14,13 @@ def flash_light(it, sample=(0, 0), active=True):
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
-    light = Photograph.current.light
+    light, falloff = Photograph.current.light, Photograph.current.falloff
     ds, weight = light.sample_direction(it, mi.Point2f(sample), active)
     if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite):  # being nested, it was never told how large the scene is
         ds.dist = mi.Float(FAR)
         ds.p = it.p + FAR * ds.d
+    else:
+        weight = weight * cone(ds.d, Photograph.current.to_world.matrix, falloff)
     return ds, dr.select(it.time == SHUTTER, weight, 0)
 
 

@@ -38,6 +38,11 @@ class Photograph(mi.Sensor):
                                   they only say "at least this bright". Default: 1
     ``gamma``        float        exponent of the camera's curve: a pixel, decoded as ``encoding`` says,
                                   is radiance to this power. Default: 1
+    ``vignetting``   float        how much darker the lens is toward the borders of the picture: like the
+                                  cosine of the angle from the optical axis to this power. Default: 0
+    ``falloff``      float        how much less a point light, taken to be a flash that looks where the  P, ∂
+                                  camera looks, shines to the sides: like the cosine of the angle from
+                                  that direction to this power. Default: 0, alike in all directions
     ``calibrated``   boolean      are camera and light exact? Then a fit leaves them alone unless told
                                   otherwise. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P
@@ -98,6 +103,8 @@ class Photograph(mi.Sensor):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = number(props, "saturation", 1.0, positive=True)
         self.gamma = number(props, "gamma", 1.0, positive=True)
+        self.vignetting = number(props, "vignetting", 0.0)
+        self.falloff = mi.Float(number(props, "falloff", 0.0))
         self.calibrated = props.get("calibrated", False)
 
         width, height = (int(s) for s in self.film().size())
@@ -117,13 +124,22 @@ class Photograph(mi.Sensor):
             raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, must be at most one')
         position = [float(v) for v in matrix[:3, 3]]
         self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
-        dr.make_opaque(self.focal, self.centre, self.to_world)
+        if self.light.class_name() != "PointLight" and "falloff" in props:
+            raise ValueError(
+                f'photograph "{props.id()}": falloff is for point lights, not for {self.light.class_name()}'
+            )
+        dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff)
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) [px]"""
         width, height = self.film().size()
         return int(width), int(height)
+
+    @property
+    def cone(self) -> float:
+        """``falloff`` as a number."""
+        return float(np.ravel(self.falloff)[0])
 
     @property
     def files(self) -> set[Path]:
@@ -153,7 +169,12 @@ class Photograph(mi.Sensor):
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
         callback.put("focal", self.focal, mi.ParamFlags.Differentiable)
         callback.put("centre", self.centre, mi.ParamFlags.Differentiable)
+        callback.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
         callback.put("light", self.light, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys):
+        super().parameters_changed(keys)
+        dr.make_opaque(self.falloff)  # Dr.Jit gives literals, which are shared, the size of a call that reads them
 
     def to_string(self):
         return f"Photograph[filename={self.filename}, size={self.size}]"

@@ -157,7 +157,7 @@ def render(
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
     samples. `calibration`: other cameras and lights of all photographs, as `Photographs.moved` takes them: (P, 3, 4),
-    (P, 4) [px of these sizes], (P, 3), (P, 3).
+    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) if flashes have cones.
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage; by one backward pass,

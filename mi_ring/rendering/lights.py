@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_ring.errors import SceneError
 
+SIDEWAYS = 1e-3  #: the least cosine from the axis of a flash; beyond, its light is what it is there
 FAR = 1e9  #: distance of a directional light [scene units]
 
 
@@ -91,6 +92,12 @@ class Lights:
         """(N, 3) what each light brings to a point (3,), on a surface that faces it: equation 2's intensity / d²."""
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
+
+
+def cone(direction, to_world, falloff):
+    """What a flash that looks where the camera looks gives, of its intensity, to where it is in this `direction`."""
+    cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
+    return dr.power(dr.maximum(cosine, SIDEWAYS), falloff)
 
 
 def place_of(emitter):

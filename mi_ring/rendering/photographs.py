@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.rendering.lights import Lights
+from mi_ring.rendering.lights import Lights, cone
 from mi_ring.rendering.pinhole import camera_ray
 
 LANES = 2**22  #: rays at once where memory is to be bounded: about a gigabyte
@@ -26,6 +26,7 @@ class Photographs:
     index: object
     size: tuple[int, int]
     colocated: bool  #: is every light at its camera's centre? Then nothing that is seen is in shadow
+    falloff: object = None  #: Float, one per photograph: exponent of its flash's cone; None if all shine to all sides
     room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
 
     @classmethod
@@ -35,11 +36,13 @@ class Photographs:
         matrices = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.stack([np.concatenate([camera.focal, camera.centre]) for camera in cameras])
         lights = Lights.of(sensors)
+        falloff = np.array([sensor.cone for sensor in sensors], np.float32)
         # Equal but for the rounding of float32.
         off = np.abs(lights.positions() - matrices[:, :, 3]).max(1) > 1e-6 * np.abs(matrices[:, :, 3]).max()
         return cls(
             mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
-            dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(), room,
+            dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(),
+            mi.Float(falloff) if falloff.any() else None, room,
         )  # fmt: skip
 
     @classmethod
@@ -51,6 +54,7 @@ class Photographs:
             cameras=dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
             intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
             lights=Lights.attached(sensor),
+            falloff=mi.Float(sensor.falloff),
         )
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
@@ -61,10 +65,10 @@ class Photographs:
             index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale),
         )  # fmt: skip
 
-    def moved(self, cameras, intrinsics, places, strengths) -> "Photographs":
+    def moved(self, cameras, intrinsics, places, strengths, falloff=None) -> "Photographs":
         """The same with other buffers of cameras and lights; no light is taken to be exactly at its camera."""
         lights = replace(self.lights, places=places, strengths=strengths)
-        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False)
+        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False, falloff=falloff)
 
     def __len__(self) -> int:
         return dr.width(self.index)
@@ -88,7 +92,13 @@ class Photographs:
 
     def light(self, view, si):
         """(DirectionSample3f, radiance · d⁻²) at `si` of the light of photograph `view`, one per lane."""
-        return self.lights.sample(dr.gather(mi.UInt32, self.index, view), si)
+        k = dr.gather(mi.UInt32, self.index, view)
+        ds, radiance = self.lights.sample(k, si)
+        if self.falloff is not None:
+            finite = dr.gather(mi.Bool, self.lights.finite, k)
+            given = cone(ds.d, self.camera(view)[0], dr.gather(mi.Float, self.falloff, k))
+            radiance *= dr.select(finite, given, 1)
+        return ds, radiance
 
     @property
     def pixels(self) -> int:
