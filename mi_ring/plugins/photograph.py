@@ -38,8 +38,9 @@ class Photograph(mi.Sensor):
                                   they only say "at least this bright". Default: 1
     ``gamma``        float        exponent of the camera's curve: a pixel, decoded as ``encoding`` says,
                                   is radiance to this power. Default: 1
-    ``vignetting``   float        how much darker the lens is toward the borders of the picture: like the
-                                  cosine of the angle from the optical axis to this power. Default: 0
+    ``vignetting``   float        how much darker the lens is toward the borders of the picture: like
+                                  the cosine of the angle from the optical axis to this power.
+                                  Default: 0, none
     ``falloff``      float        how much less a point light, taken to be a flash that looks where the  P, ∂
                                   camera looks, shines to the sides: like the cosine of the angle from
                                   that direction to this power. Default: 0, alike in all directions
