@@ -1,7 +1,7 @@
 """Simulated phone captures with their truth: an object on a printed sheet, photographed by hand with the flash on.
 
     python benchmarks/phone.py OUT [--object NAME|MESH] [--disturbances all|none|NAME,NAME…] [--ambient 0.03]
-        [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|none] [--turntable] [--spp N]
+        [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|none] [--turntable] [--spp N] [--no-exact]
 
 Writes, in the world of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
 
@@ -74,6 +74,7 @@ class Settings:
     sheet: str = "board"
     turntable: bool = False
     spp: int = 4
+    exact: bool = True  #: make the exact capture, too
 
     def has(self, disturbance: str) -> bool:
         """Is it switched on?"""
@@ -193,13 +194,12 @@ def make_capture(out: Path, settings: Settings) -> None:
     photos, truth, exact = out / "photos", out / "truth", out / "exact"
     for folder in (photos, truth, exact):
         shutil.rmtree(folder, ignore_errors=True)
-    for folder in (photos, truth / "masks", exact / "images", exact / "masks"):
+    for folder in (photos, truth / "masks", *[exact / "images", exact / "masks"] * settings.exact):
         folder.mkdir(parents=True)
     sheet = settings.sheet if settings.has("sheet") else "bare"
     stage = Stage(settings.object, sheet, settings.turntable, settings.seed)
     alone = stage if stage.bare else Stage(settings.object, "bare", False, settings.seed)
     write_ply(stage.mesh, truth / "mesh.ply")
-    (exact / "truth").symlink_to("../truth")
     suffix = ".jpg" if settings.has("jpeg") else ".png"
     elements, frames, taken = [], [], {}
     for k, (to_world, angle) in enumerate(tqdm(list(poses(settings, stage.mesh.extents[2])), disable=None)):
@@ -218,6 +218,8 @@ def make_capture(out: Path, settings: Settings) -> None:
             "transform_matrix": (to_world @ OPPOSITE).tolist(), "pl_pos": flash_at(settings, camera).tolist(),
             "pl_intensity": (intensity() * exposure * balance).tolist(),
         })  # fmt: skip
+        if not settings.exact:
+            continue
         pinhole = Shot(camera)
         alone.flash.aim(camera.position, camera.forward, intensity(), 0.0)
         linear = alone.radiance(pinhole, max(settings.spp, 9), settings.seed * 10_000 + 2 * k + 1)
@@ -225,7 +227,9 @@ def make_capture(out: Path, settings: Settings) -> None:
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
         light = Light("point", camera.position, np.full(3, intensity()))
         elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png"))
-    (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+    if settings.exact:
+        (exact / "truth").symlink_to("../truth")
+        (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
     (fx, fy), (cx, cy), (k1, k2) = shot.camera.focal, shot.camera.centre, shot.distortion
     lens = {"camera_model": "OPENCV", "w": settings.size[0], "h": settings.size[1], "fl_x": fx, "fl_y": fy, "cx": cx,
             "cy": cy, "k1": k1, "k2": k2}  # fmt: skip
@@ -248,6 +252,7 @@ def parse(arguments: list[str] | None = None) -> tuple[Path, Settings]:
     parser.add_argument("--sheet", default="board", choices=("board", "random", "none"), help="what lies on the table")
     parser.add_argument("--turntable", action="store_true", help="the object turns, camera and light stand")
     parser.add_argument("--spp", type=int, default=Settings.spp, help="paths per pixel, a square number")
+    parser.add_argument("--no-exact", dest="exact", action="store_false", help="leave out the exact capture")
     options = vars(parser.parse_args(arguments))
     chosen = {"all": DISTURBANCES, "none": ()}.get(options["disturbances"], options["disturbances"].split(","))
     if unknown := set(chosen) - set(DISTURBANCES):
