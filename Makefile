@@ -50,7 +50,7 @@ fit: setup
 	$(RUN) mi_ring.fit "$(SCENE)" $(ARGS)
 
 test: setup
-	$(RUN) pytest $(ARGS)
+	$(RUN) pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 # Without these the tests that need them are skipped.
 tools:

@@ -29,9 +29,14 @@ SHIFT, AXIS = [1.0, 0.3, -0.2], [0.48, 0.8, 0.36]  #: along which things are mov
 #: What moves, and by how much to either side in the finite difference.
 STEPS = {
     "translate": 0.016, "scale": 0.016, "bump": 0.01, "camera moves": 0.016, "camera turns": 0.004,
-    "focal length": 0.008, "light moves": 0.03, "intensity": 0.05,
+    "focal length": 0.008, "principal point": 0.5, "light moves": 0.03, "intensity": 0.05,
+    "falloff": 0.05, "room": 0.05,
 }  # fmt: skip
-MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.light")
+MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.centre", "sensor.falloff", "sensor.light", "room")
+CONE, ROOM = (
+    4.0,
+    np.linspace(0.5, -0.3, 27),
+)  #: exponent of the flash's and harmonics of the room's light, where they change
 LIGHTS, SHAPES = ("flash", "lamp", "directional"), ("sphere", "bumpy")
 
 
@@ -67,6 +72,10 @@ class Picture:
                 "sampler": {"type": "multijitter"}, "light": lamp,
             },
         }  # fmt: skip
+        if moved == "falloff":
+            scene["sensor"]["falloff"] = CONE
+        if moved == "room":
+            scene["room"] = {"type": "room", "harmonics": " ".join(map(str, ROOM))}
         if wall:
             place = mi.ScalarTransform4f().translate([0, 0, -1.7 * unit]).rotate([0.28, 0.96, 0], 9).scale(20 * unit)
             paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}
@@ -109,6 +118,12 @@ class Picture:
                 return {"sensor.to_world": pose @ turn(t)}
             case "focal length":
                 return {"sensor.focal": focal * (1 + t)}
+            case "principal point":
+                return {"sensor.centre": self.before["sensor.centre"] + t * mi.Vector2f(*SHIFT[:2])}
+            case "falloff":
+                return {"sensor.falloff": self.before["sensor.falloff"] + t}
+            case "room":
+                return {"room.harmonics": self.before["room.harmonics"] * (1 + t)}
             case "light moves" if self.light == "directional":
                 return {"sensor.light.to_world": turn(t) @ self.before["sensor.light.to_world"]}
             case "light moves":
@@ -174,24 +189,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--spp", type=int, default=256, help="of the finite differences")
+    parser.add_argument("--moved", nargs="+", choices=STEPS, default=list(STEPS), help="what changes")
     parser.add_argument("--units", type=float, nargs="+", default=[1.0, 1000.0])
     options = parser.parse_args()
     print(f"{processor()}; {datetime.date.today()}; {WIDTH} × {HEIGHT} px, 10,242 vertices, finite differences with "
           f"{options.seeds} × {options.spp} spp\n")  # fmt: skip
     tables = [("Radiance", RADIANCE, (False, True), LIGHTS), ("Coverage", COVERAGE, (False,), ("flash",))]
-    cells = len(STEPS) * len(SHAPES) * len(options.units) * sum(len(w) * len(li) for _, _, w, li in tables)
+    cells = len(options.moved) * len(SHAPES) * len(options.units) * sum(len(w) * len(li) for _, _, w, li in tables)
     with tqdm(total=cells, desc="derivatives") as bar:
         for (title, channels, walls, lights), unit in product(tables, options.units):
             columns = list(product(SHAPES, walls, lights))
             print(f"{title}, lengths × {unit:g}:\n")
             print("| | " + " | ".join(f"{s}, {'wall' if w else 'black'}, {light}" for s, w, light in columns) + " |")
             print("|---" * (len(columns) + 1) + "|", flush=True)
-            for moved in STEPS:
+            for moved in options.moved:
                 row = []
                 for shape, wall, light in columns:
+                    bar.update()
+                    if moved == "falloff" and light == "directional":
+                        row.append("")
+                        continue
                     picture = Picture(moved, light, wall, shape, unit)
                     row.append(cell(*compare(picture, channels, options.seeds, options.spp), allowed(light, wall)))
-                    bar.update()
                 print(f"| {moved} | " + " | ".join(row) + " |", flush=True)
             print(flush=True)
 

@@ -262,11 +262,12 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
         assert (first.step().terms["rgb"] > 100) == bright
 
 
-def test_interreflection_is_left_out_where_intensities_cannot_be_true(broken_capture, tmp_path, capsys):
+def test_interreflection_is_left_out_where_intensities_cannot_be_true_nor_be_refined(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     path.write_text(re.sub(r'name="intensity" value="[^"]*"', 'name="intensity" value="1"', path.read_text()))
-    for option, said in (("--indirect", True), ("--no-indirect", False)):
-        assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "1", option, *QUICK]) == 0
+    for options, said in (("--refine none", True), ("--refine none --no-indirect", False), ("", False)):
+        command = [str(path), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK, *options.split()]
+        assert fit.main(command) == 0
         assert ("Interreflection is left out" in capsys.readouterr().out) == said
 
 

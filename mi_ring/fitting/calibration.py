@@ -1,15 +1,15 @@
 """Cameras, lights, room and camera curve as unknowns: what a fit refines besides surface and material.
 
 The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
-against albedo (the logarithms of `power` have the mean zero in each colour); where the whole is, how it is turned and
-how large it is, which only the priors hold; focal length against distance, likewise; the cone of a flash against
-vignetting, nearly, where it is beside the lens. A room that is alike from all
-sides is in the world's axes and in the camera's: it counts as the world's.
+against albedo, but for interreflection (the logarithms of `power` have the mean zero in each colour, and `scale` takes
+the reflectance along); where the whole is, how it is turned and how large it is, which only the priors hold; focal
+length against distance, likewise; the cone of a flash against vignetting, nearly, where it is beside the lens. A room
+that is alike from all sides is in the world's axes and in the camera's: it counts as the world's.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,9 +38,11 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
     "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
     "curve": {"curve": 0.2},  # logarithm of the exponent
+    "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
 }
-AUTO = "light", "power", "curve", "ambient"  #: what is refined by default
+AUTO = "light", "power", "curve", "ambient"  #: what is refined by default; `scale`, too, where it must be wrong
+ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
 START, SETTLED = 0.2, 0.4  #: progress of the fit when refinement begins, and when that of cameras does
@@ -48,11 +50,21 @@ LIT = 0.15  #: and when that of the room's light does
 RATE = 0.1  #: of Adam at first, in standard deviations an iteration
 
 
-def refined_of(capture: Capture, config: Config) -> tuple[str, ...]:
-    """Names of what a fit refines: as `Config.refine` says, `auto` by what the capture says of itself."""
+def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ...]:
+    """Names of what a fit refines: as `Config.refine` says, `auto` by what the capture says of itself.
+
+    `albedo`: the object's, by the lights' intensities.
+    """
     if "auto" in config.refine:
-        return () if capture.known else AUTO
+        if capture.known:
+            return ()
+        return (*AUTO, "scale") if config.indirect and albedo >= 1 else AUTO
     return tuple(name for name in UNKNOWNS if name in config.refine)
+
+
+def overall(refined: Sequence[str], albedo: float) -> float:
+    """The factor of the lights' power that `scale` begins with: 1, or what makes an impossible albedo a usual one."""
+    return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0
 
 
 class Calibrated(NamedTuple):
@@ -70,15 +82,20 @@ class Calibration(nn.Module):
 
     base: Calibrated
 
-    def __init__(self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float) -> None:
-        """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays."""
+    def __init__(
+        self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0
+    ) -> None:
+        """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
+
+        `power`: a factor of what the capture says of the lights' intensities, to begin with.
+        """
         super().__init__()
-        self.refined, self.exposure = tuple(refined), exposure
+        self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
         cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
         cones = np.array([sensor.cone for sensor in capture.sensors])
-        arrays = to_world, intrinsics, lights.positions(), lights.rgb(), cones
+        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones
         self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
         self.center = torch.from_numpy(np.asarray(center)).float()
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
@@ -99,7 +116,7 @@ class Calibration(nn.Module):
         count = len(cameras)
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
                   "principal": (int(lenses.max()) + 1, 2), "falloff": (), "vignetting": (),
-                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": ()}  # fmt: skip
+                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": (), "scale": ()}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
@@ -130,13 +147,32 @@ class Calibration(nn.Module):
             moved = places + offset * torch.where(self.finite, self.distance, 1.0)
             places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
         power = self.value("power")
-        strengths = strengths * (power - (power.mean(0) if power.ndim else 0)).exp()
+        scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
+        strengths = strengths * (scale + power - (power.mean(0) if power.ndim else 0)).exp()
         return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"))
 
     def scaled(self, scale: int) -> Calibrated:
         """For photographs `scale` times smaller."""
         calibrated = self()
         return calibrated._replace(intrinsics=calibrated.intrinsics / scale)
+
+    @property
+    def reflecting(self) -> float:
+        """The factor of the reflectance that keeps directly lit surfaces as bright as they are, whatever `scale` is."""
+        return math.exp(-float(self.value("scale").detach()))
+
+    @property
+    def strengthened(self) -> float:
+        """The factor of the power of all lights that has been found."""
+        return self.first_power / self.reflecting
+
+    def bounced(self, interreflection: Tensor) -> Tensor:
+        """Light that has bounced between surfaces, attached to `scale`.
+
+        All others keep it as it is: one more reflection by a surface that is darker by as much as lights are stronger.
+        """
+        scale = self.value("scale").to(interreflection)
+        return interreflection * (scale.detach() - scale).exp()
 
     @property
     def gamma(self) -> Tensor:
@@ -230,36 +266,6 @@ class Calibration(nn.Module):
         if "ambient" in self.refined or capture.photographs.room is not None:
             room = self.room.harmonics.double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
         return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting)
-
-    def summary(self, capture: Capture, refined: Capture, center: np.ndarray, radius: float) -> dict[str, Any]:
-        """What was refined, as plain numbers: shared unknowns, and of each photograph how far it moved.
-
-        `refined`: the capture with all of it `applied`; `center` (3,), `radius` [scene units]: of the object, whose
-        pixels count.
-        """
-        with torch.no_grad():
-            result: dict[str, Any] = {"refined": list(self.refined), "unit": self.distance}
-            for name in ("focal", "principal", "light", "falloff", "vignetting", "curve"):
-                if name in self.widths:
-                    value = self.value(name)
-                    result[name] = (value.exp() if name in ("focal", "curve") else value).tolist()
-            power = self.value("power")
-            factors = (power - power.mean(0)).exp() if power.ndim else None
-            if "ambient" in self.refined:
-                result["ambient"] = {"share": self.room_share().tolist(), "harmonics": self.room.harmonics.tolist()}
-        corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
-        result["photographs"] = {}
-        for k, (old, new) in enumerate(zip(capture.sensors, refined.sensors)):
-            shift = new.camera.project(corners)[0] - old.camera.project(corners)[0]
-            entry: dict[str, Any] = {"moved_px": float(np.linalg.norm(shift, axis=1).mean())}
-            if "cameras" in self.refined:
-                turn = np.linalg.norm(self.value("turn")[k].detach().numpy())
-                move = np.linalg.norm(self.value("move")[k].detach().numpy()) * self.distance
-                entry |= {"turned_degrees": float(np.degrees(turn)), "moved": float(move)}
-            if factors is not None:
-                entry["power"] = factors[k].tolist()
-            result["photographs"][capture.names[k]] = entry
-        return result
 
 
 def rotations(vectors: Tensor) -> Tensor:

@@ -12,16 +12,17 @@ from torch import Tensor
 
 from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.loading import recompute_normals
-from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import LIT, Calibration, refined_of
+from mi_ring.fitting.calibration import LIT, Calibration, overall, refined_of
+from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
-from mi_ring.fitting.start import require_networks, require_view_from_outside, starting_surface
+from mi_ring.fitting.start import starting_ring
+from mi_ring.fitting.summary import summary
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.brdfnet import ReflectanceMap
@@ -30,7 +31,6 @@ from mi_ring.output import results
 from mi_ring.rendering import bridge
 from mi_ring.rendering.indirect import BOUNCES
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device
 
@@ -89,14 +89,21 @@ class Fit:
         self.fitted = np.setdiff1d(np.arange(several), self.held_out)
         seen = capture.part(self.fitted) if every else capture
         self.exposure = seen.exposure()
-        self.ring = ring_of(state["ring"]) if state else self.new_ring(seen, networks)
+        self.ring = ring_of(state["ring"]) if state else starting_ring(seen, self.config, self.exposure, networks)
+        regularised = self.terms.get("velocity") is default_terms["velocity"] and self.config.weights["velocity"]
+        if regularised and not hasattr(self.ring.shape_net, "velocity"):
+            raise InputError(f"networks: {type(self.ring.shape_net).__name__}: has no velocity, which the term of that "
+                             "name needs; give it one, or the term the weight 0")  # fmt: skip
+        #: Of the light it gets, how much the object reflects: more than all where the intensities are not true.
+        self.albedo = math.pi * seen.reflectance(self.ring.center.cpu().numpy(), self.exposure)
         self.device = device()
         self.ring.to(self.device)
         self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.calibration: Calibration | None = None
-        if refined := refined_of(capture, self.config):
-            self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure)
+        if refined := refined_of(capture, self.config, self.albedo):
+            power = overall(refined, self.albedo)
+            self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
             self.optimizers += self.calibration.optimizers()
             self.calibration.room.to(self.device)
         self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
@@ -109,37 +116,6 @@ class Fit:
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
-
-    def new_ring(self, capture: Capture, networks: tuple[Flow, ReflectanceMap] | None) -> Ring:
-        """The networks before the first iteration, on the surface that a fit of these photographs starts from."""
-        config = self.config
-        domain, center, radius = starting_surface(capture, config.domain)
-        require_view_from_outside(capture, domain, center, radius)
-        parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
-        scale = capture.reflectance(center, self.exposure)
-        if math.pi * scale >= 1 and all(math.isfinite(p.high) for p in parameters):
-            raise InputError(f"{capture.path}: emitter: by the lights' intensities the object reflects "
-                             f"{math.pi * scale:.3g} times the light that it gets, which the ranges of --parameters do "
-                             "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
-        indirect = config.indirect and math.pi * scale < 1
-        if networks:
-            for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
-                if not hasattr(network, needed):
-                    raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
-            networks[1].set_parameters(parameters, scale)
-        ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                    networks, capture.shape.ground)  # fmt: skip
-        require_networks(ring)
-        regularised = self.terms.get("velocity") is default_terms["velocity"] and config.weights["velocity"]
-        if regularised and not hasattr(ring.shape_net, "velocity"):
-            raise InputError(f"networks: {type(ring.shape_net).__name__}: has no velocity, which the term of that name "
-                             "needs; give it one, or the term the weight 0")  # fmt: skip
-        return ring
-
-    @property
-    def albedo(self) -> float:
-        """Of the light it gets, how much the object reflects: more than all where the intensities are not true."""
-        return math.pi * self.capture.reflectance(self.ring.center.cpu().numpy(), self.exposure)
 
     def __iter__(self) -> Iterator[Iteration]:
         """The iterations that are left, each as it is done."""
@@ -157,6 +133,7 @@ class Fit:
         it = self.predict()
         loss = self.weigh(it)
         self.descend(loss, it.progress)
+        self.follow_power()
         it.loss = float(loss.detach())
         it.detach()
         self.restraint.note(it, self.iterations)
@@ -211,7 +188,8 @@ class Fit:
         around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
                                      bounces=BOUNCES if self.ring.indirect else 1)  # fmt: skip
         if self.ring.indirect:
-            predicted = predicted + around.interreflection
+            predicted = predicted + (self.calibration.bounced(around.interreflection) if self.calibration
+                                     else around.interreflection)  # fmt: skip
         if calibration:
             if self.iteration / self.iterations >= LIT:
                 telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
@@ -220,6 +198,12 @@ class Fit:
         if photographs.room is not None:
             predicted = predicted + around.room(torch.from_numpy(photographs.room).to(predicted))
         return predicted
+
+    def follow_power(self) -> None:
+        """The reflectance takes along what the fit has found of the power of the lights together."""
+        if self.calibration and "scale" in self.calibration.refined:
+            net, first = self.ring.brdf_net, self.albedo / overall(self.calibration.refined, self.albedo) / math.pi
+            net.set_parameters(net.bsdf_parameters, first * self.calibration.reflecting)
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the photographs of one iteration, all of one size (width, height)."""
@@ -274,6 +258,13 @@ class Fit:
                 group["lr"] = group["initial_lr"] * self.config.decay**progress * begun
             if healthy:
                 optimizer.step()
+
+    def summary(self, refined: Capture) -> dict:
+        """What was refined besides surface and material, as `mi_ring.fitting.summary` has it; the surface is shown.
+
+        `refined`: the capture with all of it, as `calibrated` gives it.
+        """
+        return summary(self, refined, deviations(self))
 
     def calibrated(self) -> Capture:
         """The capture with cameras, lights and curve as refined by now."""

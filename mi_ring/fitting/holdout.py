@@ -45,8 +45,13 @@ def confirm(fit: "Fit") -> dict:
     Returns what is unexplained of them (`unexplained`, and `before`, without any of it) and what was `put_back`.
     """
     calibration = fit.calibration
-    fit.surface.show(fit.ring, *fit.ring.domain.sample(fit.stages[-1].level))
-    now = unexplained(fit, fit.calibrated())
+
+    def unexplained_now() -> float:
+        fit.follow_power()
+        fit.surface.show(fit.ring, *fit.ring.domain.sample(fit.stages[-1].level))
+        return unexplained(fit, fit.calibrated())
+
+    now = unexplained_now()
     back: list[str] = []
     if calibration is None:
         return {"unexplained": now, "put_back": back}
@@ -55,9 +60,10 @@ def confirm(fit: "Fit") -> dict:
         found = unknown.detach().clone()
         with torch.no_grad():
             unknown.copy_(given)
-            without = unexplained(fit, fit.calibrated())
+            without = unexplained_now()
             if without <= now:
                 now, back = without, [*back, name]
             else:
                 unknown.copy_(found)
+                fit.follow_power()
     return {"unexplained": now, "before": unexplained(fit, fit.capture), "put_back": back}

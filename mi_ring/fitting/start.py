@@ -1,15 +1,55 @@
-"""Where a fit starts: the surface that is deformed, and the sphere that normalises it."""
+"""Where a fit starts: the networks, the surface that is deformed, and the sphere that normalises it."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
+from mi_ring.fitting.calibration import overall, refined_of
+from mi_ring.fitting.config import Config
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
+from mi_ring.nets.brdfnet import ReflectanceMap
+from mi_ring.nets.shapenet import Flow
 from mi_ring.ring.ring import Ring
+
+
+def starting_ring(
+    capture: Capture, config: Config, exposure: float, networks: tuple[Flow, ReflectanceMap] | None
+) -> Ring:
+    """The networks before the first iteration, on the surface that a fit of these photographs starts from.
+
+    `exposure`: radiance of the object in them.
+    """
+    domain, center, radius = starting_surface(capture, config.domain)
+    require_view_from_outside(capture, domain, center, radius)
+    parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
+    scale = capture.reflectance(center, exposure)
+    bounded = all(math.isfinite(p.high) for p in parameters)
+    if math.pi * scale >= 1 and bounded:
+        raise InputError(f"{capture.path}: emitter: by the lights' intensities the object reflects "
+                         f"{math.pi * scale:.3g} times the light that it gets, which the ranges of --parameters do "
+                         "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
+    refined = refined_of(capture, config, math.pi * scale)
+    if "scale" in refined and (bounded or not config.indirect):
+        raise InputError(f"{capture.path}: --refine scale: what the power of the lights is tells interreflection "
+                         "alone, and a reflectance without bounds; it goes neither with --no-indirect nor with "
+                         "these --parameters")  # fmt: skip
+    scale /= overall(refined, math.pi * scale)
+    indirect = config.indirect and math.pi * scale < 1
+    if networks:
+        for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
+            if not hasattr(network, needed):
+                raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
+        networks[1].set_parameters(parameters, scale)
+    ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
+                networks, capture.shape.ground)  # fmt: skip
+    require_networks(ring)
+    return ring
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:

@@ -1,7 +1,9 @@
 """What there is to say of each photograph of a capture, and what is to be mended."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, stats
@@ -12,6 +14,14 @@ from mi_ring.geometry.hull import WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 
 CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares beyond which something is said
+FAR, LEAST_FAR = 4.0, 2.0  #: a photograph that a fit moves so many times as far as half of them, and so far [px]
+
+
+def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
+    """Which photographs a fit has moved much farther than the others, and how far, by its `summary`; empty if none."""
+    moved = {name: entry["moved_px"] for name, entry in photographs.items()}
+    limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()))))
+    return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
 @dataclass
@@ -125,6 +135,11 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
+    record = capture.path.parent / "calibration.json"  # of the fit that found this calibration
+    if record.exists() and (few := moved_far(json.loads(record.read_text("utf-8"))["photographs"])):
+        found.append(
+            f"{few}: the fit has moved the camera much farther than the others': out of focus, or another scene?"
+        )
     found += filter(None, [units(capture, center)])
     received = capture.photographs.lights.irradiance(center).mean(1)
     lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind

@@ -19,6 +19,9 @@ from skimage.registration import phase_cross_correlation
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.metrics.captures import moved_far
+from mi_ring.output import calibration_panel
+from mi_ring.output.figures import svg_uri
 from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
 from mi_ring.system.command import scene_name
@@ -43,10 +46,12 @@ class PhotographPanel:
     pictures: dict[str, str]
 
 
-def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None) -> str:
+def report_html(
+    fit: Any, glb: bytes | None = None, unseen: float | None = None, refined: dict[str, Any] | None = None
+) -> str:
     """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer.
 
-    `unseen`: the share of its area that no photograph shows.
+    `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
     """
     capture, ring = fit.calibrated(), fit.ring
     rows, errors = [], []
@@ -69,7 +74,6 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
         "Fit time": f"{fit.seconds:.0f} s",
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
-        **({"Refined": refined_text(fit.calibration)} if fit.calibration else {}),
         "Made by": f"mi_ring {__version__}",
         "Normalising sphere": "centre ({:.5g}, {:.5g}, {:.5g}), radius {:.5g}".format(*ring.center, ring.radius),
     }
@@ -77,35 +81,11 @@ def report_html(fit: Any, glb: bytes | None = None, unseen: float | None = None)
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
         name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
-        settings=fit.config.settings(), findings=fit_findings(rows, fit.iteration, fit.iterations),
+        settings=fit.config.settings(), findings=fit_findings(rows, fit.iteration, fit.iterations, refined),
+        refined=refined and calibration_panel.panel(fit.capture, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
-
-
-def refined_text(calibration: Any) -> str:
-    """What a fit has refined, in words."""
-    parts = []
-    if "light" in calibration.refined:
-        moved = calibration.value("light").detach().norm(dim=-1).max()
-        parts.append(f"light, by {moved:.1%} of the cameras' distance")
-    if "power" in calibration.refined:
-        parts.append(f"its power, by {calibration.value('power').detach().std():.1%}")
-    if "cameras" in calibration.refined:
-        turn, move = (calibration.value(name).detach().norm(dim=-1).max() for name in ("turn", "move"))
-        parts.append(f"cameras, by at most {math.degrees(turn):.2f}° and {move:.2%} of their distance")
-    if "focal" in calibration.refined:
-        parts.append(f"focal length, by {calibration.value('focal').detach().abs().max():.2%}")
-    if "principal" in calibration.refined:
-        parts.append(f"principal point, by {calibration.value('principal').detach().norm(dim=-1).max():.2%} of it")
-    for name, what in (("falloff", "the flash's cone"), ("vignetting", "vignetting")):
-        if name in calibration.refined:
-            parts.append(f"{what}, whose exponent has changed by {calibration.value(name).detach():+.2f}")
-    if "curve" in calibration.refined:
-        parts.append(f"the camera's curve, whose exponent is {calibration.gamma.detach():.2f}")
-    if "ambient" in calibration.refined:
-        parts.append(f"the room's light, {calibration.room_share().mean():.1%} of the flash's")
-    return "; ".join(parts) + " (calibration.json)"
 
 
 def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
@@ -115,8 +95,10 @@ def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
     return {"up": capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
 
 
-def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -> list[str]:
-    """What stands out, each in one sentence that says what to do."""
+def fit_findings(
+    rows: list[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None
+) -> list[str]:
+    """What stands out, each in one sentence that says what to do. `refined`: the fit's `summary`."""
     found = []
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
@@ -146,6 +128,9 @@ def fit_findings(rows: list[PhotographPanel], iteration: int, iterations: int) -
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
             found.append(f"{few} of the prediction: shifted as the others are not; mend the pose, or leave the "
                          "photograph out.")  # fmt: skip
+    if refined and (few := moved_far(refined["photographs"])):
+        found.append(f"{few}: the fit has moved the camera much farther than the others': out of focus, or another "
+                     "scene? Then leave the photograph out.")  # fmt: skip
     return found
 
 
@@ -247,6 +232,4 @@ def loss_curve(fit: Any) -> str:
     axes.grid(alpha=0.3)
     if fit.log:
         figure.legend(loc="outside right upper")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg")
-    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return svg_uri(figure)

@@ -121,15 +121,15 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room)
-        center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
-        summary = fit.calibration.summary(fit.capture, capture, center, radius)
-        summary |= {"held_out": fit.confirmed} if fit.confirmed else {}
-        write_file(folder / "calibration.json", json.dumps(summary, indent=1))
     write_file(folder / "scene.xml", scene)
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)
-    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen))
+    refined = None
+    if fit.calibration:
+        refined = fit.summary(capture) | ({"held_out": fit.confirmed} if fit.confirmed else {})
+        write_file(folder / "calibration.json", json.dumps(refined, indent=1))
+    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 

@@ -1,0 +1,159 @@
+"""How sure a fit is of what it has refined besides surface and material, these taken as they are.
+
+Least squares around what was found: how the photographs would change with each unknown, beside how far predictions are
+from them, gives the covariance ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 8.1, there called
+dispersion).
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.fitting.calibration import Calibration
+from mi_ring.rendering import bridge
+from mi_ring.rendering.indirect import BOUNCES
+
+if TYPE_CHECKING:
+    from mi_ring.fitting.fit import Fit
+
+WIDTH, SPP, TOGETHER = 96, 16, 8  #: of the pictures that are compared, and how many at once
+STEP = 0.2  #: of the unknowns, to either side, in their priors' standard deviations
+BLOCK = 8  #: pixels across which errors are taken to go together
+
+
+class Entries:
+    """Where the unknowns of a calibration have their place in one vector."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration, self.first, self.count = calibration, {}, 0
+        for name in calibration.widths:
+            self.first[name] = self.count
+            self.count += getattr(calibration, name).numel()
+
+    def rows(self, name: str, index: np.ndarray) -> np.ndarray:
+        """Which row of an unknown is that of each photograph."""
+        shared = {"focal": self.calibration.lens, "principal": self.calibration.lens, "light": self.calibration.place}
+        if name in shared:
+            return shared[name][index].numpy()
+        return index if getattr(self.calibration, name).ndim else np.zeros_like(index)
+
+    def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
+        """Name, component and place (n,) of all that photographs depend on."""
+        result = []
+        for name in self.calibration.widths:
+            unknown = getattr(self.calibration, name)
+            components = unknown.shape[1] if unknown.ndim == 2 else 1
+            rows = self.first[name] + components * self.rows(name, index)
+            result += [(name, k, rows + k) for k in range(components)]
+        return result
+
+
+@torch.no_grad()
+def deviations(fit: "Fit") -> dict[str, np.ndarray]:
+    """Standard deviation of each unknown of `fit.calibration` in its own unit, shaped like it; not of the room's light.
+
+    The surface must have been shown.
+    """
+    calibration = fit.calibration
+    assert calibration is not None
+    entries = Entries(calibration)
+    colours, outlines = Equations(entries.count), Equations(entries.count)
+    for size, alike in fit.capture.sizes.items():
+        chosen = np.intersect1d(alike, fit.fitted)
+        for start in range(0, len(chosen), TOGETHER):
+            index = chosen[start : start + TOGETHER]
+            compare(fit, calibration, index, -(-size[0] // WIDTH), entries, colours, outlines)
+    precision = np.eye(entries.count) + colours.information() + outlines.information()
+    spread = np.sqrt(np.diag(np.linalg.inv(precision)))
+    return {
+        name: width * spread[entries.first[name] :][: getattr(calibration, name).numel()]
+        .reshape(getattr(calibration, name).shape)
+        for name, width in calibration.widths.items()
+    }  # fmt: skip
+
+
+class Equations:
+    """The normal equations of all photographs, and the variance of what they leave unexplained."""
+
+    def __init__(self, count: int) -> None:
+        self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
+
+    def add(self, slopes: Tensor, error: Tensor, telling: Tensor, places: np.ndarray) -> None:
+        """One photograph: how (K, H, W, C) it changes with the unknowns at `places` (K,), what is unexplained of it.
+
+        `error` (H, W, C); `telling` (H, W): where.
+        """
+        slopes = slopes[:, telling].flatten(1).double()
+        np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
+        height, width, channels = error.shape
+        error = torch.where(telling[..., None], error, 0.0).double()
+        error = error[: height - height % BLOCK, : width - width % BLOCK]
+        blocks = error.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK, channels).sum((1, 3))
+        self.squares += float(blocks.square().sum())
+        self.pixels += channels * int(telling.sum())
+
+    def information(self) -> np.ndarray:
+        """How precisely these photographs say what the unknowns are: (N, N)."""
+        return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
+
+
+def compare(
+    fit: "Fit", calibration: Calibration, index: np.ndarray, scale: int, entries: Entries, colours: Equations,
+    outlines: Equations,
+) -> None:  # fmt: skip
+    """Photographs `index`, all of one size, with their predictions, at what was found and beside it."""
+    seen = fit.capture.observe(index, scale)
+    photographs = replace(fit.capture.photographs.select(index, fit.capture.sensors[index[0]].size, scale), room=None)
+
+    def direct() -> tuple[Tensor, Tensor]:
+        moved = bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
+        return bridge.draw(fit.surface, moved, SPP, shadows=fit.config.shadows and fit.capture.shadows)
+
+    lit, coverage = direct()
+    room = calibration.room.harmonics.cpu()
+    moved = bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
+    bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
+    if fit.ring.indirect or room.any():
+        around = bridge.surroundings(fit.surface, moved, coverage.to(fit.device), 1, room=bool(room.any()),
+                                     bounces=BOUNCES if fit.ring.indirect else 1)  # fmt: skip
+        bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
+        roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
+
+    def perceived(linear: Tensor) -> Tensor:
+        return (4 * linear / fit.exposure).clamp(min=-0.5).log1p()
+
+    def picture(lit: Tensor, bounced: Tensor = bounced) -> Tensor:
+        return perceived(calibration.recorded(lit + bounced + roomlight, index, scale))
+
+    slopes = []  # of colours (n, H, W, 3) and coverage (n, H, W)
+    for name, k, places in entries.of(index):
+        sides = []
+        for step in (STEP, -STEP):
+            factor = float(np.exp(step * calibration.widths[name]))
+            if name == "power":  # not by its unknowns, whose mean does not count
+                colour = torch.ones(3)
+                colour[k] = factor
+                sides.append((picture(lit * colour), coverage))
+            elif name == "scale":
+                sides.append((picture(lit, bounced / factor), coverage))
+            else:
+                unknown = getattr(calibration, name)
+                found = unknown.detach().clone()
+                unknown.view(-1)[torch.from_numpy(np.unique(places - entries.first[name]))] += step
+                rgb, covered = direct()
+                sides.append((picture(rgb), covered))
+                unknown.copy_(found)
+        slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
+    changing, covering = (torch.stack(part) for part in zip(*slopes))
+    places = np.stack([places for *_, places in entries.of(index)], 1)
+    predicted = picture(lit)
+    error = predicted - perceived(seen.rgb)
+    surely = seen.surely(coverage) & ~seen.clipped.any(-1)
+    known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
+    for n in range(len(index)):
+        colours.add(changing[:, n], error[n], surely[n], places[n])
+        if seen.masked[n] and fit.capture.threshold is None:
+            outlines.add(covering[:, n, ..., None], (coverage - seen.mask)[n][..., None], known[n], places[n])

@@ -1,0 +1,87 @@
+"""What a fit has refined besides surface and material, as plain numbers: `calibration.json`."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mi_ring.capture.capture import Capture
+
+if TYPE_CHECKING:
+    from mi_ring.fitting.fit import Fit
+
+
+def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
+    """What was refined: of each unknown `before`, `after` and `std`, its standard deviation given the surface.
+
+    `photographs`: of each how far its picture of the object moved [px]; if cameras were refined how far it was turned
+    and moved, if powers were, the factor of each colour. `refined`: the capture with all of it; `deviations`: as
+    `mi_ring.fitting.certainty` has them.
+    """
+    calibration = fit.calibration
+    assert calibration is not None
+    with torch.no_grad():
+        now = {name: calibration.value(name).double().numpy(force=True) for name in calibration.widths}
+        gain = calibration.strengthened
+        share = calibration.room_share().tolist()
+    unknowns: dict[str, dict[str, Any]] = {}
+
+    def add(name: str, what: str, before: Any, after: Any, std: Any) -> None:
+        before, after, std = (np.asarray(value, float).tolist() for value in (before, after, std))
+        unknowns[name] = {"what": what, "before": before, "after": after, "std": std}
+
+    old, new = fit.capture.sensors, refined.sensors
+    lenses = np.unique(calibration.lens.numpy(), return_index=True)[1]
+    focal = np.stack([new[k].camera.focal for k in lenses])
+    if "light" in now and calibration.flash is not None:
+        flash, unit = calibration.flash.mean(0).numpy(), calibration.distance
+        add("light", "place of the flash in the cameras' axes: to the left, up, ahead [scene units]", flash,
+            flash + unit * now["light"][0], unit * deviations["light"][0])  # fmt: skip
+    elif "light" in now:
+        first = np.unique(calibration.place.numpy(), return_index=True)[1]
+        before, after = (c.photographs.lights.positions()[first] for c in (fit.capture, refined))
+        units = np.where(calibration.finite.numpy()[first], calibration.distance, 1.0)
+        add("light", "places of the lights [scene units], directions to distant ones", before, after,
+            units * deviations["light"])  # fmt: skip
+    if "focal" in now:
+        add("focal", "focal length [px]", [old[k].camera.focal.mean() for k in lenses], focal.mean(1),
+            focal.mean(1) * deviations["focal"])  # fmt: skip
+    if "principal" in now:
+        add("principal", "principal point [px]", [old[k].camera.centre for k in lenses],
+            [new[k].camera.centre for k in lenses], focal * deviations["principal"])  # fmt: skip
+    for name, attribute, what in (
+        ("falloff", "cone", "exponent of the flash's cone"),
+        ("vignetting", "vignetting", "exponent of the lens' vignetting"),
+    ):
+        if name in now:
+            before, after = (np.mean([getattr(sensor, attribute) for sensor in side]) for side in (old, new))
+            add(name, what, before, after, deviations[name])
+    if "curve" in now:
+        gamma = np.mean([sensor.gamma for sensor in new])
+        add("curve", "exponent of the camera's curve", np.mean([sensor.gamma for sensor in old]), gamma,
+            gamma * deviations["curve"])  # fmt: skip
+    if "scale" in now:
+        add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
+    if "ambient" in calibration.refined:
+        unknowns["ambient"] = {"what": "light of the room on the object, by the flash's", "after": share,
+                               "harmonics": calibration.room.harmonics.tolist()}  # fmt: skip
+
+    center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
+    corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
+    photographs: dict[str, dict[str, Any]] = {}
+    for k, (before, after) in enumerate(zip(old, new)):
+        shift = after.camera.project(corners)[0] - before.camera.project(corners)[0]
+        entry: dict[str, Any] = {"moved_px": float(np.linalg.norm(shift, axis=1).mean())}
+        std: dict[str, Any] = {}
+        for name, key, unit in (
+            ("turn", "turned_degrees", np.degrees(1.0)),
+            ("move", "moved", calibration.distance),
+        ):
+            if name in now:
+                entry[key] = float(unit * np.linalg.norm(now[name][k]))
+                std[key] = float(unit * np.linalg.norm(deviations[name][k]))
+        if "power" in now:
+            factor = np.exp(now["power"][k] - now["power"].mean(0))
+            entry["power"], std["power"] = factor.tolist(), (factor * deviations["power"][k]).tolist()
+        photographs[fit.capture.names[k]] = entry | {"std": std}
+    return {"refined": list(calibration.refined), "unknowns": unknowns, "photographs": photographs}

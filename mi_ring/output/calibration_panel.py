@@ -1,0 +1,107 @@
+"""What a fit has refined besides surface and material, in the report: a table and pictures of before and after."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mi_ring.capture.capture import Capture
+from mi_ring.output.figures import svg_uri
+
+BEFORE, AFTER = "0.6", "tab:orange"  #: colours
+LISTED = 6  #: unknowns of one kind that are listed one by one
+
+
+class Panel(NamedTuple):
+    """That part of the page."""
+
+    rows: list[tuple[str, str, str, str]]  #: what, before, after, standard deviation
+    chart: str  #: a data URI
+    held_out: str  #: what the photographs that were kept out say of it; empty if there are none
+
+
+def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
+    """`refined`: a fit's `summary`, of what has made the one capture the other."""
+    rows = [row(entry) for entry in refined["unknowns"].values()]
+    rows += [row(entry) for entry in of_photographs(refined["photographs"])]
+    return Panel(rows, chart(before, after, refined["photographs"]), held_out_text(refined.get("held_out", {})))
+
+
+def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
+    """An unknown in words: what, before, after, standard deviation."""
+    if np.size(entry["after"]) > LISTED:
+        moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]), axis=-1)
+        spread = np.linalg.norm(entry["std"], axis=-1)
+        return entry["what"], "", f"by {np.median(moved):.3g}, at most {moved.max():.3g}", f"{np.median(spread):.2g}"
+    return entry["what"], *(numbers(entry[key]) if key in entry else "" for key in ("before", "after", "std"))
+
+
+def numbers(value: Any) -> str:
+    """A few of them."""
+    return ", ".join(f"{v:.4g}" for v in np.ravel(value))
+
+
+def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The unknowns of photographs, in the median."""
+    entries = list(photographs.values())
+    result = []
+    for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved [scene units]")):
+        if key in entries[0]:
+            middle, spread = (np.median([e[key] for e in side]) for side in (entries, [e["std"] for e in entries]))
+            result.append({"what": what, "before": 0, "after": middle, "std": spread})
+    if "power" in entries[0]:
+        off = np.median([np.abs(np.log(e["power"])).mean() for e in entries])
+        spread = np.median([np.divide(e["std"]["power"], e["power"]).mean() for e in entries])
+        result.append({"what": "power of photographs, off the mean, median [%]", "before": 0, "after": 100 * off,
+                       "std": 100 * spread})  # fmt: skip
+    return result
+
+
+def held_out_text(held_out: dict[str, Any]) -> str:
+    """How much better photographs that were kept out are explained."""
+    if "before" not in held_out:
+        return ""
+    back = ", ".join(held_out["put_back"])
+    return "Of the object's light in the photographs that were kept out {:.1%} is unexplained, {:.1%} before.{}".format(
+        held_out["unexplained"], held_out["before"], f" What did not help was put back: {back}." if back else ""
+    )
+
+
+def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
+    """Cameras and lights from above, and how far each photograph's picture or power has moved."""
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    plan, bars = figure.subplots(1, 2)
+    draw_plan(plan, before, BEFORE, "before")
+    draw_plan(plan, after, AFTER, "after")
+    plan.legend(fontsize=8)
+    plan.set_aspect("equal", "datalim")
+    plan.set_title("cameras and lights (•), along the vertical", fontsize=9)
+    moved = [entry["moved_px"] for entry in photographs.values()]
+    if max(moved) > 0 or "power" not in next(iter(photographs.values())):
+        bars.bar(range(len(moved)), moved, color=AFTER)
+        bars.set_ylabel("pixels")
+        bars.set_title("how far the object has moved in each photograph", fontsize=9)
+    else:
+        power = np.array([entry["power"] for entry in photographs.values()])
+        for channel, colour in zip(power.T, ("tab:red", "tab:green", "tab:blue")):
+            bars.plot(channel, ".", color=colour)
+        bars.axhline(1, color=BEFORE, linewidth=1)
+        bars.set_title("power of the light of each photograph, by colour", fontsize=9)
+    bars.set_xlabel("photograph")
+    return svg_uri(figure)
+
+
+def draw_plan(axes: Axes, capture: Capture, colour: str, label: str) -> None:
+    """Cameras, the way they look, and their lights, seen along what is up in the photographs."""
+    up = capture.up
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    plane = np.stack([right / np.linalg.norm(right), np.cross(up, right / np.linalg.norm(right))])
+    poses = np.stack([sensor.camera.to_world for sensor in capture.sensors])
+    places = poses[:, :3, 3] @ plane.T
+    reach = np.ptp(places, axis=0).max()
+    axes.quiver(*places.T, *(0.12 * reach * poses[:, :3, 2] @ plane.T).T, color=colour, angles="xy", scale_units="xy",
+                scale=1, width=0.004, label=label)  # fmt: skip
+    lights = capture.photographs.lights
+    x, y = (lights.positions()[lights.is_finite()] @ plane.T).T
+    axes.scatter(x, y, s=8, c=colour)
