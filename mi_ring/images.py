@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any, TypeVar
 
 import imageio.v3 as imageio
 import mitsuba as mi
@@ -23,6 +24,23 @@ def linear_to_srgb(v: np.ndarray) -> np.ndarray:
     """The inverse of `srgb_to_linear`, clipped to [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+Pictures = TypeVar("Pictures", np.ndarray, Tensor)
+
+
+def contrasted(linear: Pictures, contrast: Any) -> Pictures:
+    """Linear values whose sRGB encoding v has become vᶜ / (vᶜ + (1 − v)ᶜ), c = `contrast`; from 1 on as they are.
+
+    An S-curve as of film: steeper in the middle, and flat at both ends. `1 / contrast` undoes it.
+    """
+    where: Any = torch.where if isinstance(linear, Tensor) else np.where
+    x = linear.clip(1e-6, 1 - 1e-6)  # where powers have slopes
+    v = where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    a, b = v**contrast, (1 - v) ** contrast
+    v = a / (a + b)
+    y = where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    return where((linear > 0) & (linear < 1), y, linear)
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:

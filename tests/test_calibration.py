@@ -20,6 +20,7 @@ from mi_ring.fitting import holdout
 from mi_ring.fitting.calibration import UNKNOWNS, Calibration, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.images import linear_to_srgb
 from mi_ring.rendering import bridge
 from mi_ring.rendering.rooms import BASIS
 
@@ -315,14 +316,14 @@ def test_distant_lights_keep_their_length_and_each_place_has_one_unknown(small_c
 def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(small_capture):
     capture = mi_ring.load_capture(small_capture)
     calibration = Calibration(capture, ("curve",), CENTER, 0.3)
-    radiance = torch.tensor([0.0, 1e-6, 0.01, 0.3, 0.7], requires_grad=True)
-    np.testing.assert_allclose(calibration.curved(radiance).detach(), radiance.detach())
+    radiance, ones = torch.tensor([[0.0, 1e-6, 0.01, 0.3, 0.7]], requires_grad=True), torch.ones(1)
+    np.testing.assert_allclose(calibration.curved(radiance, ones).detach(), radiance.detach())
     with torch.no_grad():
         calibration.curve.fill_(-1.5)
     gamma = np.exp(-1.5 * 0.2)
     expected = 0.3 * (np.array([0.01, 0.3, 0.7]) / 0.3) ** gamma
-    recorded = calibration.curved(radiance)
-    np.testing.assert_allclose(recorded[2:].detach(), expected, rtol=1e-5)
+    recorded = calibration.curved(radiance, ones)
+    np.testing.assert_allclose(recorded[0, 2:].detach(), expected, rtol=1e-5)
     recorded.sum().backward()
     assert radiance.grad.isfinite().all()
     sensor = calibration.applied(capture).sensors[4]
@@ -332,6 +333,35 @@ def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(
     factor /= float(np.ravel(mi.traverse(capture.sensors[4].light)["intensity.value"])[0])
     decoded, _ = decode(expected.astype(np.float32), True, 2.0, sensor.gamma)
     np.testing.assert_allclose(decoded, factor * np.array([0.01, 0.3, 0.7]), rtol=1e-4)
+
+
+def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp_path):
+    def curve(element):
+        for name, value in (("gamma", "1.3"), ("contrast", "1.2")):
+            ElementTree.SubElement(element, "float", name=name, value=value)
+
+    capture = mi_ring.load_capture(edited(small_capture, tmp_path / "curve", curve))
+    exposure = 0.3
+    calibration = Calibration(capture, ("curve",), CENTER, exposure)
+    with torch.no_grad():
+        calibration.curve.fill_(0.8)
+        calibration.contrast.fill_(-1.5)
+    sensor, radiance = calibration.applied(capture).sensors[4], np.array([0.02, 0.11, 0.3, 0.71])
+    gamma, contrast = np.exp(0.8 * 0.2), np.exp(-1.5 * 0.2)
+    assert sensor.gamma == pytest.approx(1.3 * gamma, rel=1e-6)
+    assert sensor.contrast == pytest.approx(1.2 * contrast, rel=1e-6)
+    stronger = exposure ** ((1 - gamma) / gamma)  # the lights of that scene
+    file = recorded(stronger * radiance, sensor)
+    v = linear_to_srgb((stronger * radiance) ** (1.3 * gamma))
+    odds = (v / (1 - v)) ** (1.2 * contrast)
+    np.testing.assert_allclose(linear_to_srgb(file), odds / (1 + odds), rtol=1e-4)
+    as_given, _ = decode(file.astype(np.float32), True, 2.0, 1.3, 1.2)
+    curved = calibration.curved(tensor(radiance)[None], torch.tensor([1.3]))
+    np.testing.assert_allclose(curved[0].detach(), as_given, rtol=1e-4)
+    np.testing.assert_allclose(calibration.straight(curved.detach(), torch.tensor([1.3]))[0], radiance, rtol=1e-4)
+    many = torch.tensor([[0.0, 1e-8, 1e-3, 0.4, 0.99, 1.0, 1.7]], requires_grad=True)
+    calibration.curved(many, torch.tensor([1.3])).sum().backward()
+    assert many.grad.isfinite().all() and (many.grad > 0).all() and calibration.contrast.grad.isfinite()
 
 
 def test_calibration_survives_the_scene_file(small_capture, tmp_path):

@@ -15,8 +15,9 @@ from mi_ring.rendering.photographs import Photographs
 def with_calibration(
     capture: Capture, cameras: Sequence[Camera], lights: Sequence[Light], gamma: float = 1.0,
     room: np.ndarray | None = None, falloff: Sequence[float] | None = None, vignetting: float = 0.0,
+    contrast: float = 1.0,
 ) -> Capture:  # fmt: skip
-    """The same photographs with other cameras and lights, one each; the exponents of their curves times `gamma`.
+    """The same photographs with other cameras and lights, one each; their curves' `gamma` and `contrast` times these.
 
     `room`: light of the room, as `Photographs` has it; `falloff`: exponents of the flashes' cones, one each, by default
     as they are; `vignetting`: what is added to the exponents of the lenses'.
@@ -28,7 +29,7 @@ def with_calibration(
             sensor.id(), str(sensor.filename), camera, light, sensor.mask and str(sensor.mask),
             None if sensor.encoding == "auto" else sensor.encoding, sensor.saturation,
             sensor.valid and str(sensor.valid), sensor.gamma * gamma,
-            falloff=cone, vignetting=sensor.vignetting + vignetting,
+            falloff=cone, vignetting=sensor.vignetting + vignetting, contrast=sensor.contrast * contrast,
         )  # fmt: skip
         sensors.append(load_element(element))
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))

@@ -123,7 +123,7 @@ class Capture:
                 return result
             self._remembered -= self._decoded.pop(k)[1][2].numel()
         sensor = self.sensors[k]
-        linear, saturated = decode(self.images[k], self.linear[k], sensor.saturation, sensor.gamma)
+        linear, saturated = decode(self.images[k], self.linear[k], sensor.saturation, sensor.gamma, sensor.contrast)
         linear = linear / shade(sensor)
         mask, own = self.masks[k], self.valid[k]
         mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask

@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.images import contrasted, linear_to_srgb, read_image, srgb_to_linear
 
 
-def decode(image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def decode(
+    image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape.
 
-    `gamma`: of the camera's curve, by which linear values are radiance to this power.
+    `gamma`, `contrast`: of the camera's curve, by which linear values are radiance to this power, `contrasted`.
     """
     if image.dtype == np.float32:
         value = image
@@ -20,6 +22,7 @@ def decode(image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.
         full = np.iinfo(image.dtype).max
         value = np.arange(full + 1, dtype=np.float32) / full
     lookup = value if linear else srgb_to_linear(value)
+    lookup = lookup if contrast == 1 else contrasted(lookup, 1 / contrast).astype(np.float32)
     lookup = lookup if gamma == 1 else np.maximum(lookup, 0) ** np.float32(1 / gamma)
     saturated = value >= saturation
     return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
@@ -35,7 +38,8 @@ def shade(sensor: Any, scale: int = 1) -> np.ndarray | float:
 
 def recorded(radiance: np.ndarray, sensor: Any, scale: int = 1) -> np.ndarray:
     """Linear radiance (H, W, 3) as the lens and the curve of a photograph's camera record it, `scale` times smaller."""
-    return (radiance * shade(sensor, scale)) ** sensor.gamma
+    curved = (radiance * shade(sensor, scale)) ** sensor.gamma
+    return curved if sensor.contrast == 1 else contrasted(curved, sensor.contrast)
 
 
 def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:

@@ -23,7 +23,7 @@ Element = ElementTree.Element
 def photograph_element(
     name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
     encoding: str | None = None, saturation: float | None = None, valid: str | None = None, gamma: float = 1.0,
-    calibrated: bool = False, falloff: float = 0.0, vignetting: float = 0.0,
+    calibrated: bool = False, falloff: float = 0.0, vignetting: float = 0.0, contrast: float = 1.0,
 ) -> Element:  # fmt: skip
     """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
     element = ElementTree.Element("sensor", type="photograph", id=name)
@@ -31,8 +31,8 @@ def photograph_element(
         if value:
             ElementTree.SubElement(element, "string", name=field, value=value)
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
-    usual = {"saturation": None, "gamma": 1.0, "falloff": 0.0, "vignetting": 0.0}
-    given = dict(zip(usual, (saturation, gamma, falloff, vignetting)))
+    usual = {"saturation": None, "gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0}
+    given = dict(zip(usual, (saturation, gamma, contrast, falloff, vignetting)))
     fields |= {field: value for field, value in given.items() if value != usual[field]}
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
@@ -134,12 +134,14 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
     named = {sensor.id(): sensor for sensor in sensors}
     for old, sensor in zip(photographs, sensors, strict=True):
         sensor = named.get(old.get("id", ""), sensor)
-        new = photograph_element("", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma,
-                                 falloff=sensor.cone, vignetting=sensor.vignetting)  # fmt: skip
+        new = photograph_element(
+            "", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma, contrast=sensor.contrast,
+            falloff=sensor.cone, vignetting=sensor.vignetting,
+        )  # fmt: skip
         fields = {child.get("name"): child for child in new if child.tag in ("float", "transform")}
         for child in list(old):
             lit = child.tag == "emitter" or (child.tag == "ref" and root.find(f".//emitter[@id='{child.get('id')}']"))
-            if lit or child.get("name") in ("gamma", "falloff", "vignetting", *fields):
+            if lit or child.get("name") in ("gamma", "contrast", "falloff", "vignetting", *fields):
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
     for emitter in root.findall("emitter[@type='room']"):

@@ -22,6 +22,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera
+from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS
 
@@ -37,13 +38,14 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "power": {"power": 0.1},  # logarithm, of each photograph and colour
     "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
     "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
-    "curve": {"curve": 0.2},  # logarithm of the exponent
+    "curve": {"curve": 0.2, "contrast": 0.2},  # logarithms, of the exponent and of how steep the S is
     "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
 }
 AUTO = "light", "power", "curve", "ambient"  #: what is refined by default; `scale`, too, where it must be wrong
 ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
+BLACK = 1e-6  #: radiance, in units of the file's, below which a curve is none
 DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
 START, SETTLED = 0.2, 0.4  #: progress of the fit when refinement begins, and when that of cameras does
 LIT = 0.15  #: and when that of the room's light does
@@ -108,6 +110,7 @@ class Calibration(nn.Module):
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
         self.sizes = [sensor.size for sensor in capture.sensors]
+        self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
         lenses = np.unique(intrinsics[:, :2].round(3), axis=0, return_inverse=True)[1].ravel()
         places = np.unique(lights.positions().round(6), axis=0, return_inverse=True)[1].ravel()
@@ -116,7 +119,8 @@ class Calibration(nn.Module):
         count = len(cameras)
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
                   "principal": (int(lenses.max()) + 1, 2), "falloff": (), "vignetting": (),
-                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": (), "scale": ()}  # fmt: skip
+                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": (), "contrast": (),
+                  "scale": ()}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
@@ -195,17 +199,27 @@ class Calibration(nn.Module):
         if "vignetting" in self.refined:
             cosines, given = self.cosines(index, scale).to(radiance), self.dimmed[index].to(radiance)
             given = cosines ** given[:, None, None, None]
-            radiance = self.curved(radiance * given * cosines ** self.value("vignetting").to(radiance)) / given
-            return radiance
-        return self.curved(radiance)
+            dimmed = radiance * given * cosines ** self.value("vignetting").to(radiance)
+            return self.curved(dimmed, self.gammas[index]) / given
+        return self.curved(radiance, self.gammas[index])
 
-    def curved(self, radiance: Tensor) -> Tensor:
-        """Radiance as the curve records it."""
+    def curved(self, radiance: Tensor, gammas: Tensor) -> Tensor:
+        """Radiance (N, ...) as the curve records it; `gammas` (N,): as the capture has them."""
         if "curve" not in self.refined:
             return radiance
         relative = radiance / self.exposure
-        slope = relative.clamp(min=DARKEST) ** (self.gamma - 1)
-        return radiance * slope
+        slope = relative.clamp(min=DARKEST) ** (self.gamma.to(radiance) - 1)
+        return self.contrasted(radiance * slope, self.value("contrast").exp(), gammas)
+
+    @staticmethod
+    def contrasted(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
+        """What the curve's S makes of values (N, ...) that a capture decodes with these `gammas` (N,).
+
+        An S of one steepness after another is one of their product's: that of the capture need not be known.
+        """
+        gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
+        lit = values.clamp(min=BLACK)
+        return torch.where(values > BLACK, contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas), values)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
@@ -213,13 +227,16 @@ class Calibration(nn.Module):
         if "vignetting" in self.refined:
             cosines, given = self.cosines(index, scale).to(recorded), self.dimmed[index].to(recorded)
             given = cosines ** given[:, None, None, None]
-            return self.straight(recorded * given) / given / cosines ** self.value("vignetting").to(recorded)
-        return self.straight(recorded)
+            straight = self.straight(recorded * given, self.gammas[index])
+            return straight / given / cosines ** self.value("vignetting").to(recorded)
+        return self.straight(recorded, self.gammas[index])
 
-    def straight(self, recorded: Tensor) -> Tensor:
-        """Radiance of what the curve recorded."""
+    @torch.no_grad()
+    def straight(self, recorded: Tensor, gammas: Tensor) -> Tensor:
+        """Radiance (N, ...) of what the curve recorded; `gammas` (N,): as the capture has them."""
         if "curve" not in self.refined:
             return recorded
+        recorded = self.contrasted(recorded, (-self.value("contrast")).exp(), gammas)
         relative, gamma = recorded / self.exposure, float(self.gamma)
         return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
 
@@ -254,6 +271,7 @@ class Calibration(nn.Module):
         with torch.no_grad():
             matrices, intrinsics, places, strengths, falloff = (part.double().numpy() for part in self())
             gamma, vignetting = float(self.gamma), float(self.value("vignetting"))
+            contrast = float(self.value("contrast").exp())
         # The curve's fixed point is the exposure here, full scale in a scene file.
         strengths = strengths * self.exposure ** ((1 - gamma) / gamma)
         cameras, lights = [], []
@@ -265,7 +283,7 @@ class Calibration(nn.Module):
         room = None
         if "ambient" in self.refined or capture.photographs.room is not None:
             room = self.room.harmonics.double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
-        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting)
+        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast)
 
 
 def rotations(vectors: Tensor) -> Tensor:

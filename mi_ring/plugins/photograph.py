@@ -38,6 +38,8 @@ class Photograph(mi.Sensor):
                                   they only say "at least this bright". Default: 1
     ``gamma``        float        exponent of the camera's curve: a pixel, decoded as ``encoding`` says,
                                   is radiance to this power. Default: 1
+    ``contrast``     float        of the camera's curve: the encoding v of what ``gamma`` has made of
+                                  radiance is recorded as vᶜ / (vᶜ + (1 − v)ᶜ). Default: 1, as it is
     ``vignetting``   float        how much darker the lens is toward the borders of the picture: like
                                   the cosine of the angle from the optical axis to this power.
                                   Default: 0, none
@@ -104,6 +106,7 @@ class Photograph(mi.Sensor):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = number(props, "saturation", 1.0, positive=True)
         self.gamma = number(props, "gamma", 1.0, positive=True)
+        self.contrast = number(props, "contrast", 1.0, positive=True)
         self.vignetting = number(props, "vignetting", 0.0)
         self.falloff = mi.Float(number(props, "falloff", 0.0))
         self.calibrated = props.get("calibrated", False)
