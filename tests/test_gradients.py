@@ -36,6 +36,10 @@ CELLS = [  # moved, light, wall, shape, unit, channels
     ("light moves", "lamp", True, "bumpy", 1000.0, RADIANCE),
     ("light moves", "directional", True, "sphere", 1.0, RADIANCE),
     ("light moves", "flash", True, "bumpy", 1.0, RADIANCE),
+    ("principal point", "lamp", False, "bumpy", 1.0, RADIANCE),
+    ("falloff", "flash", False, "bumpy", 1000.0, RADIANCE),
+    ("falloff", "lamp", True, "sphere", 1.0, RADIANCE),
+    ("room", "flash", True, "bumpy", 1.0, RADIANCE),
     ("intensity", "flash", False, "sphere", 1.0, RADIANCE),
     ("intensity", "directional", True, "bumpy", 1000.0, RADIANCE),
 ]
