@@ -342,7 +342,7 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
 
     capture = mi_ring.load_capture(edited(small_capture, tmp_path / "curve", curve))
     exposure = 0.3
-    calibration = Calibration(capture, ("curve",), CENTER, exposure)
+    calibration = Calibration(capture, ("curve", "contrast"), CENTER, exposure)
     with torch.no_grad():
         calibration.curve.fill_(0.8)
         calibration.contrast.fill_(-1.5)

@@ -38,7 +38,8 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "power": {"power": 0.1},  # logarithm, of each photograph and colour
     "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
     "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
-    "curve": {"curve": 0.2, "contrast": 0.2},  # logarithms, of the exponent and of how steep the S is
+    "curve": {"curve": 0.2},  # logarithm of the exponent
+    "contrast": {"contrast": 0.2},  # logarithm of how steep the curve's S is
     "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
 }
@@ -205,7 +206,7 @@ class Calibration(nn.Module):
 
     def curved(self, radiance: Tensor, gammas: Tensor) -> Tensor:
         """Radiance (N, ...) as the curve records it; `gammas` (N,): as the capture has them."""
-        if "curve" not in self.refined:
+        if not {"curve", "contrast"} & set(self.refined):
             return radiance
         relative = radiance / self.exposure
         slope = relative.clamp(min=DARKEST) ** (self.gamma.to(radiance) - 1)
@@ -234,7 +235,7 @@ class Calibration(nn.Module):
     @torch.no_grad()
     def straight(self, recorded: Tensor, gammas: Tensor) -> Tensor:
         """Radiance (N, ...) of what the curve recorded; `gammas` (N,): as the capture has them."""
-        if "curve" not in self.refined:
+        if not {"curve", "contrast"} & set(self.refined):
             return recorded
         recorded = self.contrasted(recorded, (-self.value("contrast")).exp(), gammas)
         relative, gamma = recorded / self.exposure, float(self.gamma)

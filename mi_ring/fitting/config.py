@@ -79,7 +79,7 @@ class Config:
     subdivisions: int = 6
     """Level of the mesh that is written."""
     refine: tuple[Literal["auto", "none", "cameras", "focal", "principal", "light", "power", "falloff", "vignetting",
-                          "curve", "scale", "ambient"], ...] = ("auto",)  # fmt: skip
+                          "curve", "contrast", "scale", "ambient"], ...] = ("auto",)  # fmt: skip
     """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point
     of each lens; light: where a flash is that moves with the camera, else the place or direction of each light; power:
     strength and colour of the light, photograph by photograph; falloff: how much less a flash shines to the sides;

@@ -60,6 +60,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         gamma = np.mean([sensor.gamma for sensor in new])
         add("curve", "exponent of the camera's curve", np.mean([sensor.gamma for sensor in old]), gamma,
             gamma * deviations["curve"])  # fmt: skip
+    if "contrast" in now:
         contrast = np.mean([sensor.contrast for sensor in new])
         add("contrast", "contrast of the camera's curve", np.mean([sensor.contrast for sensor in old]), contrast,
             contrast * deviations["contrast"])  # fmt: skip
