@@ -67,8 +67,8 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     if "scale" in now:
         add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
     if "ambient" in calibration.refined:
-        unknowns["ambient"] = {"what": "light of the room on the object, by the flash's", "after": share,
-                               "harmonics": calibration.room.harmonics.tolist()}  # fmt: skip
+        what = "light of the room on the object, by the flash's; below 0: the rest of the model is too bright"
+        unknowns["ambient"] = {"what": what, "after": share, "harmonics": calibration.room.harmonics.tolist()}
 
     center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
     corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])

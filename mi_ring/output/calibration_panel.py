@@ -34,12 +34,15 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]), axis=-1)
         spread = np.linalg.norm(entry["std"], axis=-1)
         return entry["what"], "", f"by {np.median(moved):.3g}, at most {moved.max():.3g}", f"{np.median(spread):.2g}"
-    return entry["what"], *(numbers(entry[key]) if key in entry else "" for key in ("before", "after", "std"))
+    before, after, std = (
+        numbers(entry[key], digits) if key in entry else "" for key, digits in (("before", 4), ("after", 4), ("std", 2))
+    )
+    return entry["what"], before, after, std
 
 
-def numbers(value: Any) -> str:
+def numbers(value: Any, digits: int) -> str:
     """A few of them."""
-    return ", ".join(f"{v:.4g}" for v in np.ravel(value))
+    return ", ".join(f"{v:.{digits}g}" for v in np.ravel(value))
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
