@@ -40,7 +40,7 @@ def contrasted(linear: Pictures, contrast: Any) -> Pictures:
     a, b = v**contrast, (1 - v) ** contrast
     v = a / (a + b)
     y = where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
-    return where((linear > 0) & (linear < 1), y, linear)
+    return where(linear < 1, y * where(linear < x, linear / x, 1.0), linear)  # straight below
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from mi_ring import InputError, fit
 from mi_ring.capture.decoding import decode, recorded
 from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import holdout
-from mi_ring.fitting.calibration import UNKNOWNS, Calibration, rotations
+from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.images import linear_to_srgb
@@ -242,6 +242,33 @@ def test_the_power_that_is_refined_begins_with_a_usual_albedo(broken_capture):
     fit.follow_power()
     factor = np.exp(UNKNOWNS["scale"]["scale"])
     assert np.pi * float(fit.ring.brdf_net.scale) == pytest.approx(0.5 * factor, rel=1e-4)
+
+
+def test_what_is_refined_on_demand_goes_with_auto(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    assert refined_of(capture, Config(refine=("auto", "contrast")), 0.5) == (
+        "light", "power", "curve", "contrast", "ambient")  # fmt: skip
+    assert "scale" in refined_of(capture, Config(), 1.5) and "scale" not in refined_of(capture, Config(), 0.5)
+    with pytest.raises(InputError, match="none alone"):
+        Config(refine=("none", "light"))
+
+
+def test_a_lens_whose_vignetting_is_known_dims_what_the_curve_records(small_capture, tmp_path):
+    def dim(element):
+        ElementTree.SubElement(element, "float", name="vignetting", value="3.5")
+
+    capture = mi_ring.load_capture(edited(small_capture, tmp_path / "dim", dim))
+    calibration = Calibration(capture, ("curve",), CENTER, 0.3)
+    with torch.no_grad():
+        calibration.curve.fill_(1)
+    gamma, sensor = np.exp(0.2), calibration.applied(capture).sensors[4]
+    width, height = sensor.size
+    radiance = np.random.default_rng(6).uniform(0.1, 0.6, size=(height, width, 3)).astype(np.float32)
+    file = recorded(radiance * 0.3 ** ((1 - gamma) / gamma), sensor)  # under the lights of that scene
+    before = replace(capture, sensors=[capture.sensors[4]], images=[file.astype(np.float32)], linear=[True],
+                     masks=[None])  # fmt: skip
+    predicted = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
+    np.testing.assert_allclose(predicted[0].detach(), before.observe([0]).rgb[0], rtol=1e-4)
 
 
 def test_power_of_all_lights_is_not_refined_where_nothing_tells_it(small_capture):

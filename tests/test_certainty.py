@@ -76,8 +76,21 @@ def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
     assert found["power"].max() < 0.7 * running.calibration.widths["power"]
 
 
+def test_pixels_beside_the_blocks_count_as_well():
+    random = np.random.default_rng(8)
+    slopes, noise = random.normal(size=(1, 213, 301, 1)), 0.2 * random.normal(size=(213, 301, 1))
+    equations = Equations(1)
+    equations.add(torch.tensor(slopes), torch.tensor(noise), torch.ones(213, 301, dtype=torch.bool), np.array([0]))
+    assert equations.information()[0, 0] == pytest.approx((slopes**2).sum() / 0.2**2, rel=0.15)
+
+
+def test_the_room_alone_has_no_deviation(small_capture):
+    running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",)))
+    assert deviations(running) == {}
+
+
 def test_photographs_that_moved_far_are_told_from_those_that_all_moved():
     moved = {f"{k}.png": {"moved_px": 3.0 + 0.1 * k} for k in range(9)}
-    assert moved_far(moved) == ""
+    assert moved_far(moved) == moved_far({}) == ""
     moved["4.png"] = {"moved_px": 17.0}
     assert moved_far(moved) == "4.png (17.0 px)"

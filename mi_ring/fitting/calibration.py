@@ -58,11 +58,10 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
 
     `albedo`: the object's, by the lights' intensities.
     """
-    if "auto" in config.refine:
-        if capture.known:
-            return ()
-        return (*AUTO, "scale") if config.indirect and albedo >= 1 else AUTO
-    return tuple(name for name in UNKNOWNS if name in config.refine)
+    names: set[str] = set(config.refine)
+    if "auto" in names and not capture.known:
+        names |= {*AUTO, "scale"} if config.indirect and albedo >= 1 else {*AUTO}
+    return tuple(name for name in UNKNOWNS if name in names)
 
 
 def overall(refined: Sequence[str], albedo: float) -> float:
@@ -126,7 +125,8 @@ class Calibration(nn.Module):
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room
-        self.room = Room(torch.zeros(BASIS, 3) if given is None else torch.from_numpy(given).float(), exposure)
+        room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
+        self.room = Room(room, exposure)
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""
@@ -174,7 +174,8 @@ class Calibration(nn.Module):
     def bounced(self, interreflection: Tensor) -> Tensor:
         """Light that has bounced between surfaces, attached to `scale`.
 
-        All others keep it as it is: one more reflection by a surface that is darker by as much as lights are stronger.
+        All other unknowns keep it as it is: it is one more reflection by a surface that is darker by as much as lights
+        are stronger.
         """
         scale = self.value("scale").to(interreflection)
         return interreflection * (scale.detach() - scale).exp()
@@ -195,9 +196,10 @@ class Calibration(nn.Module):
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """Radiance (N, H, W, 3) as lens and curve record it, decoded by what the capture says of both.
 
-        The curve leaves the mean of the object as it is. `index`, `scale`: which photographs, how much smaller.
+        The curve's exponent leaves the mean of the object as it is. `index`, `scale`: which photographs, how much
+        smaller.
         """
-        if "vignetting" in self.refined:
+        if self.shading:
             cosines, given = self.cosines(index, scale).to(radiance), self.dimmed[index].to(radiance)
             given = cosines ** given[:, None, None, None]
             dimmed = radiance * given * cosines ** self.value("vignetting").to(radiance)
@@ -219,13 +221,13 @@ class Calibration(nn.Module):
         An S of one steepness after another is one of their product's: that of the capture need not be known.
         """
         gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
-        lit = values.clamp(min=BLACK)
-        return torch.where(values > BLACK, contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas), values)
+        lit = values.clamp(min=BLACK)  # below it goes on straight
+        return contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas) * (values / lit)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """Radiance of what lens and curve recorded, the inverse of `recorded`; without gradients."""
-        if "vignetting" in self.refined:
+        if self.shading:
             cosines, given = self.cosines(index, scale).to(recorded), self.dimmed[index].to(recorded)
             given = cosines ** given[:, None, None, None]
             straight = self.straight(recorded * given, self.gammas[index])
@@ -240,6 +242,16 @@ class Calibration(nn.Module):
         recorded = self.contrasted(recorded, (-self.value("contrast")).exp(), gammas)
         relative, gamma = recorded / self.exposure, float(self.gamma)
         return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
+
+    @property
+    def shading(self) -> bool:
+        """Does the curve record what the lens has dimmed, or is that dimming unknown?"""
+        return "vignetting" in self.refined or bool(self.dimmed.any())
+
+    def roomlight(self) -> Tensor:
+        """(BASIS, 3) harmonics of the room's light as they are by now; what a scene says goes with `scale`."""
+        harmonics = self.room.harmonics
+        return harmonics if "ambient" in self.refined else harmonics / self.reflecting
 
     def room_share(self) -> Tensor:
         """(3,) the room's light on the object, mean over all directions, by that of the flash where it faces it."""
@@ -283,7 +295,7 @@ class Calibration(nn.Module):
             lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
         room = None
         if "ambient" in self.refined or capture.photographs.room is not None:
-            room = self.room.harmonics.double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
+            room = self.roomlight().double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
         return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast)
 
 

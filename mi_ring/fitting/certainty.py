@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from mi_ring.fitting.calibration import Calibration
 from mi_ring.rendering import bridge
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
 WIDTH, SPP, TOGETHER = 96, 16, 8  #: of the pictures that are compared, and how many at once
+RECORDED = "curve", "contrast", "vignetting"  #: what changes nothing of the light that reaches the camera
 STEP = 0.2  #: of the unknowns, to either side, in their priors' standard deviations
 BLOCK = 8  #: pixels across which errors are taken to go together
 
@@ -60,6 +62,8 @@ def deviations(fit: "Fit") -> dict[str, np.ndarray]:
     calibration = fit.calibration
     assert calibration is not None
     entries = Entries(calibration)
+    if not entries.count:
+        return {}
     colours, outlines = Equations(entries.count), Equations(entries.count)
     for size, alike in fit.capture.sizes.items():
         chosen = np.intersect1d(alike, fit.fitted)
@@ -90,8 +94,8 @@ class Equations:
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
         height, width, channels = error.shape
         error = torch.where(telling[..., None], error, 0.0).double()
-        error = error[: height - height % BLOCK, : width - width % BLOCK]
-        blocks = error.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK, channels).sum((1, 3))
+        error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
+        blocks = error.unfold(0, BLOCK, BLOCK).unfold(1, BLOCK, BLOCK).sum((-2, -1))
         self.squares += float(blocks.square().sum())
         self.pixels += channels * int(telling.sum())
 
@@ -113,7 +117,7 @@ def compare(
         return bridge.draw(fit.surface, moved, SPP, shadows=fit.config.shadows and fit.capture.shadows)
 
     lit, coverage = direct()
-    room = calibration.room.harmonics.cpu()
+    room = calibration.roomlight().cpu()
     moved = bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
@@ -136,14 +140,14 @@ def compare(
             if name == "power":  # not by its unknowns, whose mean does not count
                 colour = torch.ones(3)
                 colour[k] = factor
-                sides.append((picture(lit * colour), coverage))
+                sides.append((picture(lit * colour, bounced * colour), coverage))
             elif name == "scale":
                 sides.append((picture(lit, bounced / factor), coverage))
             else:
                 unknown = getattr(calibration, name)
                 found = unknown.detach().clone()
                 unknown.view(-1)[torch.from_numpy(np.unique(places - entries.first[name]))] += step
-                rgb, covered = direct()
+                rgb, covered = (lit, coverage) if name in RECORDED else direct()
                 sides.append((picture(rgb), covered))
                 unknown.copy_(found)
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
@@ -153,7 +157,10 @@ def compare(
     error = predicted - perceived(seen.rgb)
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
+    outlined = (covering.abs().amax(0) > 0) | (coverage != seen.mask)  # beside and amid the object nothing can be wrong
     for n in range(len(index)):
         colours.add(changing[:, n], error[n], surely[n], places[n])
         if seen.masked[n] and fit.capture.threshold is None:
-            outlines.add(covering[:, n, ..., None], (coverage - seen.mask)[n][..., None], known[n], places[n])
+            outlines.add(
+                covering[:, n, ..., None], (coverage - seen.mask)[n][..., None], (known & outlined)[n], places[n]
+            )

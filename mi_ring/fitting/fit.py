@@ -101,7 +101,7 @@ class Fit:
         self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.calibration: Calibration | None = None
-        if refined := refined_of(capture, self.config, self.albedo):
+        if refined := refined_of(seen, self.config, self.albedo):
             power = overall(refined, self.albedo)
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
             self.optimizers += self.calibration.optimizers()
@@ -196,7 +196,8 @@ class Fit:
                 calibration.room.see(around, predicted.detach(), calibration.linear(seen.rgb, index, scale), telling)
             return predicted + around.room(calibration.room.harmonics)
         if photographs.room is not None:
-            predicted = predicted + around.room(torch.from_numpy(photographs.room).to(predicted))
+            room = self.calibration.roomlight() if self.calibration else torch.from_numpy(photographs.room)
+            predicted = predicted + around.room(room.to(predicted))
         return predicted
 
     def follow_power(self) -> None:

@@ -1,5 +1,6 @@
 """Photographs that are kept out of a fit: does what was refined explain them better?"""
 
+import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,10 +14,8 @@ from mi_ring.rendering import bridge
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
-SHARED = set(UNKNOWNS) - {
-    "cameras",
-    "power",
-}  #: of all photographs; what is of one is not known where it is out
+#: Of all photographs; what is of one is not known where it is out.
+SHARED = set(UNKNOWNS) - {"cameras", "power"}
 WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
 
 
@@ -42,7 +41,8 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
 def confirm(fit: "Fit") -> dict:
     """Put back what was refined for all photographs and explains those that were kept out no better than before.
 
-    Returns what is unexplained of them (`unexplained`, and `before`, without any of it) and what was `put_back`.
+    Returns what is unexplained of them (`unexplained`; `before`: with all unknowns as they began) and what was
+    `put_back`.
     """
     calibration = fit.calibration
 
@@ -66,4 +66,12 @@ def confirm(fit: "Fit") -> dict:
             else:
                 unknown.copy_(found)
                 fit.follow_power()
-    return {"unexplained": now, "before": unexplained(fit, fit.capture), "put_back": back}
+    found_by_now = copy.deepcopy(calibration.state_dict())
+    with torch.no_grad():
+        for name in (*calibration.widths, "ambient"):
+            unknown, given = calibration.unknown(name)
+            unknown.copy_(given)
+        before = unexplained_now()
+    calibration.load_state_dict(found_by_now)
+    fit.follow_power()
+    return {"unexplained": now, "before": before, "put_back": back}

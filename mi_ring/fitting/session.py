@@ -67,6 +67,9 @@ def run_session(fit: Fit, folder: Path) -> bool:
         if fit.config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
                   f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
+        elif fit.albedo >= 1 and fit.calibration and "scale" in fit.calibration.refined:
+            print(f"By the lights' intensities the object reflects {fit.albedo:.3g} times the light that it gets: how "
+                  "strong they are is found by interreflection (--refine scale)")  # fmt: skip
         if not fit.iteration:
             results.write_inputs(folder / "inputs.png", fit)
         try:

@@ -20,7 +20,7 @@ FAR, LEAST_FAR = 4.0, 2.0  #: a photograph that a fit moves so many times as far
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
     """Which photographs a fit has moved much farther than the others, and how far, by its `summary`; empty if none."""
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
-    limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()))))
+    limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
@@ -136,7 +136,12 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
     record = capture.path.parent / "calibration.json"  # of the fit that found this calibration
-    if record.exists() and (few := moved_far(json.loads(record.read_text("utf-8"))["photographs"])):
+    try:
+        moved = {k: v for k, v in json.loads(record.read_text("utf-8"))["photographs"].items() if k in capture.names}
+        few = moved_far(moved)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # there is none, or it is another tool's
+        few = ""
+    if few:
         found.append(
             f"{few}: the fit has moved the camera much farther than the others': out of focus, or another scene?"
         )

@@ -31,8 +31,9 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
     """An unknown in words: what, before, after, standard deviation."""
     if np.size(entry["after"]) > LISTED:
-        moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]), axis=-1)
-        spread = np.linalg.norm(entry["std"], axis=-1)
+        several = len(entry["after"]), -1
+        moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
+        spread = np.linalg.norm(np.reshape(entry["std"], several), axis=1)
         return entry["what"], "", f"by {np.median(moved):.3g}, at most {moved.max():.3g}", f"{np.median(spread):.2g}"
     before, after, std = (
         numbers(entry[key], digits) if key in entry else "" for key, digits in (("before", 4), ("after", 4), ("std", 2))
@@ -75,8 +76,11 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     """Cameras and lights from above, and how far each photograph's picture or power has moved."""
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     plan, bars = figure.subplots(1, 2)
-    draw_plan(plan, before, BEFORE, "before")
-    draw_plan(plan, after, AFTER, "after")
+    up = before.up
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    plane = np.stack([right / np.linalg.norm(right), np.cross(up, right / np.linalg.norm(right))])
+    draw_plan(plan, before, plane, BEFORE, "before")
+    draw_plan(plan, after, plane, AFTER, "after")
     plan.legend(fontsize=8)
     plan.set_aspect("equal", "datalim")
     plan.set_title("cameras and lights (•), along the vertical", fontsize=9)
@@ -95,16 +99,11 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     return svg_uri(figure)
 
 
-def draw_plan(axes: Axes, capture: Capture, colour: str, label: str) -> None:
-    """Cameras, the way they look, and their lights, seen along what is up in the photographs."""
-    up = capture.up
-    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    plane = np.stack([right / np.linalg.norm(right), np.cross(up, right / np.linalg.norm(right))])
+def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
+    """Cameras, the way they look, and their lights, in a plane of these two directions (2, 3)."""
     poses = np.stack([sensor.camera.to_world for sensor in capture.sensors])
-    places = poses[:, :3, 3] @ plane.T
-    reach = np.ptp(places, axis=0).max()
-    axes.quiver(*places.T, *(0.12 * reach * poses[:, :3, 2] @ plane.T).T, color=colour, angles="xy", scale_units="xy",
-                scale=1, width=0.004, label=label)  # fmt: skip
+    places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
+    axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)
     lights = capture.photographs.lights
     x, y = (lights.positions()[lights.is_finite()] @ plane.T).T
     axes.scatter(x, y, s=8, c=colour)
