@@ -33,10 +33,8 @@ STEPS = {
     "falloff": 0.05, "room": 0.05,
 }  # fmt: skip
 MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.centre", "sensor.falloff", "sensor.light", "room")
-CONE, ROOM = (
-    4.0,
-    np.linspace(0.5, -0.3, 27),
-)  #: exponent of the flash's and harmonics of the room's light, where they change
+CONE = 4.0  #: exponent of the flash's, where that changes
+ROOM = np.linspace(0.5, -0.3, 27)  #: harmonics of the room's light, where they change
 LIGHTS, SHAPES = ("flash", "lamp", "directional"), ("sphere", "bumpy")
 
 

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from mi_ring.fitting.calibration import Calibration
 from mi_ring.rendering import bridge
 from mi_ring.rendering.indirect import BOUNCES
+from mi_ring.rendering.photographs import Photographs
 
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
@@ -112,16 +113,17 @@ def compare(
     seen = fit.capture.observe(index, scale)
     photographs = replace(fit.capture.photographs.select(index, fit.capture.sensors[index[0]].size, scale), room=None)
 
+    def calibrated() -> Photographs:
+        return bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
+
     def direct() -> tuple[Tensor, Tensor]:
-        moved = bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
-        return bridge.draw(fit.surface, moved, SPP, shadows=fit.config.shadows and fit.capture.shadows)
+        return bridge.draw(fit.surface, calibrated(), SPP, shadows=fit.config.shadows and fit.capture.shadows)
 
     lit, coverage = direct()
     room = calibration.roomlight().cpu()
-    moved = bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
-        around = bridge.surroundings(fit.surface, moved, coverage.to(fit.device), 1, room=bool(room.any()),
+        around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, room=bool(room.any()),
                                      bounces=BOUNCES if fit.ring.indirect else 1)  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
         roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
@@ -132,8 +134,8 @@ def compare(
     def picture(lit: Tensor, bounced: Tensor = bounced) -> Tensor:
         return perceived(calibration.recorded(lit + bounced + roomlight, index, scale))
 
-    slopes = []  # of colours (n, H, W, 3) and coverage (n, H, W)
-    for name, k, places in entries.of(index):
+    slopes, unknowns = [], entries.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
+    for name, k, places in unknowns:
         sides = []
         for step in (STEP, -STEP):
             factor = float(np.exp(step * calibration.widths[name]))
@@ -152,15 +154,12 @@ def compare(
                 unknown.copy_(found)
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
     changing, covering = (torch.stack(part) for part in zip(*slopes))
-    places = np.stack([places for *_, places in entries.of(index)], 1)
-    predicted = picture(lit)
-    error = predicted - perceived(seen.rgb)
+    own = np.stack([places for *_, places in unknowns], 1)
+    error, off = picture(lit) - perceived(seen.rgb), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
-    outlined = (covering.abs().amax(0) > 0) | (coverage != seen.mask)  # beside and amid the object nothing can be wrong
+    outlined = (covering.abs().amax(0) > 0) | (off != 0)  # beside and amid the object nothing can be wrong
     for n in range(len(index)):
-        colours.add(changing[:, n], error[n], surely[n], places[n])
+        colours.add(changing[:, n], error[n], surely[n], own[n])
         if seen.masked[n] and fit.capture.threshold is None:
-            outlines.add(
-                covering[:, n, ..., None], (coverage - seen.mask)[n][..., None], (known & outlined)[n], places[n]
-            )
+            outlines.add(covering[:, n, ..., None], off[n, ..., None], (known & outlined)[n], own[n])

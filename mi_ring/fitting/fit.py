@@ -203,7 +203,7 @@ class Fit:
     def follow_power(self) -> None:
         """The reflectance takes along what the fit has found of the power of the lights together."""
         if self.calibration and "scale" in self.calibration.refined:
-            net, first = self.ring.brdf_net, self.albedo / overall(self.calibration.refined, self.albedo) / math.pi
+            net, first = self.ring.brdf_net, self.albedo / self.calibration.first_power / math.pi
             net.set_parameters(net.bsdf_parameters, first * self.calibration.reflecting)
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
