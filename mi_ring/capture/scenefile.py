@@ -3,7 +3,7 @@
 import math
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -130,10 +130,8 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
     `room`: the light of their room, as `mi_ring.rendering.rooms` has it.
     """
     root = ElementTree.fromstring(scene)
-    photographs = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
-    named = {sensor.id(): sensor for sensor in sensors}
-    for old, sensor in zip(photographs, sensors, strict=True):
-        sensor = named.get(old.get("id", ""), sensor)
+    for old, k in photographs_of(root, sensors):
+        sensor = sensors[k]
         new = photograph_element(
             "", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma, contrast=sensor.contrast,
             falloff=sensor.cone, vignetting=sensor.vignetting,
@@ -149,6 +147,24 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
     if room is not None:
         root.extend(room_elements(room))
     return scene_bytes(root)
+
+
+def remasked_xml(scene: bytes, sensors: Sequence, masks: Mapping[int, str]) -> bytes:
+    """A scene file of the photographs `sensors`, some of which, by index, have these masks; names relative to it."""
+    root = ElementTree.fromstring(scene)
+    for element, k in photographs_of(root, sensors):
+        if k in masks:
+            for old in element.findall("string[@name='mask']"):
+                element.remove(old)
+            ElementTree.SubElement(element, "string", name="mask", value=masks[k])
+    return scene_bytes(root)
+
+
+def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]]:
+    """The photographs of a scene file, each with the index of its sensor: by name; unnamed ones in order."""
+    elements = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
+    named = {sensor.id(): k for k, sensor in enumerate(sensors)}
+    return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
 
 
 def room_elements(room: np.ndarray) -> list[Element]:

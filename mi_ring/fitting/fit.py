@@ -19,6 +19,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
+from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import starting_ring
@@ -79,6 +80,9 @@ class Fit:
             raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
+        if "masks" in self.config.refine and capture.threshold is not None:
+            raise InputError(f"{capture.path}: --refine masks: they are those of a dark room, found by brightness; "
+                             "leave it out, or give others")  # fmt: skip
         if self.config.deterministic:
             recompute_normals(capture.scene)
         self.random = torch.Generator().manual_seed(self.config.seed)
@@ -109,6 +113,8 @@ class Fit:
         self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
+        #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.
+        self.outlines: dict[int, Tensor] = {}
         self.iteration, self.seconds = 0, 0.0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.restraint = Restraint()
@@ -130,6 +136,8 @@ class Fit:
         if self.iteration >= self.iterations:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
+        if "masks" in self.config.refine and self.iteration in [int(p * self.iterations) for p in REDRAWN]:
+            self.take_outlines(find_outlines(self))
         it = self.predict()
         loss = self.weigh(it)
         self.descend(loss, it.progress)
@@ -199,6 +207,11 @@ class Fit:
             room = self.calibration.roomlight() if self.calibration else torch.from_numpy(photographs.room)
             predicted = predicted + around.room(room.to(predicted))
         return predicted
+
+    def take_outlines(self, outlines: dict[int, Tensor]) -> None:
+        """Go on with these masks, where there are any, instead of those of the capture."""
+        self.outlines = outlines
+        self.capture = with_outlines(self.capture, outlines)
 
     def follow_power(self) -> None:
         """The reflectance takes along what the fit has found of the power of the lights together."""
@@ -303,6 +316,7 @@ class Fit:
             "restraint": vars(self.restraint),
             "calibration": self.calibration and self.calibration.state_dict(),
             "confirmed": self.confirmed,
+            "outlines": self.outlines,
         }
         return copy.deepcopy(state)  # which the next iteration would change
 
@@ -315,5 +329,6 @@ class Fit:
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
         vars(self.restraint).update(state["restraint"])
         self.confirmed = state["confirmed"]
+        self.take_outlines(state["outlines"])
         if self.calibration:
             self.calibration.load_state_dict(state["calibration"])

@@ -3,16 +3,17 @@
 import contextlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.output import gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
@@ -121,6 +122,8 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room)
+    if fit.outlines:
+        scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
@@ -131,6 +134,23 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
         write_file(folder / "calibration.json", json.dumps(refined, indent=1))
     write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
+
+
+def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
+    """Files of the masks of these photographs, each called like its photograph with .png added.
+
+    Returns their names, by index, as a scene beside `folder` has them.
+    """
+    names = {}
+    for k in index:
+        path = folder / f"{capture.names[k]}.png"
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        mask = capture.masks[k]
+        assert mask is not None
+        write_image(mask[..., None], path)
+        names[k] = relative_to(folder.parent, path)
+    return names
 
 
 def viewed(ring: Ring, views: Sequence[View] | None = None) -> bytes | None:

@@ -1,7 +1,7 @@
 """Masks that nobody has to draw: a first guess, then GrabCut in each photograph and votes of all in space, in turn.
 
 Votes keep what most photographs that show a place call object, so that lamps, highlights and the neighbours of one
-photograph drop out, and GrabCut ("GrabCut", Rother et al. 2004) finds the outline that the coarse votes leave open.
+photograph drop out, and GrabCut finds the outline that the coarse votes leave open.
 """
 
 import os
@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from mi_ring.capture.outlines import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
 from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
@@ -22,7 +23,6 @@ SHOWN = 0.25  #: share of the photographs that must show a place, else it is not
 AGREE = 0.9  #: share of those that must call it object
 RESOLUTION = 96  #: voxels along an edge of the space that is looked at
 FEWEST = 30  #: voxels of an object: a few agree anywhere, and then agree perfectly
-BAND = 0.04  #: of the object's size: GrabCut decides so far inside the votes' outline, and somewhat further outside
 ROUNDS, SETTLED = 6, 0.995  #: at most; or when so much of the masks' union is the same as before
 DARKEST = 1e-3  #: radiance below which nothing is told
 
@@ -100,12 +100,6 @@ class Space:
         return Body(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
 
 
-def disk(radius: float) -> np.ndarray:
-    """A structuring element."""
-    r = max(1, round(radius))
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
-
-
 def nothing(views: Sequence[View]) -> list[np.ndarray]:
     """Empty masks."""
     return [np.zeros(view.shown.shape, np.uint8) for view in views]
@@ -117,30 +111,9 @@ def bright(view: View) -> np.ndarray:
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def grabcut(view: View, coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: the object's outline near that of its coverage (H, W).
-
-    `background` (H, W) uint8 is what surely is not the object.
-    """
-    size = np.sqrt(max(1, int(coverage.sum())))
-    seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[cv2.dilate(coverage, disk(1.5 * BAND * size)) > 0] = cv2.GC_PR_BGD
-    seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[cv2.erode(coverage, disk(BAND * size)) > 0] = cv2.GC_FGD
-    seed[~view.shown | (background > 0)] = cv2.GC_BGD
-    if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
-        return coverage & (background == 0)
-    cv2.setRNGSeed(0)  # of this thread
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    bgr = np.ascontiguousarray(view.rgb[..., ::-1])
-    cv2.grabCut(bgr, seed, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
-    return ((seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)).astype(np.uint8)
-
-
-def overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks; 1 if both are empty."""
-    union = int(((a > 0) | (b > 0)).sum())
-    return int(((a > 0) & (b > 0)).sum()) / union if union else 1.0
+def outlined(view: View, coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(H, W) uint8: the object near its coverage (H, W). `background` (H, W) surely is not the object."""
+    return grabcut(view.rgb, coverage, ~view.shown | (background > 0))
 
 
 @dataclass(frozen=True)
@@ -170,7 +143,7 @@ def settle(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number in range(ROUNDS):
             before, covered = masks, [body.coverage(view) for view in space.views]
-            found = pool.map(grabcut, space.views, covered, backgrounds)
+            found = pool.map(outlined, space.views, covered, backgrounds)
             masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
             body = space.vote(masks)
             if body is None:

@@ -1,0 +1,95 @@
+"""Outlines by GrabCut, and masks as unknowns of a fit."""
+
+import shutil
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+import mi_ring
+from mi_ring import Config, Fit, InputError
+from mi_ring.capture.outlines import grabcut, overlap
+from mi_ring.fitting import outlines
+
+WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
+BRIEF = {"iterations": 60, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3}
+
+
+def ellipse(x, y, rows=50, columns=70):
+    i, j = np.mgrid[:rows, :columns]
+    return (((j - x) / 21) ** 2 + ((i - y) / 14) ** 2 < 1).astype(np.uint8)
+
+
+def test_the_outline_is_that_of_the_colours_near_the_coverage():
+    true, noise = ellipse(33, 24), np.random.default_rng(1).normal(0, 6, (50, 70, 3))
+    true[20:28, :3] = 1  # looks alike, but is elsewhere
+    picture = np.where(true[..., None] > 0, [150, 60, 40], [70, 90, 80]) + noise
+    nowhere = np.zeros(true.shape, bool)
+    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), nowhere)
+    assert overlap(ellipse(34, 25), ellipse(33, 24)) < 0.94
+    assert overlap(found, ellipse(33, 24)) > 0.99
+    never = nowhere.copy()
+    never[:, 40:] = True
+    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), never)
+    assert not found[never].any() and overlap(found[:, :40], ellipse(33, 24)[:, :40]) > 0.99
+
+
+def test_overlap_by_hand():
+    a, b = np.array([[1, 1, 0], [0, 0, 0]]), np.array([[0, 1, 1], [1, 0, 0]])
+    assert overlap(a, b) == 1 / 4
+    assert overlap(0 * a, 0 * b) == 1
+
+
+@pytest.fixture
+def without_some_masks(small_capture, tmp_path):
+    """The small capture, of which some photographs have no mask, and the masks of all (N, H, W)."""
+    true = np.stack(mi_ring.load_capture(small_capture).masks) > 127
+    shutil.copytree(small_capture.parent, tmp_path / "some")
+    scene = tmp_path / "some" / small_capture.name
+    tree = ElementTree.parse(scene)
+    for k in WITHOUT:
+        sensor = tree.find(f"sensor[@id='{k:03}']")
+        sensor.remove(sensor.find("string[@name='mask']"))
+    tree.write(scene)
+    return scene, true
+
+
+def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_some_masks, tmp_path):
+    scene, true = without_some_masks
+    capture = mi_ring.load_capture(scene)
+    fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
+    for it in fit:
+        masked = sum(mask is not None for mask in fit.capture.masks)
+        assert masked == (12 if it.number > 30 else 12 - len(WITHOUT))
+    assert [k for k, mask in enumerate(capture.masks) if mask is None] == WITHOUT  # the capture stays as it was
+    for k in range(12):
+        assert overlap(fit.capture.masks[k] > 127, true[k]) > 0.93, k
+
+    other = Fit(capture, fit.config, state=fit.state())
+    for one, another in zip(fit.capture.masks, other.capture.masks):
+        np.testing.assert_array_equal(one, another)
+
+    fit.save(tmp_path / "run")
+    written = mi_ring.load_capture(tmp_path / "run" / "scene.xml")
+    assert [sensor.mask.name for sensor in written.sensors] == [f"{k:03}.png.png" for k in range(12)]
+    for one, another in zip(fit.capture.masks, written.masks):
+        np.testing.assert_array_equal(one, another)
+
+
+def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks, monkeypatch):
+    scene, _ = without_some_masks
+    capture = mi_ring.load_capture(scene)
+    fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
+    monkeypatch.setattr(outlines, "grabcut", lambda picture, coverage, background: coverage * (np.arange(56) > 27))
+    fit.iteration = 30
+    fit.step()
+    assert not fit.outlines
+    for before, after in zip(capture.masks, fit.capture.masks):
+        assert before is after
+
+
+def test_masks_of_a_dark_room_are_left_alone(small_capture):
+    capture = mi_ring.load_capture(small_capture, masks="none")
+    assert capture.threshold is not None
+    with pytest.raises(InputError, match="--refine masks: .* by brightness"):
+        Fit(capture, Config(**BRIEF, refine=("masks", "light")))
