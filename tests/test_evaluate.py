@@ -187,6 +187,32 @@ def test_ssim_is_that_of_the_paper():
     assert predictions.ssim(a[:10], b[:10]) == {}  # it does not fit in
 
 
+def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_capture):
+    """What is beside the object is not predicted."""
+    path, _ = broken_capture
+    for k in range(12):
+        picture, mask = (np.array(mi.Bitmap(str(path.parent / f"{kind}/{k:03}.png"))) for kind in ("images", "masks"))
+        if k != 7:  # the room is that of most photographs
+            picture[mask.reshape(40, 56) == 0] = [140, 110, 90]
+        mi.Bitmap(picture).write(str(path.parent / f"images/{k:03}.png"))
+    scene = loading.load_capture(path)
+    assert scene.lit_room
+    ring = Ring(CENTER, 25.0, scale=0.5)
+    numbers, views = predictions.compare_photographs(scene, ring, 4)
+    surface = predictions.bridge.Surface(scene.scene, scene.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    squares = []
+    for k in range(12):
+        rgb, _ = predictions.bridge.draw(surface, scene.photograph(k), spp=4)
+        guess = np.clip(rgb[0].numpy(), 0, 1)
+        guess = np.where(guess <= 0.0031308, 12.92 * guess, 1.055 * guess ** (1 / 2.4) - 0.055)
+        inside = scene.masks[k] == 255
+        squares.append(((guess - scene.images[k] / 255)[inside] ** 2).mean())
+        assert views[k]["psnr"] == pytest.approx(-10 * np.log10(squares[k]), abs=0.05)  # 8 bits
+        assert -1 <= views[k]["ssim"] <= 1
+    assert numbers["psnr"] == pytest.approx(-10 * np.log10(np.mean(squares)), abs=0.05)
+
+
 # The command.
 
 

@@ -17,7 +17,8 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     """`psnr` [dB] and `ssim` of predictions as 8-bit sRGB against the files, sRGB in [0, 1].
 
     Of all photographs, from the mean of their squared errors and as the mean of their SSIM, and of each. What is
-    predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR.
+    predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR. In a room that was not
+    black only what is wholly object by its mask counts: nobody predicts the rest.
     """
     surface = bridge.Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
@@ -28,12 +29,18 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
         predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
         seen = capture.observe([k])
         observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))
-        if seen.valid is not None:  # what shows nothing is no error
-            predicted = np.where(seen.valid[0, ..., None].numpy(), predicted, observed)
-        squares.append(np.mean((predicted - observed) ** 2))
-        views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed)})
+        telling = np.ones(predicted.shape[:2], bool) if seen.valid is None else seen.valid[0].numpy()
+        if seen.masked[0] and capture.lit_room:
+            telling = telling & (seen.mask[0].numpy() > 0.99)
+        if not telling.any():
+            views.append({"name": name})
+            continue
+        predicted = np.where(telling[..., None], predicted, observed)
+        squares.append(np.mean((predicted - observed)[telling] ** 2))
+        views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed, telling)})
     similar = [view["ssim"] for view in views if "ssim" in view]
-    return decibels(np.mean(squares)) | ({"ssim": float(np.mean(similar))} if similar else {}), views
+    totals = decibels(np.mean(squares)) if squares else {}
+    return totals | ({"ssim": float(np.mean(similar))} if similar else {}), views
 
 
 def decibels(square: float) -> dict[str, float]:
@@ -41,12 +48,15 @@ def decibels(square: float) -> dict[str, float]:
     return {"psnr": float(-10 * np.log10(square))} if square else {}
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+def ssim(a: np.ndarray, b: np.ndarray, telling: np.ndarray | None = None) -> dict[str, float]:
     """Structural similarity of images (H, W, 3) in [0, 1], mean over channels, none if they are less than its window.
+
+    `telling` (H, W) bool: the pixels over which it is averaged; None: all of whose neighbours its window holds.
 
     Wang et al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 pixels, σ = 1.5 px.
     """
     if min(a.shape[:2]) < WINDOW:
         return {}
     wang = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    return {"ssim": float(structural_similarity(a, b, data_range=1, channel_axis=-1, **wang))}
+    mean, local = structural_similarity(a, b, data_range=1, channel_axis=-1, full=True, **wang)
+    return {"ssim": float(mean if telling is None or telling.all() else local[telling].mean())}
