@@ -92,7 +92,6 @@ class Settings:
 
 def poses(settings: Settings, height: float) -> Iterator[tuple[np.ndarray, float]]:
     """Camera-to-world matrices, Mitsuba's axes, and how far the room turned with the camera [radians]."""
-    rings = RINGS[:1] * 2 if settings.turntable else RINGS
     share = [0.5, 0.5] if settings.turntable else [0.4, 0.35, 0.25]
     ring = np.searchsorted(np.cumsum(share), (np.arange(settings.views) + 0.5) / settings.views)
     for k in range(settings.views):
@@ -102,7 +101,7 @@ def poses(settings: Settings, height: float) -> Iterator[tuple[np.ndarray, float
             elevation, distance, roll, aim = np.radians(28 + 24 * ring[k]), DISTANCE, 0.0, np.zeros(3)
         else:
             azimuth += rng.normal(0, 0.25 * 2 * np.pi / len(own))
-            elevation = np.radians(np.clip(rings[ring[k]] + rng.normal(0, 3.5), 15, 70))
+            elevation = np.radians(np.clip(RINGS[ring[k]] + rng.normal(0, 3.5), 15, 70))
             distance = DISTANCE + rng.uniform(-SCATTER, SCATTER)
             roll, aim = rng.normal(0, np.radians(4)), rng.uniform(-12, 12, 3)
         away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])

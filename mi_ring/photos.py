@@ -35,6 +35,7 @@ from mi_ring.photogrammetry.workflow import (
 )
 from mi_ring.system import command
 from mi_ring.system.files import writing
+from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
 
@@ -69,6 +70,12 @@ class PhotosConfig:
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
             raise InputError(f"--square-mm: is {self.square_mm}, must be above 0")
+        if self.box and not all(low < high for low, high in zip(self.box[::2], self.box[1::2])):
+            raise InputError(f"--box: is {' '.join(map(str, self.box))}, must be lowest and highest x, then y, then z")
+        if isinstance(self.masks, Path) and not self.masks.is_dir():
+            raise InputError(f"--masks: {self.masks}: no such folder; give auto, alpha, rembg or a folder of masks")
+        if self.masks == "rembg":
+            need("rembg", "--masks rembg")
 
 
 def cameras_report(motion: Motion) -> str:
@@ -81,10 +88,10 @@ def cameras_report(motion: Motion) -> str:
     ])  # fmt: skip
 
 
-def masks_report(found: Object, motion: Motion) -> str:
-    """Which photographs have a mask."""
+def masks_report(found: Object, motion: Motion, source: str | Path) -> str:
+    """Which photographs have a mask; `source`: as `PhotosConfig.masks`."""
     without = [name for name in motion.cameras if name not in found.masks]
-    why = "does not show the object, or not clearly enough for a mask"
+    why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
         f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs",
         *(f"  without: {name}: {why}" for name in without),
@@ -96,8 +103,8 @@ def main(arguments: Sequence[str]) -> int:
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     if scene.exists() and sheet.exists():
-        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it to make it anew from "
-                         f"{config.out}/work")  # fmt: skip
+        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/ and "
+                         f"valid/ beside it, to make it anew from {config.out}/work")  # fmt: skip
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if not scene.exists():
@@ -136,7 +143,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     hints = Hints(plane, config.box, config.masks)
     found = find_object(pictures, motion, hints, work / "masks", progress)
     plane = found.plane
-    print(masks_report(found, motion))
+    print(masks_report(found, motion, config.masks))
     if config.masks == "auto":  # what shows a table and no mask would be taken for the object
         motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
     if not sheet:

@@ -244,7 +244,7 @@ def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2}
     source = transforms(tmp_path / "pot", top, [{"file_path": "images/a.png"}], lambda k: noise(np.uint8))
     before = (source / "images/a.png").read_bytes()
-    with pytest.raises(InputError, match=r"images/a.png: exists already; give SCENE.xml another name"):
+    with pytest.raises(InputError, match=r"images/a.png: exists already and is another; remove it"):
         convert.main(["transforms", str(source), str(tmp_path / scene)])
     assert (source / "images/a.png").read_bytes() == before
     assert sorted(p.name for p in source.iterdir()) == ["images", "transforms.json"]

@@ -21,7 +21,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with
-from mi_ring.photogrammetry.motion import structure_from_motion
+from mi_ring.photogrammetry.motion import alike, structure_from_motion
 from mi_ring.photogrammetry.views import camera_of
 from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs
 from mi_ring.system.progress import progress
@@ -67,9 +67,10 @@ def photographs(tmp_path_factory, speckles):
     folder = tmp_path_factory.mktemp("photographs")
     (folder / "masks").mkdir()
     for k, pose in enumerate(walk(14)):
-        Image.fromarray(rendered(pose, speckles)).save(folder / f"{k:02}.png")
+        name = f"# 2026 IMG ({k:02}).png"  # as messengers and file managers call them
+        Image.fromarray(rendered(pose, speckles)).save(folder / name)
         mask = np.isfinite(hit_ellipsoid(camera_of(LENS, pose))[0]).reshape(SIZE[::-1])
-        Image.fromarray(mask).convert("L").save(folder / f"masks/{k:02}.png")
+        Image.fromarray(mask).convert("L").save(folder / "masks" / name)
     return folder
 
 
@@ -179,6 +180,9 @@ def test_photographs_from_one_place_are_told_after_the_first_pairs(tmp_path, spe
     with pytest.raises(InputError, match=r"100% of the first 60 pairs are from one place; walk around"):
         structure_from_motion(find_pictures(tmp_path), tmp_path / "work", counting)
     assert batches.count("matching") == 1
+    database = tmp_path / "work/database.db"  # where an interrupted one goes on there are more pairs than are asked for
+    assert alike(database, [("01.png", "00.png"), ("02.png", "03.png")]) == 1
+    assert alike(database, [("01.png", "00.png"), ("12.png", "13.png")]) == 0.5
 
 
 def test_photographs_that_are_the_same_file_are_named(tmp_path):
@@ -254,6 +258,27 @@ def test_the_flash_turns_with_the_camera(tmp_path):
     np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
 
 
+def test_the_flash_turns_with_heif_whose_reader_turns_the_pixels(tmp_path):
+    heif = pytest.importorskip("pillow_heif")
+    for k, orientation in enumerate((1, 1, 8)):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        picture = heif.from_pillow(Image.fromarray(np.full((40, 64, 3), 90 * k, np.uint8)))
+        picture.save(tmp_path / f"{k}.heic", exif=exif.tobytes())
+    pictures = [Picture(tmp_path / f"{k}.heic") for k in range(3)]
+    assert [picture.size for picture in pictures] == [(64, 40), (64, 40), (40, 64)]
+    assert [picture.pixels.shape[:2] for picture in pictures] == [(40, 64), (40, 64), (64, 40)]
+    found = turned_with(pictures, np.array([10.0, 0, 1]))
+    np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
+
+
+def test_a_photograph_must_not_be_called_like_the_surface(tmp_path):
+    for name in ("a", "b", "c", "d", "e", "f", "g", "object"):
+        Image.fromarray(np.full((6, 8, 3), ord(name[0]), np.uint8)).save(tmp_path / f"{name}.png")
+    with pytest.raises(InputError, match=r"object.png: FOLDER: .*; rename the file"):
+        find_pictures(tmp_path)
+
+
 @pytest.mark.parametrize("orientation", FLIPS.values())
 def test_raw_photographs_are_turned_as_libraw_turns_them(orientation, tmp_path):
     rawpy, tifffile = pytest.importorskip("rawpy"), pytest.importorskip("tifffile")
@@ -270,6 +295,7 @@ def test_raw_photographs_are_turned_as_libraw_turns_them(orientation, tmp_path):
         expected = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True)
     picture = Picture(tmp_path / "a.dng")
     assert picture.orientation == orientation and picture.size == expected.shape[1::-1]
+    assert "pixels" not in vars(picture)  # they would stay in memory
     np.testing.assert_array_equal(picture.pixels, expected)
     assert Picture(tmp_path / "a.dng", upright=False).size == (64, 48)
 

@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+import torch
 
 import mi_ring
 from mi_ring import Config, Fit, InputError
@@ -25,12 +26,12 @@ def test_the_outline_is_that_of_the_colours_near_the_coverage():
     true[20:28, :3] = 1  # looks alike, but is elsewhere
     picture = np.where(true[..., None] > 0, [150, 60, 40], [70, 90, 80]) + noise
     nowhere = np.zeros(true.shape, bool)
-    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), nowhere)
+    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), nowhere, 0.04)
     assert overlap(ellipse(34, 25), ellipse(33, 24)) < 0.94
     assert overlap(found, ellipse(33, 24)) > 0.99
     never = nowhere.copy()
     never[:, 40:] = True
-    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), never)
+    found = grabcut(picture.clip(0, 255).astype(np.uint8), ellipse(34, 25), never, 0.04)
     assert not found[never].any() and overlap(found[:, :40], ellipse(33, 24)[:, :40]) > 0.99
 
 
@@ -76,11 +77,37 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
         np.testing.assert_array_equal(one, another)
 
 
+def test_what_the_second_search_is_not_sure_of_stays(without_some_masks):
+    scene, _ = without_some_masks
+    fit = Fit(mi_ring.load_capture(scene), Config(**BRIEF, refine=("masks",)))
+    half = {k: torch.ones(40, 56, dtype=torch.uint8) for k in range(12)}
+    fit.take_outlines(half)
+    fit.take_outlines({k: 0 * outline for k, outline in half.items() if k != 4})
+    assert sorted(fit.outlines) == list(range(12))
+    assert fit.outlines[4].all() and not fit.outlines[5].any()
+    assert (fit.capture.masks[4] == 255).all()
+
+
+def test_outlines_of_reduced_pictures_stay_where_they_are(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    sensor = capture.sensors[0]
+    outline = torch.zeros(40 // 3, 56 // 3, dtype=torch.uint8)
+    outline[4:, 10:] = 1  # from row 12 and column 30 on
+    mask = outlines.with_outlines(capture, {0: outline}).masks[0]
+    assert mask.shape == sensor.size[::-1]
+    expected = np.zeros((40, 56), bool)
+    expected[12:, 30:] = True
+    expected[12, 30] = False  # corners are rounded
+    np.testing.assert_array_equal(mask > 127, expected)
+
+
 def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks, monkeypatch):
     scene, _ = without_some_masks
     capture = mi_ring.load_capture(scene)
     fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
-    monkeypatch.setattr(outlines, "grabcut", lambda picture, coverage, background: coverage * (np.arange(56) > 27))
+    monkeypatch.setattr(
+        outlines, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
+    )
     fit.iteration = 30
     fit.step()
     assert not fit.outlines

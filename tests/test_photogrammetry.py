@@ -1,6 +1,7 @@
 """From photographs to a capture, piece by piece: pictures, masks, the table, crops."""
 
 import itertools
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,10 +14,10 @@ from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
-from mi_ring.photogrammetry import masks, table, trial
+from mi_ring.photogrammetry import masks, motion, table, trial
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.motion import Motion, pairs_to_match
-from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, windows, write_shot
+from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
 from mi_ring.photogrammetry.workflow import Hints, find_body
 from mi_ring.rendering.lights import Light
@@ -193,7 +194,27 @@ def test_a_few_voxels_are_no_object():
     for radius, enough in ((1.2, False), (3.0, True)):
         near = np.linalg.norm(space.grid - space.grid[len(space.grid) // 2], axis=1)
         space.allowed = near < radius * (space.axis[1] - space.axis[0])
-        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views]) is not None) == enough
+        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views], masks.AGREE) is not None) == enough
+
+
+def test_a_mask_that_misses_far_more_than_others_has_no_vote():
+    views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
+    true = [np.isfinite(hit_ellipsoid(v.camera)[0]).reshape(120, 160).astype(np.uint8) for v in views]
+    space = masks.Space.seen_by(views)
+    body = space.vote(true, 0.96)
+    np.testing.assert_allclose(body.points.mean(0), CENTER, atol=0.1)
+    wrong = [
+        mask * (np.arange(160) < 80) if k == 5 else mask for k, mask in enumerate(true)
+    ]  # a lamp in the other half
+    covered = [body.coverage(v) for v in views]
+    voters = masks.reliable(views, wrong, covered)
+    assert voters == [k != 5 for k in range(12)]
+    assert masks.reliable(views, true, covered) == [True] * 12
+    assert space.vote(wrong, 0.96).voxels.sum() < 0.8 * body.voxels.sum()
+    assert space.vote(wrong, 0.96, voters).voxels.sum() == pytest.approx(body.voxels.sum(), rel=0.05)
+    for v, mask in zip(views, true):
+        reach = body.reach(v)
+        assert (reach >= mask)[body.coverage(v) > 0].all() and reach.sum() < 1.5 * mask.sum()
 
 
 def test_the_pattern_of_the_table_is_known_again_in_a_shadow():
@@ -219,19 +240,29 @@ def test_masks_that_others_contradict_are_left_open():
     assert found.sum() < 10 * 12 + 4 * 5 + 10
 
 
-def test_a_window_about_the_object_and_back():
-    lens = Lens("PINHOLE", (1600, 1200), (1700.0, 1760.0, 770.0, 640.0))
-    mask = np.zeros((120, 160), np.uint8)
-    mask[30:60, 90:110] = 1  # 200 x 300 pixels
-    window = around(lens, mask, 100)
-    assert window.scale == 3 and window.width < 150 and window.height < 180
-    row, column = window.top + 3 * np.arange(window.height) + 1.5, window.left + 3 * np.arange(window.width) + 1.5
-    inside = (np.abs(row - 450) < 150)[:, None] & (np.abs(column - 1000) < 100)
-    back = pasted(inside.astype(np.uint8), lens, window)
-    assert back.shape == (400, 533)
-    rows, columns = np.nonzero(back)
-    np.testing.assert_allclose([rows.min(), rows.max() + 1, columns.min(), columns.max() + 1],
-                               [100, 200, 300, 366.7], atol=1.1)  # fmt: skip
+@pytest.mark.parametrize("seed", range(8))
+def test_a_window_about_the_object_and_back(seed):
+    """A disk, in a window about it, as mask of all of the picture, and cut out in full size: it stays where it is."""
+    random = np.random.default_rng(seed)
+    size = 1603, 1201  # no multiples of the scales
+    lens = Lens("PINHOLE", size, (1700.0, 1760.0, 770.0, 640.0))
+    center, radius = random.uniform(300, 900, 2), random.uniform(150, 250)
+    away = np.linalg.norm(np.stack(np.meshgrid(np.arange(1603) + 0.5, np.arange(1201) + 0.5), -1) - center, axis=-1)
+    whole = cv2.resize((away < radius).astype(np.uint8)[:1200, :1600], (160, 120), interpolation=cv2.INTER_NEAREST)
+    window = around(lens, whole, 100)
+    scale = window.scale
+    assert scale in (3, 4, 5) and window.width * scale < 4 * radius
+    row = window.top + scale * (np.arange(window.height) + 0.5)
+    column = window.left + scale * (np.arange(window.width) + 0.5)
+    inside = np.hypot(column - center[0], row[:, None] - center[1]) < radius
+    back = pasted(inside * np.uint8(OBJECT), lens, window)
+    assert back.shape == (1201 // scale, 1603 // scale)
+    cut = cut_mask(back, size, (100, 40, 1400, 1150)) > 127
+    rows, columns = np.nonzero(cut)
+    np.testing.assert_allclose([columns.mean() + 100.5, rows.mean() + 40.5], center, atol=0.4)
+    assert cut.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
+    extent = Shot(None, lens, np.eye(4), back, None).extent()
+    np.testing.assert_allclose(extent, [center - radius, center + radius], atol=scale)
 
 
 def test_the_plane_under_an_object():
@@ -248,6 +279,53 @@ def test_the_plane_under_an_object():
     axes = plane.axes()
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
+
+
+def camera_and_image(number, pose, focal):
+    colmap = pytest.importorskip("pycolmap")
+    camera = colmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=[focal, 80, 60, 0.0], camera_id=number)
+    there = np.linalg.inv(pose)
+    rigid = colmap.Rigid3d(colmap.Rotation3d(there[:3, :3]), there[:3, 3])
+    return camera, SimpleNamespace(camera_id=number, cam_from_world=lambda: rigid)
+
+
+def test_how_far_matches_are_from_what_two_cameras_say():
+    """Nothing where they are projections of points; sideways by d from the line of the other: d, as is told of both."""
+    (first, one), (second, two) = (camera_and_image(k, pose, 170.0) for k, pose in enumerate(list(poses(7))[:2]))
+    model = SimpleNamespace(cameras={0: first, 1: second})
+    points = CENTER + np.random.default_rng(1).normal(0, 2, (30, 3))
+    seen = []
+    for camera, image in ((first, one), (second, two)):
+        local = points @ image.cam_from_world().matrix()[:, :3].T + image.cam_from_world().matrix()[:, 3]
+        seen.append(camera.img_from_cam(local))
+    np.testing.assert_allclose(motion.epipolar(model, one, two, *seen), 0, atol=1e-9)
+    centre = one.cam_from_world().inverse().matrix()[:, 3]
+    local = two.cam_from_world().matrix()[:, :3] @ centre + two.cam_from_world().matrix()[:, 3]
+    toward = seen[1] - (170 * local[:2] / local[2] + [80, 60])  # lines of the second picture meet in the first's camera
+    aside = toward[:, ::-1] * [1, -1] / np.linalg.norm(toward, axis=1, keepdims=True)
+    off = motion.epipolar(model, one, two, seen[0], seen[1] + 1e-3 * aside)
+    # Sampson's distance shares the error out among both pictures, whose lines are about equally steep.
+    np.testing.assert_allclose(off, 1e-3 / np.sqrt(2), rtol=0.35)
+
+
+def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_is_taken(tmp_path, monkeypatch):
+    def model(name, points):
+        images = {k: SimpleNamespace(num_points3D=n, frame_id=k) for k, n in enumerate(points)}
+        removed = []
+        return SimpleNamespace(name=name, images=images, removed=removed, reg_image_ids=lambda: list(images),
+                               deregister_frame=removed.append)  # fmt: skip
+
+    together, after = model("together", [90, 80, 12]), model("after", [90, 80, 70])
+    monkeypatch.setattr(motion, "map_globally", lambda *_: together)
+    monkeypatch.setattr(motion, "map_incrementally", lambda *_: after)
+    for counts, best, removed in (((50, 40), together, [2]), ((40, 50), after, [])):
+        found = dict(zip(("together", "after"), counts))
+        monkeypatch.setattr(motion, "explained", lambda model, _, found=found: found[model.name])
+        assert motion.put_together(tmp_path, 3, None) is best
+        assert best.removed == removed
+    monkeypatch.setattr(motion, "map_globally", lambda *_: None)
+    monkeypatch.setattr(motion, "map_incrementally", lambda *_: None)
+    assert motion.put_together(tmp_path, 3, None) is None
 
 
 def test_pairs_of_few_photographs_are_all_and_of_many_are_near_ones_and_some():

@@ -1,6 +1,7 @@
 """The command that makes a capture of a folder of photographs, and the stages of its way."""
 
 import json
+import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -65,6 +66,15 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     before = {file: file.stat().st_mtime_ns for file in (out / "work/masks").iterdir()}
     assert photos.main([str(folder), str(out)]) == 0  # from what is in work/
     assert before == {file: file.stat().st_mtime_ns for file in (out / "work/masks").iterdir()}
+    (out / "scene.xml").unlink()
+    with pytest.raises(InputError, match="work/masks: has masks that were found with other --masks; remove it"):
+        photos.main([str(folder), str(out), "--masks", "alpha"])
+    for name in ("images", "masks", "valid"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / "work/masks/03.png").unlink()  # of no use
+    photos.main([str(folder), str(out)])
+    assert "Masks: of 19 of 20 photographs" in capsys.readouterr().out
+    assert len(load_capture(out / "scene.xml")) == 19
     (folder / "07.png").unlink()
     (out / "scene.xml").unlink()
     with pytest.raises(InputError, match="work: is of other photographs"):
@@ -93,6 +103,8 @@ def test_masks_that_the_user_brings(folder, tmp_path):
     (["{folder}", "out", "--square-mm", "0"], "--square-mm: is 0"),
     (["{folder}", "out", "--turntable"], "--turntable: the sheet"),
     (["{folder}", "out", "--box", "0", "1", "0", "1", "0", "1"], "--box: is in the frame of the sheet"),
+    (["{folder}", "out", "--box", "0", "1", "1", "0", "0", "1"], "--box: is 0.0 1.0 1.0 0.0 0.0 1.0, must be lowest"),
+    (["{folder}", "out", "--masks", "typo"], "--masks: typo: no such folder; give auto"),
 ])  # fmt: skip
 def test_mistakes_of_the_user(arguments, words, folder, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

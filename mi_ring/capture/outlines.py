@@ -3,8 +3,6 @@
 import cv2
 import numpy as np
 
-BAND = 0.04  #: of the object's size: GrabCut decides so far inside a coverage's outline, and somewhat further outside
-
 
 def disk(radius: float) -> np.ndarray:
     """A structuring element."""
@@ -12,22 +10,23 @@ def disk(radius: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
-def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
+def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
     """(H, W) uint8, 1 the object, in a photograph (H, W, 3) uint8 sRGB, near its `coverage` (H, W) uint8, 0 or 1.
 
-    `background` (H, W) bool: what surely is not the object.
+    `background` (H, W) bool: what surely is not the object. `band`: how far inside the coverage's outline, and half as
+    far again outside, is open, in units of the object's size.
     """
     size = np.sqrt(max(1, int(coverage.sum())))
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[cv2.dilate(coverage, disk(1.5 * BAND * size)) > 0] = cv2.GC_PR_BGD
+    seed[cv2.dilate(coverage, disk(1.5 * band * size)) > 0] = cv2.GC_PR_BGD
     seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[cv2.erode(coverage, disk(BAND * size)) > 0] = cv2.GC_FGD
+    seed[cv2.erode(coverage, disk(band * size)) > 0] = cv2.GC_FGD
     seed[background] = cv2.GC_BGD
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
         return coverage & ~background
     cv2.setRNGSeed(0)  # of this thread
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), seed, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), seed, (0, 0, 0, 0), *models, 3, cv2.GC_INIT_WITH_MASK)
     return ((seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)).astype(np.uint8)
 
 

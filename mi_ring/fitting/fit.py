@@ -210,7 +210,7 @@ class Fit:
 
     def take_outlines(self, outlines: dict[int, Tensor]) -> None:
         """Go on with these masks, where there are any, instead of those of the capture."""
-        self.outlines = outlines
+        self.outlines = self.outlines | outlines
         self.capture = with_outlines(self.capture, outlines)
 
     def follow_power(self) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 REDRAWN = 0.5, 0.75  #: progress of the fit at which masks are found anew
 LONGEST = 512  #: pixels at most along the pictures in which they are found
+BAND = 0.04  #: of the object's size, by which the surface may be off
 SURE = 0.8  #: overlap with what the surface covers, below which a mask is not believed
 BRIGHTNESS = 0.25  #: of the object in these pictures, linear
 
@@ -48,7 +49,7 @@ def find_outlines(fit: "Fit") -> dict[int, Tensor]:
         return picture, (coverage[0].numpy() > 0.5).astype(np.uint8), background
 
     def outlined(given: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray | None:
-        mask = grabcut(*given)
+        mask = grabcut(*given, BAND)
         return mask if overlap(mask, given[1]) >= SURE else None
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # what draws does so on this thread
@@ -66,6 +67,8 @@ def with_outlines(capture: Capture, outlines: Mapping[int, Tensor]) -> Capture:
     """The capture with these masks instead of its own, as `find_outlines` gives them."""
     masks = list(capture.masks)
     for k, outline in outlines.items():
-        size = capture.sensors[k].size
-        masks[k] = cv2.resize(255 * outline.numpy(), size, interpolation=cv2.INTER_LINEAR)
+        (width, height), (rows, columns) = capture.sensors[k].size, outline.shape
+        scale = width // columns  # what is over is less than a pixel of the outline's
+        whole = cv2.resize(255 * outline.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
+        masks[k] = np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
     return replace(capture, masks=masks)

@@ -58,7 +58,7 @@ class Writer:
         for file in self.files:
             place = self.folder / file
             if place.exists() and not filecmp.cmp(self.staging / file, place, shallow=False):
-                raise InputError(f"{self.folder / file}: exists already; give SCENE.xml another name or folder")
+                raise InputError(f"{self.folder / file}: exists already and is another; remove it, or write elsewhere")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)

@@ -157,9 +157,9 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         ("clipped", CLIPPED, "of the object is over-exposed; expose less"),
         ("dark", DARK, "of the object is black: under-exposed, or unlit"),
     ):
-        shares = [value for row in rows if (value := getattr(row, name)) is not None]
-        if shares and np.median(shares) > limit:
-            found.append(f"{np.median(shares):.0%} {text}")
+        share = np.median([getattr(row, name) for row in rows])
+        if share > limit:
+            found.append(f"{share:.0%} {text}")
     if all(mask is None for mask in capture.masks) and dark_threshold(capture) is None:
         found.append("no masks, and the background is not dark, for which a fit would take it: give masks, or have "
                      "them found by mi-ring photos")  # fmt: skip

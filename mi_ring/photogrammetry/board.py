@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.cameras import Lens, inverse
 
 COLUMNS, ROWS = 9, 13  #: squares, of which each white one has a marker of MARKER times its size in its middle
 SQUARE, MARKER = 20, 0.75  #: [mm] as it is printed
@@ -150,19 +150,12 @@ def calibrate(
         fits = errors <= max(1.0, 3 * float(np.median(errors)))
         if fits.all():
             lens = Lens("SIMPLE_RADIAL", size, (K[0, 0], size[0] / 2, size[1] / 2, distortion.ravel()[0]))
-            poses = {name: inverse(cv2.Rodrigues(turn)[0], shift) for name, turn, shift in zip(names, turns, shifts)}
+            moved = zip(names, turns, shifts)
+            poses = {name: inverse(cv2.Rodrigues(turn)[0], shift.ravel()) for name, turn, shift in moved}
             return lens, poses, dict(zip(names, errors.tolist()))
         names = [name for name, fit in zip(names, fits) if fit]
     raise InputError(f"sheet of markers: {len(names)} photographs show enough of it and fit each other; must be 3 or "
                      "more: photograph it, flat, from all around")  # fmt: skip
-
-
-def inverse(rotation: np.ndarray, shift: np.ndarray) -> Pose:
-    """Camera-to-world of a world-to-camera rotation (3, 3) and shift (3,)."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ shift.ravel()
-    return pose
 
 
 def align(sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, Pose]]) -> Similarity:

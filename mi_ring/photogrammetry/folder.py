@@ -4,8 +4,9 @@ import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -66,6 +67,15 @@ class Picture:
         value = exif_of(self.path).get(ExifTags.Base.Orientation)
         return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
+    @cached_property
+    def held(self) -> int:
+        """By EXIF's numbers, how the camera was held, whoever turns the pixels."""
+        if self.upright and self.path.suffix.lower() in HEIF:
+            need("pillow_heif", f"{self.path}").register_heif_opener()
+            with Image.open(self.path) as image:
+                return image.info.get("original_orientation") or 1
+        return self.orientation
+
     @property
     def encoding(self) -> str:
         """`linear` or `srgb`: what the numbers mean."""
@@ -74,12 +84,10 @@ class Picture:
     @cached_property
     def size(self) -> tuple[int, int]:
         """(width, height) [px]"""
-        if self.path.suffix.lower() in RAW:
-            height, width = self.pixels.shape[:2]
-            return width, height
         if self.path.suffix.lower() in HEIF:
             need("pillow_heif", f"{self.path}").register_heif_opener()
-        width, height = image_size(self.path)
+        raw = self.path.suffix.lower() in RAW
+        width, height = read_as(self.path, "raw photograph", developed_size) if raw else image_size(self.path)
         return (height, width) if self.orientation > 4 else (width, height)
 
     def grey(self, longest: int) -> np.ndarray:
@@ -119,7 +127,8 @@ class Picture:
             alpha = self.pixels[:, :, 3] if self.pixels.shape[2] == 4 else None
             return None if alpha is None else (alpha // (np.iinfo(alpha.dtype).max // 255)).astype(np.uint8)
         if source == "rembg":
-            return np.array(need("rembg", "--masks rembg").remove(Image.fromarray(self.srgb()), only_mask=True))
+            rembg = need("rembg", "--masks rembg")
+            return np.array(rembg.remove(Image.fromarray(self.srgb()), session=rembg_session(), only_mask=True))
         names = (f"{self.path.name}.png", f"{self.name}.png")
         file = next((f for name in names if (f := Path(source) / name).is_file()), None)
         if file is None:
@@ -135,11 +144,23 @@ class Picture:
         self.__dict__.pop("pixels", None)
 
 
+@cache
+def rembg_session() -> Any:
+    """Its network, loaded once."""
+    return need("rembg", "--masks rembg").new_session()
+
+
 def develop(path: Path) -> np.ndarray:
     """A raw photograph (H, W, 3) uint16, linear radiance in sRGB's primaries, white balance as the camera chose it."""
     rawpy = need("rawpy", f"{path}")
     with rawpy.imread(str(path)) as raw:
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
+
+
+def developed_size(path: Path) -> tuple[int, int]:
+    """(width, height) of what `develop` makes of a raw photograph."""
+    with need("rawpy", f"{path}").imread(str(path)) as raw:
+        return raw.sizes.iwidth, raw.sizes.iheight
 
 
 def flip(path: Path) -> int:
@@ -168,8 +189,8 @@ def axes_of(orientation: int) -> np.ndarray:
 
 def turned_with(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
     """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name."""
-    usual, _ = Counter(picture.orientation for picture in pictures).most_common(1)[0]
-    return {p.name: axes_of(p.orientation) @ axes_of(usual).T @ vector for p in pictures}
+    usual, _ = Counter(picture.held for picture in pictures).most_common(1)[0]
+    return {p.name: axes_of(p.held) @ axes_of(usual).T @ vector for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
@@ -191,6 +212,8 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
     if len(found) < FEWEST:
         raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({', '.join(PLAIN + HEIF)} or raw); at least "
                          f"{FEWEST} are needed, better 40, from all around")  # fmt: skip
+    if "object" in found:
+        raise InputError(f'{found["object"]}: FOLDER: "object" is what the scene calls the surface; rename the file')
     require_different(list(found.values()))
     return [Picture(path, upright) for path in found.values()]
 

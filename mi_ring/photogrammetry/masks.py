@@ -1,13 +1,16 @@
 """Masks that nobody has to draw: a first guess, then GrabCut in each photograph and votes of all in space, in turn.
 
 Votes keep what most photographs that show a place call object, so that lamps, highlights and the neighbours of one
-photograph drop out, and GrabCut finds the outline that the coarse votes leave open.
+photograph drop out, and GrabCut finds the outline that the coarse votes leave open. What fills a hollow in some
+photographs, a shadow for one, drops out where a few others see through it.
 """
 
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,8 +26,23 @@ SHOWN = 0.25  #: share of the photographs that must show a place, else it is not
 AGREE = 0.9  #: share of those that must call it object
 RESOLUTION = 96  #: voxels along an edge of the space that is looked at
 FEWEST = 30  #: voxels of an object: a few agree anywhere, and then agree perfectly
-ROUNDS, SETTLED = 6, 0.995  #: at most; or when so much of the masks' union is the same as before
+SETTLED = 0.995  #: share of the masks' union that is the same as before
+MISSES, SOME = 2.0, 0.01  #: a mask that misses so many times the usual and some is wrong, of what all say together
 DARKEST = 1e-3  #: radiance below which nothing is told
+
+
+class Care(NamedTuple):
+    """How masks are settled."""
+
+    agree: float  #: share of the masks that must call a place object
+    band: float  #: of the object's size, by which their common outline may be off
+    rounds: int  #: at most
+    strict: bool = True  #: does a mask that misses much more than the others have no vote?
+
+
+WHEREABOUTS = Care(AGREE, 0.04, 6, False)
+HOLLOWS = Care(0.96, 0.15, 6)  #: shadows fill them, until a few photographs see through
+OUTLINES = Care(0.96, 0.04, 2)
 
 
 @dataclass
@@ -47,6 +65,10 @@ class Body:
         mask = np.zeros(view.shown.shape, np.uint8)
         mask[pixel[inside, 1], pixel[inside, 0]] = 1
         return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.pixels(view) + 1))
+
+    def reach(self, view: View) -> np.ndarray:
+        """(H, W) uint8: where the object may be by what the other views say, which is coarse by a voxel."""
+        return cv2.dilate(self.coverage(view), disk(self.pixels(view)))
 
     def pixels(self, view: View) -> float:
         """How wide a voxel is in a view."""
@@ -84,14 +106,18 @@ class Space:
         low, high = body.points.min(0), body.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + body.spacing)
 
-    def vote(self, masks: Sequence[np.ndarray]) -> Body | None:
-        """The largest piece of what most masks (H, W) call object; None if it is next to nothing."""
+    def vote(self, masks: Sequence[np.ndarray], agree: float, voters: Sequence[bool] | None = None) -> Body | None:
+        """The largest piece of what this share of the masks (H, W) calls object; None if it is next to nothing.
+
+        `voters`: whose masks count; by default all.
+        """
         yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
-        for view, mask in zip(self.views, masks):
-            pixel, inside = view.places(self.grid)
-            shown += inside
-            yes += inside & (mask[pixel[:, 1], pixel[:, 0]] > 0)
-        object_ = (yes >= AGREE * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
+        for number, (view, mask) in enumerate(zip(self.views, masks)):
+            if voters is None or voters[number]:
+                pixel, inside = view.places(self.grid)
+                shown += inside
+                yes += inside & (mask[pixel[:, 1], pixel[:, 0]] > 0)
+        object_ = (yes >= agree * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
         pieces, _ = ndimage.label(object_.reshape([len(self.axis)] * 3))
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
@@ -111,9 +137,17 @@ def bright(view: View) -> np.ndarray:
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def outlined(view: View, coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
+def outlined(view: View, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
     """(H, W) uint8: the object near its coverage (H, W). `background` (H, W) surely is not the object."""
-    return grabcut(view.rgb, coverage, ~view.shown | (background > 0))
+    return grabcut(view.rgb, coverage, ~view.shown | (background > 0), band)
+
+
+def reliable(views: Sequence[View], masks: Sequence[np.ndarray], covered: Sequence[np.ndarray]) -> list[bool]:
+    """Which masks do not miss far more than others of what all say together (H, W each): what a lamp has swallowed."""
+    missed = [
+        (cover > mask)[view.shown].sum() / max(1, cover.sum()) for view, mask, cover in zip(views, masks, covered)
+    ]
+    return [share <= MISSES * np.median(missed) + SOME for share in missed]
 
 
 @dataclass(frozen=True)
@@ -131,23 +165,25 @@ class Found:
 
 
 def settle(
-    space: Space, guesses: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], progress: Progress
-) -> Found | None:
+    space: Space, guesses: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], progress: Progress,
+    care: Care = WHEREABOUTS,
+) -> Found | None:  # fmt: skip
     """Masks from a first guess of each (H, W): votes and GrabCut in turn until nothing changes.
 
     `backgrounds` (H, W): what surely is not the object. None if the guesses have nothing in common.
     """
-    body, masks = space.vote(guesses), list(guesses)
+    body, masks = space.vote(guesses, AGREE), list(guesses)
     if body is None:
         return None
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for number in range(ROUNDS):
+        for number in range(care.rounds):
             before, covered = masks, [body.coverage(view) for view in space.views]
-            found = pool.map(outlined, space.views, covered, backgrounds)
+            found = pool.map(partial(outlined, band=care.band), space.views, covered, backgrounds)
             masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
-            body = space.vote(masks)
+            body = space.vote(masks, care.agree, reliable(space.views, masks, covered) if care.strict else None)
             if body is None:
                 return None
+            masks = [mask & body.reach(view) for mask, view in zip(masks, space.views)]
             if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
                 break
     return Found(masks, body, [overlap(m, body.coverage(view)) for m, view in zip(masks, space.views)])

@@ -1,11 +1,13 @@
 """Structure from motion: cameras and points from photographs alone, by COLMAP's library."""
 
+import hashlib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
@@ -24,6 +26,8 @@ PAIRS_AT_ONCE = 60
 ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
 TEXTURED, MATCHED = 300, 50  #: features of a photograph, and matches of two, from which they are worth something
 STILL, MOST = 0.01, 0.9  #: two photographs are alike if features move so little, in widths; and pairs that must not be
+EPIPOLAR = 2.5e-3  #: of a picture's width, by which a match may be off from what two cameras say
+FEWEST_POINTS = 30  #: that a photograph must show of those in space
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
@@ -35,6 +39,11 @@ class Motion:
     points: np.ndarray  #: (N, 3)
     error: float | None  #: mean reprojection error [px of the photographs], if it is known
     failed: dict[str, str]  #: photographs without a camera, and why
+
+    def digest(self) -> str:
+        """What tells these cameras from others."""
+        poses = b"".join(name.encode() + pose.round(6).tobytes() for name, (_, pose) in sorted(self.cameras.items()))
+        return hashlib.blake2b(poses, digest_size=8).hexdigest()
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Motion":
         """In another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
@@ -72,7 +81,7 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
     (folder / "grey").mkdir(parents=True, exist_ok=True)
     find_features(pictures, folder, progress)
     match_features(pictures, folder, progress)
-    model = map_incrementally(folder, len(pictures), progress)
+    model = put_together(folder, len(pictures), progress)
     found = model.num_reg_images() if model else 0
     if found < max(3, len(pictures) / 2):
         raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put "
@@ -96,7 +105,7 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
     lenses: dict[tuple[int, int], int] = {}
     equivalent = focal_35mm(pictures)
     for picture in progress(pictures, "features"):
-        file = f"{picture.name}.png"
+        file = file_of(picture)
         if file not in cameras:
             reduced = Image.fromarray(picture.grey(LONGEST))
             picture.close()
@@ -111,6 +120,11 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
             interruptible(pycolmap.extract_features, database, grey, [file], mode, reader, options)
             cameras = {image.name: image.camera_id for image in images_of(database)}
         lenses.setdefault(picture.size, cameras[file])
+
+
+def file_of(picture: Picture) -> str:
+    """The reduced picture's file name, without spaces, at which COLMAP's lists of pairs end a name."""
+    return f"{quote(picture.name, safe='')}.png"
 
 
 def images_of(database: Path) -> list[Any]:
@@ -142,36 +156,73 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
     batches = [pairs[k : k + PAIRS_AT_ONCE] for k in range(0, len(pairs), PAIRS_AT_ONCE)]
     chosen = folder / "pairs.txt"
     for batch in progress(batches, "matching"):
-        chosen.write_text("".join(f"{pictures[a].name}.png {pictures[b].name}.png\n" for a, b in batch), "utf-8")
+        named = [(file_of(pictures[a]), file_of(pictures[b])) for a, b in batch]
+        chosen.write_text("".join(f"{a} {b}\n" for a, b in named), "utf-8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
         interruptible(pycolmap.match_image_pairs, folder / "database.db", matching, pairing)
-        if batch is batches[0] and (share := alike(folder / "database.db", len(batch))) >= MOST:
+        if batch is batches[0] and (share := alike(folder / "database.db", named)) >= MOST:
             raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {len(batch)} pairs are "
                              "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
 
 
-def alike(database: Path, pairs: int) -> float:
-    """The share of so many pairs that match and where features move together, as from one place."""
+def alike(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
+    """The share of these pairs of files that match and where features move together, as from one place."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
-        images = {image.image_id: width[image.camera_id] for image in opened.read_all_images()}
+        read = opened.read_all_images()
+        images = {image.image_id: width[image.camera_id] for image in read}
+        names = {image.image_id: image.name for image in read}
         places = {k: opened.read_keypoints(k)[:, :2] for k in images}
         still = 0
         for number, geometry in zip(*opened.read_two_view_geometries()):
             a, b = pycolmap.pair_id_to_image_pair(number)
             first, second = geometry.inlier_matches.T
-            if len(first) >= MATCHED:
+            asked = (names[a], names[b]) in pairs or (names[b], names[a]) in pairs
+            if asked and len(first) >= MATCHED:
                 moved = places[a][first] - places[b][second]
                 away = np.linalg.norm(moved - np.median(moved, 0), axis=1)  # nobody holds a camera quite still
                 still += float(np.median(away)) < STILL * images[a]
-    return still / pairs
+    return still / len(pairs)
+
+
+def put_together(folder: Path, count: int, progress: Progress) -> Any:
+    """The `pycolmap.Reconstruction` that explains most of the matches; None if there is none.
+
+    All cameras together ("Global Structure-from-Motion Revisited", Pan et al. 2024), and one after another. The former
+    heeds all matches from the start, where the latter puts photographs from another side in by the first few points
+    that fit; these may be nearly in one plane, and what is mirrored then stays so. The latter is better at
+    photographs whose matches are mostly wrong, by a pattern that repeats or shadows that move.
+    """
+    models = [mapping(folder, count, progress) for mapping in (map_globally, map_incrementally)]
+    best: Any = max(filter(None, models), key=lambda model: explained(model, folder / "database.db"), default=None)
+    for k in list(best.reg_image_ids()) if best else []:
+        if best.images[k].num_points3D < FEWEST_POINTS:
+            best.deregister_frame(best.images[k].frame_id)
+    return best
+
+
+def map_globally(folder: Path, count: int, progress: Progress) -> Any:
+    """The largest `pycolmap.Reconstruction` by rotations and places of all cameras together; None if there is none."""
+    pycolmap = need("pycolmap", "structure from motion")
+    options = pycolmap.GlobalPipelineOptions(random_seed=0)
+    mapper = options.mapper
+    for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        part.random_seed = 0
+    (folder / "models").mkdir(exist_ok=True)
+    models: dict = {}
+    for _ in progress(range(1), "all cameras"):
+        models = interruptible(
+            pycolmap.global_mapping, folder / "database.db", folder / "grey", folder / "models", options
+        )
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
 def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
-    """The largest `pycolmap.Reconstruction` that the matches give; None if there is none."""
+    """The largest `pycolmap.Reconstruction`, one photograph after another; None if there is none."""
     pycolmap = need("pycolmap", "structure from motion")
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
+    options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
     for _ in range(2):  # the pair that it begins with
         next(bar, None)
@@ -183,6 +234,34 @@ def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
     for _ in bar:
         pass
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def explained(model: Any, database: Path) -> int:
+    """How many matches of two photographs are where the cameras of a model say that they are."""
+    pycolmap = need("pycolmap", "structure from motion")
+    placed = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
+    count = 0
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: placed[image.name] for image in opened.read_all_images() if image.name in placed}
+        places = {k: opened.read_keypoints(k)[:, :2] for k in images}
+        for number, geometry in zip(*opened.read_two_view_geometries()):
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            if a in images and b in images and len(geometry.inlier_matches):
+                first, second = geometry.inlier_matches.T
+                off = epipolar(model, images[a], images[b], places[a][first], places[b][second])
+                count += int((off < EPIPOLAR * model.cameras[images[a].camera_id].width).sum())
+    return count
+
+
+def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(n,) how far matches of two images, (n, 2) [px] each, are from what their places say: Sampson's distance [px]."""
+    lens = model.cameras[a.camera_id], model.cameras[b.camera_id]
+    x, y = (np.c_[camera.cam_from_img(place), np.ones(len(place))] for camera, place in zip(lens, (first, second)))
+    relative = (b.cam_from_world() * a.cam_from_world().inverse()).matrix()
+    essential = np.cross(relative[:, 3], relative[:, :3], axisb=0).T
+    lines, back = x @ essential.T, y @ essential
+    slope = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+    return np.abs((y * lines).sum(1)) / np.maximum(slope, 1e-12) * lens[0].mean_focal_length()
 
 
 def adjustments(model: Any) -> Iterator[None]:
@@ -212,13 +291,11 @@ def adjustments(model: Any) -> Iterator[None]:
 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
     """In terms of the photographs as they were taken."""
-    by_file = {f"{picture.name}.png": picture for picture in pictures}
+    by_file = {file_of(picture): picture for picture in pictures}
     cameras, scales = {}, []
     for k in model.reg_image_ids():
         image = model.images[k]
-        picture = by_file.get(image.name)
-        if picture is None:  # of a photograph that is not there any more
-            continue
+        picture = by_file[image.name]
         own = model.cameras[image.camera_id]
         scale = max(picture.size) // max(own.width, own.height)
         (f, cx, cy, radial), pose = own.params, np.eye(4)
@@ -245,7 +322,7 @@ def reason_of(picture: Picture, folder: Path) -> str:
     """Why a photograph has got no camera."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(folder / "database.db") as opened:
-        image = opened.read_image_with_name(f"{picture.name}.png")
+        image = opened.read_image_with_name(file_of(picture))
         features = opened.num_keypoints_for_image(image.image_id)
     if features < TEXTURED:
         return f"{features} features only: out of focus, blurred or too dark"

@@ -35,7 +35,7 @@ class Shot:
             return None
         rows, columns = np.nonzero(self.mask == OBJECT)
         corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
-        return corners * (np.array(self.lens.size) / self.mask.shape[::-1])
+        return corners * reduction(self.mask, self.lens.size)
 
 
 def windows(shots: Sequence[Shot]) -> list[Window]:
@@ -82,12 +82,17 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
     return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid)
 
 
+def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
+    """How many pixels of a photograph of this size (width, height) one of its mask is, across; some may be over."""
+    return round(size[0] / mask.shape[1])
+
+
 def cut_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
     """The part of a mask of a photograph of this size (width, height), enlarged: (H, W) float, 0 to 255."""
     left, top, width, height = window[:4]
-    scale = np.array(mask.shape[::-1]) / size
-    x = ((left + np.arange(width) + 0.5) * scale[0] - 0.5).astype(np.float32)
-    y = ((top + np.arange(height) + 0.5) * scale[1] - 0.5).astype(np.float32)
+    scale = reduction(mask, size)
+    x = ((left + np.arange(width) + 0.5) / scale - 0.5).astype(np.float32)
+    y = ((top + np.arange(height) + 0.5) / scale - 0.5).astype(np.float32)
     columns, rows = (np.ascontiguousarray(grid) for grid in np.broadcast_arrays(x, y[:, None]))
     object_, unsure = (
         cv2.remap((mask == value).astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

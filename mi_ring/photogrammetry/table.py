@@ -128,7 +128,8 @@ class Table:
         result = []
         for view, own in zip(self.progress(self.views, "beside the table"), self.stack):
             rest = np.abs(own - self.colours).max(1)
-            other = rest > max(LEAST, SIGNIFICANT * float(np.nanmedian(rest)))
+            usual = float(np.nanmedian(rest)) if np.isfinite(rest).any() else 0.0  # it shows nothing of the table
+            other = rest > max(LEAST, SIGNIFICANT * usual)
             mask = cv2.medianBlur(self.ground.seen_by(view, other).astype(np.uint8), 5)
             result.append(ndimage.binary_fill_holes(mask).astype(np.uint8))
         return result
@@ -157,6 +158,8 @@ def lighting(difference: np.ndarray, smooth: np.ndarray) -> np.ndarray:
     """Coefficients of `smooth` (N, 6), that a photograph's difference from the table (N, 3) is; few may be wrong."""
     mean = difference.mean(1)
     known = np.isfinite(mean)
+    if not known.any():
+        return np.zeros(smooth.shape[1])
     for _ in range(2):
         light = np.linalg.lstsq(smooth[known], mean[known], rcond=None)[0]
         rest = mean - smooth @ light

@@ -19,7 +19,7 @@ from mi_ring.rendering.lights import Light
 ITERATIONS = 100
 FEWEST = 30  #: points that tell where the object is
 INNER, OUTER = 0.15, 0.8  #: least and largest radius of the sphere, in the reach of what is looked at
-DIM = 3.0  #: mean albedo by lights of unknown intensity, see `mi_ring.photogrammetry.workflow`
+DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
 SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128,), shares=(1,), subdivisions=4,
                          masks="given", domain="sphere", weights={"mask": 0.0})  # fmt: skip
 

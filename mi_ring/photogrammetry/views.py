@@ -67,11 +67,11 @@ def around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
     """What a mask (h, w) of the whole picture covers, in about so many pixels, with room around it."""
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)
-    unit = size / mask.shape[::-1]
+    unit = np.round(size / mask.shape[::-1])
     low, high = (np.array([end(columns), end(rows)]) * unit for end in (np.min, np.max))
     extent = float((high - low).max() + unit.max())
     scale = max(1, round(extent / pixels))
-    low = np.clip(low - ROOM * extent, 0, size - 1).astype(int)
+    low = np.clip(low - ROOM * extent, 0, size - 1).astype(int) // scale * scale  # a whole pixel of all, reduced
     high = np.clip(high + ROOM * extent, low + scale, size).astype(int)
     (left, top), (width, height) = low.tolist(), ((high - low) // scale).tolist()
     return Window(left, top, width, height, scale)

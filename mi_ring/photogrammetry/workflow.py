@@ -13,24 +13,24 @@ from mi_ring.errors import InputError
 from mi_ring.images import read_image, write_image
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
+from mi_ring.importers.reading import read_as
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
 from mi_ring.photogrammetry.table import FLAT, Plane, Table, find_plane
-from mi_ring.photogrammetry.trial import coverages, sphere_of
-from mi_ring.photogrammetry.views import around, pasted, reduced, reduced_mask, whole_of
+from mi_ring.photogrammetry.trial import DIM, coverages, sphere_of
+from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
-CLOSE = 400  #: along the object, in the pictures that its outlines are found in
+SMALL, CLOSE = 200, 400  #: along the object, in the pictures that its hollows are found in, and its outlines
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
 PAPER = 0.8  #: albedo of white paper
-DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -182,11 +182,14 @@ class Hints(NamedTuple):
     box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
     masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
 
-    def allow(self, points: np.ndarray, distance: float) -> np.ndarray:
-        """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras."""
+    def allow(self, points: np.ndarray, distance: float, flat: float = 2 * FLAT) -> np.ndarray:
+        """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras.
+
+        `flat`: in units of it, height up to which it may be the table.
+        """
         allowed = np.ones(len(points), bool)
         if self.plane:
-            allowed &= self.plane.height(points) > 2 * FLAT * distance
+            allowed &= self.plane.height(points) > flat * distance
         if self.box:
             low, high = np.reshape(self.box, (3, 2)).T
             allowed &= ((points >= low) & (points <= high)).all(1)
@@ -196,13 +199,20 @@ class Hints(NamedTuple):
 def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress) -> Object:
     """The object and its masks.
 
-    Masks that `folder` has already are taken as they are; anybody may have painted in them.
+    Masks that `folder` has already are taken as they are: anybody may have painted in them, or removed some. Raises
+    InputError if they were found with other cameras or hints.
     """
     folder.mkdir(exist_ok=True)
     kept = folder / "object.json"
+    asked = {"masks": str(hints.masks), "box": hints.box and list(hints.box), "cameras": motion.digest()}
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
-        masks_ = {name: read_image(folder / f"{name}.png")[..., 0] for name in known["sure"]}
+        if other := [name for name, value in asked.items() if known["asked"][name] != value]:
+            what = "cameras" if "cameras" in other else f"--{other[0]}"
+            raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
+                             "anew, or give another DIR")  # fmt: skip
+        files = {name: folder / f"{name}.png" for name in known["sure"]}
+        masks_ = {n: read_as(f, "mask", read_image)[..., 0] for n, f in files.items() if f.exists()}
         plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
         return Object(masks_, np.array(known["center"]), known["level"], plane)
     shown = [picture for picture in pictures if picture.name in motion.cameras]
@@ -226,7 +236,7 @@ def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folde
     levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
     result = Object(shades, body.points.mean(0), float(np.median(levels)), plane)
     write_file(kept, json.dumps({
-        "sure": list(shades), "center": result.center.tolist(), "level": result.level,
+        "asked": asked, "sure": list(shades), "center": result.center.tolist(), "level": result.level,
         "plane": plane and [plane.normal.tolist(), plane.offset],
     }))  # fmt: skip
     return result
@@ -247,7 +257,7 @@ def brought(
                          "called like the photographs, with .png added or instead of the suffix")  # fmt: skip
     space = masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
     space.allowed = hints.allow(space.grid, space.distance)
-    body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views])
+    body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views], masks.AGREE)
     if body is None:
         raise InputError(f"--masks: {source}: no point in space is inside most of these masks; are they of these "
                          "photographs?")  # fmt: skip
@@ -268,21 +278,20 @@ def searched(
     if body is None or len(showing) < len(pictures) / 2:
         raise InputError(f"{folder}: masks: no object was found, neither one that stands on a table nor one that the "
                          "flash lights more than what is around it; give --masks")  # fmt: skip
-    views, windows = [], {}
+    small, close, windows = [], [], {}
     for picture, cover in progress(showing, "reading"):
         lens, pose = motion.cameras[picture.name]
         windows[picture.name] = around(lens, cover, CLOSE)
-        views.append(reduced(picture, lens, pose, windows[picture.name]))
+        small.append(reduced(picture, lens, pose, around(lens, cover, SMALL)))
+        close.append(reduced(picture, lens, pose, windows[picture.name]))
         picture.close()
-    space = masks.Space.about(views, body)
-    space.allowed = hints.allow(space.grid, space.distance)
-    tables = Table(views, plane, space.center, space.reach, progress).patterns() if plane else masks.nothing(views)
-    found = masks.settle(space, [body.coverage(view) for view in views], tables, progress)
+    found = outlines(small, body, hints, masks.HOLLOWS, progress)
+    found = found and outlines(close, found.body, hints, masks.OUTLINES, progress)
     sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
     if found is None or sure < len(pictures) / 2:
         raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
     shades = {}
-    for view, mask, agreed in zip(views, found.masks, found.agreement):
+    for view, mask, agreed in zip(close, found.masks, found.agreement):
         if agreed >= SURE:
             if plane:  # beside the object there are shadows
                 maybe = masks.disputed(mask, found.body.coverage(view), found.body.pixels(view))
@@ -291,6 +300,18 @@ def searched(
             shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
             shades[view.name] = pasted(shade, motion.cameras[view.name][0], windows[view.name])
     return found.body, shades
+
+
+def outlines(
+    views: Sequence[View], body: masks.Body, hints: Hints, care: masks.Care, progress: Progress
+) -> masks.Found | None:
+    """Masks of views that are near to the object, from what is known of it by now."""
+    space = masks.Space.about(views, body)
+    space.allowed = hints.allow(space.grid, space.distance, FLAT / 2)
+    tables = masks.nothing(views)
+    if hints.plane:
+        tables = Table(views, hints.plane, space.center, space.reach, progress).patterns()
+    return masks.settle(space, [body.coverage(view) for view in views], tables, progress, care)
 
 
 def find_body(
