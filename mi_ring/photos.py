@@ -20,13 +20,11 @@ from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
 from mi_ring.photogrammetry.folder import find_pictures
 from mi_ring.photogrammetry.motion import Motion
+from mi_ring.photogrammetry.object import Hints, Object, find_object
 from mi_ring.photogrammetry.scene import windows, write_shot
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
-    Hints,
-    Object,
     find_cameras,
-    find_object,
     find_sheet,
     require_same_photographs,
     require_sides,

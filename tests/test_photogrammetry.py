@@ -17,9 +17,9 @@ from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import masks, motion, table, trial
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.motion import Motion, pairs_to_match
+from mi_ring.photogrammetry.object import Hints, find_body
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
-from mi_ring.photogrammetry.workflow import Hints, find_body
 from mi_ring.rendering.lights import Light
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid

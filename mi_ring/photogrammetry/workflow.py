@@ -1,8 +1,7 @@
 """The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
 
-import contextlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,24 +9,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.images import read_image, write_image
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
-from mi_ring.importers.reading import read_as
-from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
-from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot
-from mi_ring.photogrammetry.table import FLAT, Plane, Table, find_plane
-from mi_ring.photogrammetry.trial import DIM, coverages, sphere_of
-from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
+from mi_ring.photogrammetry.object import Object
+from mi_ring.photogrammetry.scene import Shot
+from mi_ring.photogrammetry.table import Plane
+from mi_ring.photogrammetry.trial import DIM
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 
-SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
-COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
-SMALL, CLOSE = 200, 400  #: along the object, in the pictures that its hollows are found in, and its outlines
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
 PAPER = 0.8  #: albedo of white paper
@@ -164,184 +157,6 @@ def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
     failed = {picture.name: why for picture in pictures if picture.name not in poses}
     cameras = {name: (lens, pose) for name, pose in poses.items()}
     return Motion(cameras, np.zeros((0, 3)), float(np.mean(list(errors.values()))), failed)
-
-
-class Object(NamedTuple):
-    """The object as the photographs show it."""
-
-    masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, but for those that are not sure
-    center: np.ndarray  #: (3,)
-    level: float  #: its mean radiance, 1 = full scale
-    plane: Plane | None  #: of the table that it stands on, if there is one
-
-
-class Hints(NamedTuple):
-    """What is known of the object beforehand."""
-
-    plane: Plane | None = None  #: of the table
-    box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
-    masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
-
-    def allow(self, points: np.ndarray, distance: float, flat: float = 2 * FLAT) -> np.ndarray:
-        """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras.
-
-        `flat`: in units of it, height up to which it may be the table.
-        """
-        allowed = np.ones(len(points), bool)
-        if self.plane:
-            allowed &= self.plane.height(points) > flat * distance
-        if self.box:
-            low, high = np.reshape(self.box, (3, 2)).T
-            allowed &= ((points >= low) & (points <= high)).all(1)
-        return allowed
-
-
-def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress) -> Object:
-    """The object and its masks.
-
-    Masks that `folder` has already are taken as they are: anybody may have painted in them, or removed some. Raises
-    InputError if they were found with other cameras or hints.
-    """
-    folder.mkdir(exist_ok=True)
-    kept = folder / "object.json"
-    asked = {"masks": str(hints.masks), "box": hints.box and list(hints.box), "cameras": motion.digest()}
-    if kept.exists():
-        known = json.loads(kept.read_text("utf-8"))
-        if other := [name for name, value in asked.items() if known["asked"][name] != value]:
-            what = "cameras" if "cameras" in other else f"--{other[0]}"
-            raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
-                             "anew, or give another DIR")  # fmt: skip
-        files = {name: folder / f"{name}.png" for name in known["sure"]}
-        masks_ = {n: read_as(f, "mask", read_image)[..., 0] for n, f in files.items() if f.exists()}
-        plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
-        return Object(masks_, np.array(known["center"]), known["level"], plane)
-    shown = [picture for picture in pictures if picture.name in motion.cameras]
-    views = []
-    for picture in progress(shown, "reading"):
-        lens, pose = motion.cameras[picture.name]
-        views.append(reduced(picture, lens, pose, whole_of(lens, COARSE)))
-        picture.close()
-    space = masks.Space.seen_by(views)
-    plane, sheet = hints.plane, hints.plane is not None
-    if not sheet:
-        positions = np.stack([view.camera.position for view in views])
-        plane = find_plane(motion.points, positions, space.center, space.reach)
-    if hints.masks == "auto":
-        body, shades = searched(shown, motion, space, hints._replace(plane=plane), sheet, progress)
-    else:
-        body, shades = brought(shown, motion, space, hints, progress)
-    for name, mask in shades.items():
-        write_image(mask[..., None], folder / f"{name}.png")
-    small = {view.name: masks.resized(shades[view.name] == OBJECT, view) for view in views if view.name in shades}
-    levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
-    result = Object(shades, body.points.mean(0), float(np.median(levels)), plane)
-    write_file(kept, json.dumps({
-        "asked": asked, "sure": list(shades), "center": result.center.tolist(), "level": result.level,
-        "plane": plane and [plane.normal.tolist(), plane.offset],
-    }))  # fmt: skip
-    return result
-
-
-def brought(
-    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, progress: Progress
-) -> tuple[masks.Body, dict[str, np.ndarray]]:
-    """What the user's masks say the object is, and these masks by name, as `Object` has them."""
-    source, shades = hints.masks, {}
-    for picture in progress(pictures, "masks"):
-        mask = picture.mask(source)
-        picture.close()
-        if mask is not None:
-            shades[picture.name] = OBJECT * reduced_mask(mask, motion.cameras[picture.name][0], BROUGHT)
-    if len(shades) < len(pictures) / 2:
-        raise InputError(f"--masks: {source}: has masks for {len(shades)} of {len(pictures)} photographs; they must be "
-                         "called like the photographs, with .png added or instead of the suffix")  # fmt: skip
-    space = masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
-    space.allowed = hints.allow(space.grid, space.distance)
-    body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views], masks.AGREE)
-    if body is None:
-        raise InputError(f"--masks: {source}: no point in space is inside most of these masks; are they of these "
-                         "photographs?")  # fmt: skip
-    return body, shades
-
-
-def searched(
-    pictures: Sequence[Picture], motion: Motion, space: masks.Space, hints: Hints, sheet: bool, progress: Progress
-) -> tuple[masks.Body, dict[str, np.ndarray]]:
-    """The object, and masks of all photographs but those that do not show it or are not sure.
-
-    First in whole photographs, reduced; then closer to what was found. `sheet`: is the plane that of the sheet?
-    """
-    folder, plane = pictures[0].path.parent, hints.plane
-    body = find_body(space, motion.points, hints, sheet, progress)
-    covered = [(p, body.coverage(view)) for p, view in zip(pictures, space.views)] if body else []
-    showing = [(picture, cover) for picture, cover in covered if cover.any()]
-    if body is None or len(showing) < len(pictures) / 2:
-        raise InputError(f"{folder}: masks: no object was found, neither one that stands on a table nor one that the "
-                         "flash lights more than what is around it; give --masks")  # fmt: skip
-    small, close, windows = [], [], {}
-    for picture, cover in progress(showing, "reading"):
-        lens, pose = motion.cameras[picture.name]
-        windows[picture.name] = around(lens, cover, CLOSE)
-        small.append(reduced(picture, lens, pose, around(lens, cover, SMALL)))
-        close.append(reduced(picture, lens, pose, windows[picture.name]))
-        picture.close()
-    found = outlines(small, body, hints, masks.HOLLOWS, progress)
-    found = found and outlines(close, found.body, hints, masks.OUTLINES, progress)
-    sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
-    if found is None or sure < len(pictures) / 2:
-        raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
-    shades = {}
-    for view, mask, agreed in zip(close, found.masks, found.agreement):
-        if agreed >= SURE:
-            if plane:  # beside the object there are shadows
-                maybe = masks.disputed(mask, found.body.coverage(view), found.body.pixels(view))
-            else:
-                maybe = masks.unsure(mask, masks.bright(view))
-            shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
-            shades[view.name] = pasted(shade, motion.cameras[view.name][0], windows[view.name])
-    return found.body, shades
-
-
-def outlines(
-    views: Sequence[View], body: masks.Body, hints: Hints, care: masks.Care, progress: Progress
-) -> masks.Found | None:
-    """Masks of views that are near to the object, from what is known of it by now."""
-    space = masks.Space.about(views, body)
-    space.allowed = hints.allow(space.grid, space.distance, FLAT / 2)
-    tables = masks.nothing(views)
-    if hints.plane:
-        tables = Table(views, hints.plane, space.center, space.reach, progress).patterns()
-    return masks.settle(space, [body.coverage(view) for view in views], tables, progress, care)
-
-
-def find_body(
-    space: masks.Space, points: np.ndarray, hints: Hints, sheet: bool, progress: Progress
-) -> masks.Body | None:
-    """The object by what differs from the table that it stands on; else by brightness; else by a trial fit.
-
-    Not by brightness on a `sheet`, which differs from any object: there it would be the paper. Elsewhere what has the
-    table's pattern is left out, for the flash lights the middle of the table, too. `points` (N, 3): the sparse ones,
-    which say where the trial begins.
-    """
-    space.allowed = hints.allow(space.grid, space.distance)
-    table = Table(space.views, hints.plane, space.center, space.reach, progress) if hints.plane else None
-    tables = table.patterns() if table else masks.nothing(space.views)
-
-    def guesses() -> Iterator[list[np.ndarray]]:
-        if table:
-            yield table.others()
-        if not sheet:
-            yield [masks.bright(view) & (1 - known) for view, known in zip(space.views, tables)]
-        sphere = sphere_of(points[hints.allow(points, space.distance)], space.center, space.reach)
-        with contextlib.suppress(InputError):  # it diverged
-            if sphere:
-                yield coverages(space.views, *sphere, progress)
-
-    for guess in guesses():
-        found = masks.settle(space, guess, tables, progress)
-        if found and found.quality >= SURE:
-            return found.body
-    return None
 
 
 def shots(
