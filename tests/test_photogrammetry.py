@@ -213,7 +213,7 @@ def test_a_mask_that_misses_far_more_than_others_has_no_vote():
     assert space.vote(wrong, 0.96).voxels.sum() < 0.8 * body.voxels.sum()
     assert space.vote(wrong, 0.96, voters).voxels.sum() == pytest.approx(body.voxels.sum(), rel=0.05)
     for v, mask in zip(views, true):
-        reach = body.reach(v)
+        reach = body.reach(v, body.coverage(v))
         assert (reach >= mask)[body.coverage(v) > 0].all() and reach.sum() < 1.5 * mask.sum()
 
 

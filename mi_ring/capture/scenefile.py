@@ -164,7 +164,8 @@ def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]
     """The photographs of a scene file, each with the index of its sensor: by name; unnamed ones in order."""
     elements = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
     named = {sensor.id(): k for k, sensor in enumerate(sensors)}
-    return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
+    numbered = zip(elements, range(len(sensors)), strict=True)
+    return [(element, named.get(element.get("id", ""), k)) for element, k in numbered]
 
 
 def room_elements(room: np.ndarray) -> list[Element]:

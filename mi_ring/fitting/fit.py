@@ -210,8 +210,9 @@ class Fit:
 
     def take_outlines(self, outlines: dict[int, Tensor]) -> None:
         """Go on with these masks, where there are any, instead of those of the capture."""
-        self.outlines = self.outlines | outlines
-        self.capture = with_outlines(self.capture, outlines)
+        if outlines:
+            self.outlines = self.outlines | outlines
+            self.capture = with_outlines(self.capture, outlines)
 
     def follow_power(self) -> None:
         """The reflectance takes along what the fit has found of the power of the lights together."""

@@ -66,9 +66,9 @@ class Body:
         mask[pixel[inside, 1], pixel[inside, 0]] = 1
         return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.pixels(view) + 1))
 
-    def reach(self, view: View) -> np.ndarray:
-        """(H, W) uint8: where the object may be by what the other views say, which is coarse by a voxel."""
-        return cv2.dilate(self.coverage(view), disk(self.pixels(view)))
+    def reach(self, view: View, coverage: np.ndarray) -> np.ndarray:
+        """(H, W) uint8: where the object may be by its coverage of the view, which is coarse by a voxel."""
+        return cv2.dilate(coverage, disk(self.pixels(view)))
 
     def pixels(self, view: View) -> float:
         """How wide a voxel is in a view."""
@@ -175,18 +175,20 @@ def settle(
     body, masks = space.vote(guesses, AGREE), list(guesses)
     if body is None:
         return None
+    covered = [body.coverage(view) for view in space.views]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number in range(care.rounds):
-            before, covered = masks, [body.coverage(view) for view in space.views]
+            before = masks
             found = pool.map(partial(outlined, band=care.band), space.views, covered, backgrounds)
             masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
             body = space.vote(masks, care.agree, reliable(space.views, masks, covered) if care.strict else None)
             if body is None:
                 return None
-            masks = [mask & body.reach(view) for mask, view in zip(masks, space.views)]
+            covered = [body.coverage(view) for view in space.views]
+            masks = [mask & body.reach(view, cover) for mask, view, cover in zip(masks, space.views, covered)]
             if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
                 break
-    return Found(masks, body, [overlap(m, body.coverage(view)) for m, view in zip(masks, space.views)])
+    return Found(masks, body, [overlap(mask, cover) for mask, cover in zip(masks, covered)])
 
 
 def resized(mask: np.ndarray, view: View) -> np.ndarray:

@@ -170,20 +170,25 @@ def alike(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
-        read = opened.read_all_images()
-        images = {image.image_id: width[image.camera_id] for image in read}
-        names = {image.image_id: image.name for image in read}
+    asked, still = set(map(frozenset, pairs)), 0
+    for a, b, first, second in matches_of(database):
+        if frozenset((a.name, b.name)) in asked and len(first) >= MATCHED:
+            moved = first - second
+            away = np.linalg.norm(moved - np.median(moved, 0), axis=1)  # nobody holds a camera quite still
+            still += float(np.median(away)) < STILL * width[a.camera_id]
+    return still / len(pairs)
+
+
+def matches_of(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
+    """Of every two images of COLMAP's database that match: both, and where the matches are in each, (n, 2) [px]."""
+    pycolmap = need("pycolmap", "features")
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image for image in opened.read_all_images()}
         places = {k: opened.read_keypoints(k)[:, :2] for k in images}
-        still = 0
         for number, geometry in zip(*opened.read_two_view_geometries()):
             a, b = pycolmap.pair_id_to_image_pair(number)
             first, second = geometry.inlier_matches.T
-            asked = (names[a], names[b]) in pairs or (names[b], names[a]) in pairs
-            if asked and len(first) >= MATCHED:
-                moved = places[a][first] - places[b][second]
-                away = np.linalg.norm(moved - np.median(moved, 0), axis=1)  # nobody holds a camera quite still
-                still += float(np.median(away)) < STILL * images[a]
-    return still / len(pairs)
+            yield images[a], images[b], places[a][first], places[b][second]
 
 
 def put_together(folder: Path, count: int, progress: Progress) -> Any:
@@ -238,18 +243,13 @@ def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
 
 def explained(model: Any, database: Path) -> int:
     """How many matches of two photographs are where the cameras of a model say that they are."""
-    pycolmap = need("pycolmap", "structure from motion")
     placed = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
     count = 0
-    with pycolmap.Database.open(database) as opened:
-        images = {image.image_id: placed[image.name] for image in opened.read_all_images() if image.name in placed}
-        places = {k: opened.read_keypoints(k)[:, :2] for k in images}
-        for number, geometry in zip(*opened.read_two_view_geometries()):
-            a, b = pycolmap.pair_id_to_image_pair(number)
-            if a in images and b in images and len(geometry.inlier_matches):
-                first, second = geometry.inlier_matches.T
-                off = epipolar(model, images[a], images[b], places[a][first], places[b][second])
-                count += int((off < EPIPOLAR * model.cameras[images[a].camera_id].width).sum())
+    for one, other, first, second in matches_of(database):
+        if one.name in placed and other.name in placed and len(first):
+            a, b = placed[one.name], placed[other.name]
+            off = epipolar(model, a, b, first, second)
+            count += int((off < EPIPOLAR * model.cameras[a.camera_id].width).sum())
     return count
 
 
