@@ -2,11 +2,10 @@
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -49,7 +48,7 @@ class Picture:
         if suffix in RAW:
             return read_as(self.path, "raw photograph", develop)
         if suffix in HEIF:
-            need("pillow_heif", f"{self.path}").register_heif_opener()
+            let_open(self.path)
             return read_as(self.path, "HEIF photograph", lambda file: np.array(Image.open(file).convert("RGB")))
         pixels = read_as(self.path, "image", read_image)
         if pixels.dtype not in (np.uint8, np.uint16):
@@ -71,7 +70,7 @@ class Picture:
     def held(self) -> int:
         """By EXIF's numbers, how the camera was held, whoever turns the pixels."""
         if self.upright and self.path.suffix.lower() in HEIF:
-            need("pillow_heif", f"{self.path}").register_heif_opener()
+            let_open(self.path)
             with Image.open(self.path) as image:
                 return image.info.get("original_orientation") or 1
         return self.orientation
@@ -84,8 +83,7 @@ class Picture:
     @cached_property
     def size(self) -> tuple[int, int]:
         """(width, height) [px]"""
-        if self.path.suffix.lower() in HEIF:
-            need("pillow_heif", f"{self.path}").register_heif_opener()
+        let_open(self.path)
         raw = self.path.suffix.lower() in RAW
         width, height = read_as(self.path, "raw photograph", developed_size) if raw else image_size(self.path)
         return (height, width) if self.orientation > 4 else (width, height)
@@ -127,8 +125,7 @@ class Picture:
             alpha = self.pixels[:, :, 3] if self.pixels.shape[2] == 4 else None
             return None if alpha is None else (alpha // (np.iinfo(alpha.dtype).max // 255)).astype(np.uint8)
         if source == "rembg":
-            rembg = need("rembg", "--masks rembg")
-            return np.array(rembg.remove(Image.fromarray(self.srgb()), session=rembg_session(), only_mask=True))
+            return np.array(rembg()(Image.fromarray(self.srgb())))
         names = (f"{self.path.name}.png", f"{self.name}.png")
         file = next((f for name in names if (f := Path(source) / name).is_file()), None)
         if file is None:
@@ -144,10 +141,17 @@ class Picture:
         self.__dict__.pop("pixels", None)
 
 
+def let_open(path: Path) -> None:
+    """See that Pillow can open a file, if that is HEIF."""
+    if path.suffix.lower() in HEIF:
+        need("pillow_heif", f"{path}").register_heif_opener()
+
+
 @cache
-def rembg_session() -> Any:
-    """Its network, loaded once."""
-    return need("rembg", "--masks rembg").new_session()
+def rembg() -> Callable[[Image.Image], Image.Image]:
+    """What that package makes masks of photographs with; its network is loaded once."""
+    package = need("rembg", "--masks rembg")
+    return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
 def develop(path: Path) -> np.ndarray:
@@ -258,8 +262,7 @@ def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
 def exif_of(path: Path) -> Image.Exif:
     """EXIF data, empty where there are none."""
     try:
-        if path.suffix.lower() in HEIF:
-            need("pillow_heif", f"{path}").register_heif_opener()
+        let_open(path)
         with Image.open(path) as image:
             exif = image.getexif()
             exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
