@@ -169,11 +169,44 @@ def test_what_stands_on_a_table_differs_from_it():
         true.append(mask)
     plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     space = masks.Space.seen_by(views)
-    guesses = table.Table(views, plane, space.center, space.reach, lambda things, *_: things).others()
+    guesses = table.Table(views, table.Ground(plane, space.center, space.reach), lambda things, *_: things).others()
     assert np.median([masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
-    sure = table.Table(views, plane, CENTER, 5.0, lambda things, *_: things).patterns()
+    sure = table.Table(views, table.Ground(plane, CENTER, 5.0), lambda things, *_: things).patterns()
     assert max((s & t).sum() for s, t in zip(sure, true)) < 0.01 * np.mean([t.sum() for t in true])
     assert np.mean([s.sum() for s in sure]) > 0.1 * sure[0].size
+
+
+def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
+    random = np.random.default_rng(2)
+    views, true = [], []
+    for k, pose in enumerate(poses(20, lowest=30)):
+        rgb, mask = on_a_table(pose, random, random.uniform(0.8, 1.2))
+        rgb = rgb.reshape(120, 160, 3)
+        rgb[:, 20:45] *= np.where(mask[:, 20:45, None], 1, 0.5)  # a shadow
+        views.append(view(str(k), pose, rgb))
+        true.append(mask)
+    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    covered = [mask.astype(np.uint8) for mask in true]
+    hidden = [masks.grown(mask, 0.1) for mask in covered]
+    grounds = table.Ground(plane, CENTER, 3.0), table.Ground(plane, CENTER, 8.0)
+
+    def known(pictures):
+        tables = [table.Table(pictures, ground, lambda things, *_: things, hidden) for ground in grounds]
+        return tables, table.bare(pictures, covered, tables, lambda things, *_: things)
+
+    tables, found = known(views)
+    assert np.mean([f[t].mean() for f, t in zip(found, true)]) < 0.05
+    beside = [~t & np.isfinite(tables[1].expected(v)).all(-1) for v, t in zip(views, true)]
+    assert np.mean([f[b].mean() for f, b in zip(found, beside)]) > 0.8
+    assert np.mean([f[:, 22:43][b[:, 22:43]].mean() for f, b in zip(found, beside)]) > 0.7
+    painted = []  # the object has the table's own colours where it hides the table
+    for v, mask in zip(views, true):
+        expected = tables[1].expected(v)
+        paint = mask & np.isfinite(expected).all(-1)
+        rgb = v.rgb.copy()
+        rgb[paint] = 255 * np.exp(expected[paint]) ** (1 / 2.2)
+        painted.append(v._replace(rgb=rgb))
+    assert known(painted)[1] is None
 
 
 @pytest.mark.parametrize("bare", [False, True])

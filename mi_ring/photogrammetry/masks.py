@@ -41,7 +41,7 @@ class Care(NamedTuple):
 
 
 WHEREABOUTS = Care(AGREE, 0.04, 6, False)
-HOLLOWS = Care(0.96, 0.15, 6)  #: shadows fill them, until a few photographs see through
+HOLLOWS = Care(0.96, 0.15, 2)  #: shadows fill them, until a few photographs see through
 OUTLINES = Care(0.96, 0.04, 2)
 
 
@@ -203,6 +203,11 @@ def disputed(mask: np.ndarray, coverage: np.ndarray, pixels: float) -> np.ndarra
     """
     wide, narrow = cv2.dilate(coverage, disk(pixels)), cv2.erode(coverage, disk(pixels))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
+
+
+def grown(coverage: np.ndarray, share: float) -> np.ndarray:
+    """(H, W) uint8: a coverage, and around it such a share of its size."""
+    return cv2.dilate(coverage, disk(share * np.sqrt(coverage.sum())))
 
 
 def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:

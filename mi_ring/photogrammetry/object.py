@@ -15,7 +15,7 @@ from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.motion import Motion, Progress
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE
-from mi_ring.photogrammetry.table import FLAT, Plane, Table, find_plane
+from mi_ring.photogrammetry.table import FLAT, Ground, Plane, Table, bare, find_plane
 from mi_ring.photogrammetry.trial import coverages, sphere_of
 from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.system.files import write_file
@@ -23,6 +23,10 @@ from mi_ring.system.files import write_file
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
 SMALL, CLOSE = 200, 400  #: along the object, in the pictures that its hollows are found in, and its outlines
+FINE, WIDE = (
+    640,
+    2.0,
+)  #: texels across the table's picture there, and how far that of whole photographs goes, in reaches
 
 
 class Object(NamedTuple):
@@ -144,8 +148,8 @@ def searched(
         small.append(reduced(picture, lens, pose, around(lens, cover, SMALL)))
         close.append(reduced(picture, lens, pose, windows[picture.name]))
         picture.close()
-    found = outlines(small, body, hints, masks.HOLLOWS, progress)
-    found = found and outlines(close, found.body, hints, masks.OUTLINES, progress)
+    found = outlines(small, body, space, hints, masks.HOLLOWS, progress)
+    found = found and outlines(close, found.body, space, hints, masks.OUTLINES, progress)
     sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
     if found is None or sure < len(pictures) / 2:
         raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
@@ -162,15 +166,21 @@ def searched(
 
 
 def outlines(
-    views: Sequence[View], body: masks.Body, hints: Hints, care: masks.Care, progress: Progress
+    views: Sequence[View], body: masks.Body, whole: masks.Space, hints: Hints, care: masks.Care, progress: Progress
 ) -> masks.Found | None:
-    """Masks of views that are near to the object, from what is known of it by now."""
+    """Masks of views that are near to the object, from what is known of it by now. `whole`: the whole photographs."""
     space = masks.Space.about(views, body)
     space.allowed = hints.allow(space.grid, space.distance, FLAT / 2)
-    tables = masks.nothing(views)
+    covered, tables = [body.coverage(view) for view in views], masks.nothing(views)
     if hints.plane:
-        tables = Table(views, hints.plane, space.center, space.reach, progress).patterns()
-    return masks.settle(space, [body.coverage(view) for view in views], tables, progress, care)
+        near = Ground(hints.plane, space.center, space.reach, FINE)
+        far = Ground(hints.plane, space.center, WIDE * whole.reach, FINE)
+        known = [
+            Table(those, ground, progress, [masks.grown(body.coverage(view), care.band) for view in those])
+            for those, ground in ((views, near), (whole.views, far))
+        ]
+        tables = bare(views, covered, known, progress) or known[0].patterns()
+    return masks.settle(space, covered, tables, progress, care)
 
 
 def find_body(
@@ -183,7 +193,8 @@ def find_body(
     which say where the trial begins.
     """
     space.allowed = hints.allow(space.grid, space.distance)
-    table = Table(space.views, hints.plane, space.center, space.reach, progress) if hints.plane else None
+    ground = hints.plane and Ground(hints.plane, space.center, space.reach)
+    table = ground and Table(space.views, ground, progress)
     tables = table.patterns() if table else masks.nothing(space.views)
 
     def guesses() -> Iterator[list[np.ndarray]]:

@@ -7,17 +7,27 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from mi_ring.capture.outlines import disk
+from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
 
 FLAT = 0.004  #: distance from the plane, in that of the cameras, up to which a point belongs to it
 FEWEST = 0.15  #: share of the points that a table has at least
-TEXELS = 320  #: across the table's picture
+TEXELS, SOME = 320, 160  #: across the table's picture if nothing else is said, and to see how it is lit
+CHUNK = 50_000  #: texels whose colours are found in one go
 SIGNIFICANT = 4.0  #: a pixel that differs from the table by so many times the usual is something else
 LEAST = 0.2  #: and by so much of its log radiance
 DARKEST = 2e-3  #: radiance below which nothing is told
+LOG_RADIANCE = np.log(np.maximum(srgb_to_linear(np.arange(256, dtype=np.float32) / 255), DARKEST))  #: by a byte
 #: Where a photograph has the table's pattern: correlation in a window [px], and the pattern's least contrast in it.
 CORRELATED, WINDOW, CONTRAST = 0.8, 15, 0.15
+#: Where a photograph shows the bare table: it differs from what is expected, in log radiance and two log ratios of
+#: colours, by no more than nearly all that is not `NEAR` the object [its size], and that is at least and at most so
+#: much. Nothing is told where more of the object `INSIDE` its outline [its size] than a small share looks like it.
+NEARLY_ALL, AT_LEAST, AT_MOST = 0.99, (0.1, 0.05, 0.05), (0.4, 0.15, 0.15)
+NEAR, INSIDE, CONFUSED = 0.3, 0.1, 0.03
+SPECK = 0.015  #: what is not wider does not count [the object's size]
 
 
 class Plane(NamedTuple):
@@ -76,26 +86,26 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, reac
 class Ground:
     """The part of a plane about its point below `center`, as a square of texels `reach` times 4 wide."""
 
-    def __init__(self, plane: Plane, center: np.ndarray, reach: float) -> None:
-        self.axes, self.width = plane.axes(), 4 * reach
+    def __init__(self, plane: Plane, center: np.ndarray, reach: float, texels: int = TEXELS) -> None:
+        self.axes, self.width, self.texels = plane.axes(), 4 * reach, texels
         self.foot = center - plane.height(center) * plane.normal
-        line = np.linspace(-0.5, 0.5, TEXELS)
+        line = np.linspace(-0.5, 0.5, texels)
         self.u, self.v = (grid.ravel() for grid in np.meshgrid(line, line))
         across = self.u[:, None] * self.axes[0] + self.v[:, None] * self.axes[1]
-        self.points = self.foot + self.width * across  #: (TEXELS², 3)
+        self.points = self.foot + self.width * across  #: (texels², 3)
 
     def seen_by(self, view: View, texels: np.ndarray) -> np.ndarray:
-        """Texels (TEXELS², …) as a view shows them (H, W, …); NaN, or False, beyond."""
+        """Texels (texels², …) as a view shows them (H, W, …); NaN, or False, beyond."""
         height, width = view.shown.shape
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
         rays = view.camera.directions(pixels)
         with np.errstate(divide="ignore", invalid="ignore"):
             away = (self.foot - view.camera.position) @ self.axes[2] / (rays @ self.axes[2])
         hit = view.camera.position + away[:, None] * rays - self.foot
-        place = (hit @ self.axes[:2].T / self.width + 0.5) * TEXELS
-        known = (away > 0) & ((place >= 0) & (place < TEXELS)).all(1)
+        place = (hit @ self.axes[:2].T / self.width + 0.5) * self.texels
+        known = (away > 0) & ((place >= 0) & (place < self.texels)).all(1)
         column, row = np.where(known[:, None], place, 0).astype(int).T
-        shown = texels[row * TEXELS + column]
+        shown = texels[row * self.texels + column]
         shown[~known] = False if shown.dtype == bool else np.nan
         return shown.reshape(height, width, *texels.shape[1:])
 
@@ -103,31 +113,48 @@ class Ground:
 class Table:
     """The table as views show it together: alike from everywhere, but for how it is lit.
 
-    That is a smooth function of place, found for each view.
+    That is a smooth function of place, found for each view. `hidden` (H, W): where something may hide the table from a
+    view; by default nowhere.
     """
 
     def __init__(
-        self, views: Sequence[View], plane: Plane, center: np.ndarray, reach: float, progress: Progress
+        self, views: Sequence[View], ground: Ground, progress: Progress, hidden: Sequence[np.ndarray] | None = None
     ) -> None:
-        self.views, self.ground, self.progress = views, Ground(plane, center, reach), progress
-        x, y = 2 * self.ground.u, 2 * self.ground.v
-        smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
-        #: How each view has it (views, TEXELS², 3), and how it is (TEXELS², 3): log radiance, NaN where not shown.
-        self.stack = np.empty((len(views), len(self.ground.points), 3), np.float32)
-        for own, view in zip(self.stack, progress(views, "table")):
-            pixel, inside = view.places(self.ground.points)
-            own[:] = np.where(inside[:, None], log_radiance(view)[pixel[:, 1], pixel[:, 0]], np.nan)
+        self.views, self.ground, self.progress, self.hidden = views, ground, progress, hidden
+        x, y = 2 * ground.u, 2 * ground.v
+        self.smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1).astype(np.float32)
+        self.lights = np.zeros((len(views), self.smooth.shape[1]), np.float32)  #: by `smooth`
+        every = -(-ground.texels // SOME)
+        some = np.arange(ground.texels**2).reshape(ground.texels, -1)[::every, ::every].ravel()
+        stack = self.stack(some)
         for number in range(3):  # the table's colours and how each photograph is lit, in turn
-            colours = median(self.stack)
-            for own in progress(self.stack, f"table, round {number + 1}"):
-                own -= (smooth @ lighting(own - colours, smooth))[:, None]
-        self.colours = median(self.stack)
+            colours = median(stack)
+            for own, light in zip(progress(stack, f"table, round {number + 1}"), self.lights):
+                more = lighting(own - colours, self.smooth[some])
+                own -= (self.smooth[some] @ more)[:, None]
+                light += more
+        parts = np.array_split(np.arange(ground.texels**2), -(-(ground.texels**2) // CHUNK))
+        #: (texels², 3) log radiance, NaN where not shown
+        self.colours = np.concatenate([median(self.stack(part)) for part in progress(parts, "table")])
+
+    def shown(self, number: int, texels: np.ndarray) -> np.ndarray:
+        """How a view has some texels (N,): (N, 3) log radiance, as if lit like the others; NaN where not shown."""
+        pixel, inside = self.views[number].places(self.ground.points[texels])
+        column, row = pixel.T
+        if self.hidden:
+            inside &= self.hidden[number][row, column] == 0
+        own = log_radiance(self.views[number].rgb[row, column]) - (self.smooth[texels] @ self.lights[number])[:, None]
+        return np.where(inside[:, None], own, np.float32(np.nan))
+
+    def stack(self, texels: np.ndarray) -> np.ndarray:
+        """The same of all views: (views, N, 3)"""
+        return np.stack([self.shown(number, texels) for number in range(len(self.views))])
 
     def others(self) -> list[np.ndarray]:
         """Of each view (H, W) uint8 what differs from the table as the others show it: what stands on it."""
-        result = []
-        for view, own in zip(self.progress(self.views, "beside the table"), self.stack):
-            rest = np.abs(own - self.colours).max(1)
+        result, everywhere = [], np.arange(len(self.colours))
+        for number, view in enumerate(self.progress(self.views, "beside the table")):
+            rest = np.abs(self.shown(number, everywhere) - self.colours).max(1)
             usual = float(np.nanmedian(rest)) if np.isfinite(rest).any() else 0.0  # it shows nothing of the table
             other = rest > max(LEAST, SIGNIFICANT * usual)
             mask = cv2.medianBlur(self.ground.seen_by(view, other).astype(np.uint8), 5)
@@ -138,14 +165,67 @@ class Table:
         """Of each view (H, W) uint8 what surely is the table, for the pattern that the others show there is in it."""
         known = self.colours.mean(1)
         return [
-            alike(log_radiance(view).mean(-1), self.ground.seen_by(view, known))
+            alike(log_radiance(view.rgb).mean(-1), self.ground.seen_by(view, known))
             for view in self.progress(self.views, "pattern of the table")
         ]
 
+    def expected(self, view: View) -> np.ndarray:
+        """What a view, a part of one of these, would show of the table alone: (H, W, 3) log radiance, NaN beyond."""
+        number = [other.name for other in self.views].index(view.name)
+        return self.ground.seen_by(view, self.colours + (self.smooth @ self.lights[number])[:, None])
 
-def log_radiance(view: View) -> np.ndarray:
-    """(H, W, 3)"""
-    return np.log(np.maximum(view.linear, DARKEST))
+
+def bare(
+    views: Sequence[View], covered: Sequence[np.ndarray], tables: Sequence[Table], progress: Progress
+) -> list[np.ndarray] | None:
+    """Of each view (H, W) uint8 what shows the bare table, lit or in a shadow, by the first table that knows it there.
+
+    `covered` (H, W): where the object about is. None if the object itself looks like the table.
+    """
+    differences = []
+    for view in progress(views, "bare table"):
+        expected = tables[0].expected(view)
+        for table in tables[1:]:
+            expected = np.where(np.isfinite(expected), expected, table.expected(view))
+        differences.append(difference(log_radiance(view.rgb), expected))
+    for shadows in (True, False):
+        result, wrong, inside = [], 0, 0
+        for view, cover, off in zip(views, covered, differences):
+            size, known = np.sqrt(max(1, int(cover.sum()))), view.shown & np.isfinite(off).all(-1)
+            around = known & (cv2.dilate(cover, disk(NEAR * size)) == 0)
+            usual = np.quantile(np.abs(off[around]), NEARLY_ALL, 0) if around.any() else 0
+            value, red, blue = np.moveaxis(off, -1, 0)
+            limit, *limits = np.clip(usual, AT_LEAST, AT_MOST)
+            same = known & (np.abs(red) < limits[0]) & (np.abs(blue) < limits[1])
+            same &= (value if shadows else np.abs(value)) < limit
+            smooth = cv2.medianBlur(same.astype(np.uint8), 5)
+            result.append(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, disk(SPECK * size)))
+            core = known & (cv2.erode(cover, disk(INSIDE * size)) > 0)
+            wrong, inside = wrong + (result[-1][core] > 0).sum(), inside + core.sum()
+        if wrong <= CONFUSED * inside:
+            return result
+    return None
+
+
+def difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Of log radiances (H, W, 3), of their means and of red and blue by green: (H, W, 3), NaN where not known.
+
+    By what is expected next to a pixel, too, that is nearest to what is seen: the pattern may be off by a pixel.
+    """
+
+    def split(log: np.ndarray) -> np.ndarray:
+        return np.stack([log.mean(-1), log[..., 0] - log[..., 1], log[..., 2] - log[..., 1]], -1)
+
+    known = np.isfinite(expected).all(-1, keepdims=True)
+    near, here = np.where(known, split(expected), 0).astype(np.float32), split(seen)
+    window = np.ones((3, 3), np.uint8)
+    nearest = np.clip(here, cv2.erode(near, window), cv2.dilate(near, window))
+    return np.where(known, here - nearest, np.nan)
+
+
+def log_radiance(rgb: np.ndarray) -> np.ndarray:
+    """Of sRGB (…) uint8: (…) float32"""
+    return LOG_RADIANCE[rgb]
 
 
 def median(stack: np.ndarray) -> np.ndarray:
