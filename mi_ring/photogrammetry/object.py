@@ -23,10 +23,8 @@ from mi_ring.system.files import write_file
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
 SMALL, CLOSE = 200, 400  #: along the object, in the pictures that its hollows are found in, and its outlines
-FINE, WIDE = (
-    640,
-    2.0,
-)  #: texels across the table's picture there, and how far that of whole photographs goes, in reaches
+FINE = 640  #: texels across the table's picture there
+WIDE = 2.0  #: how far the table is known from whole photographs, in their reach
 
 
 class Object(NamedTuple):
