@@ -5,9 +5,9 @@
 A row for the exact capture, one for each disturbance alone, with exact calibration and masks, and one for all of them
 at three strengths of the room's light, for which `mi_ring.photos` finds calibration and masks. In each: mean error of
 the normals and of the depth where both surfaces are seen, after a similarity, how often that of the exact capture the
-former is, and where `photos` found the scale by the sheet, how much larger the object is than it should be. Of a
-disturbance alone photographs have half the width. By `fast` errors of masks are hidden by those of the preset. It goes
-on where it stopped.
+former is, and where `photos` found the scale by the sheet, how much larger the object is than it should be. For a
+disturbance alone photographs have half the width, and the row of none at that width is the exact one. By `fast` errors
+of masks are hidden by those of the preset. It goes on where it stopped.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     options = parser.parse_args()
     rows = {f"all, room {ambient:.0%}": ("all", ambient, True) for ambient in AMBIENT}
-    rows |= {f"{name} alone": (name, USUAL, False) for name in ALONE}
+    rows |= {f"{name} alone": (name, USUAL, False) for name in ("none", *ALONE)}
     results = {}
     for row, (disturbances, ambient, found) in rows.items():
         for name in options.objects:
@@ -104,8 +104,9 @@ def main() -> None:
             print(f"{name}, {row}: {results[row, name]}", file=sys.stderr, flush=True)
     exact = {name: results["all, room 3%", name]["exact"] for name in options.objects}
     lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]]
-    for row in rows:
-        lines.append([row, *(cell(results[row, name]["this"], exact[name]) for name in options.objects)])
+    for row, (_, _, found) in rows.items():
+        by = {name: exact[name] if found else results["none alone", name]["this"] for name in options.objects}
+        lines.append([row, *(cell(results[row, name]["this"], by[name]) for name in options.objects)])
     import torch
 
     speed = product_speed(4096, 4096, torch.float32) / 1e9
