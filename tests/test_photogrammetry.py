@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from mi_ring.capture.outlines import grown
 from mi_ring.capture.scenefile import load_element
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
@@ -187,7 +188,7 @@ def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
         true.append(mask)
     plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     covered = [mask.astype(np.uint8) for mask in true]
-    hidden = [masks.grown(mask, 0.1) for mask in covered]
+    hidden = [grown(mask, 0.1) for mask in covered]
     grounds = table.Ground(plane, CENTER, 3.0), table.Ground(plane, CENTER, 8.0)
 
     def known(pictures):

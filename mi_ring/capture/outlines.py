@@ -10,17 +10,22 @@ def disk(radius: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
+def grown(coverage: np.ndarray, share: float) -> np.ndarray:
+    """(H, W) uint8: a coverage (H, W) uint8, 0 or 1, and around it such a share of its size; less where negative."""
+    radius = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
+    return cv2.dilate(coverage, radius) if share > 0 else cv2.erode(coverage, radius)
+
+
 def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
     """(H, W) uint8, 1 the object, in a photograph (H, W, 3) uint8 sRGB, near its `coverage` (H, W) uint8, 0 or 1.
 
     `background` (H, W) bool: what surely is not the object. `band`: how far inside the coverage's outline, and half as
     far again outside, is open, in units of the object's size.
     """
-    size = np.sqrt(max(1, int(coverage.sum())))
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[cv2.dilate(coverage, disk(1.5 * band * size)) > 0] = cv2.GC_PR_BGD
+    seed[grown(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
     seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[cv2.erode(coverage, disk(band * size)) > 0] = cv2.GC_FGD
+    seed[grown(coverage, -band) > 0] = cv2.GC_FGD
     seed[background] = cv2.GC_BGD
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
         return coverage & ~background

@@ -205,11 +205,6 @@ def disputed(mask: np.ndarray, coverage: np.ndarray, pixels: float) -> np.ndarra
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
-def grown(coverage: np.ndarray, share: float) -> np.ndarray:
-    """(H, W) uint8: a coverage, and around it such a share of its size."""
-    return cv2.dilate(coverage, disk(share * np.sqrt(coverage.sum())))
-
-
 def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """(H, W) uint8: what looks like the object, touches it and is not in its mask: a rod, a stand, a lamp behind.
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mi_ring.capture.outlines import grown
 from mi_ring.errors import InputError
 from mi_ring.images import read_image, write_image
 from mi_ring.importers.reading import read_as
@@ -173,10 +174,8 @@ def outlines(
     if hints.plane:
         near = Ground(hints.plane, space.center, space.reach, FINE)
         far = Ground(hints.plane, space.center, WIDE * whole.reach, FINE)
-        known = [
-            Table(those, ground, progress, [masks.grown(body.coverage(view), care.band) for view in those])
-            for those, ground in ((views, near), (whole.views, far))
-        ]
+        places = (views, near, covered), (whole.views, far, [body.coverage(view) for view in whole.views])
+        known = [Table(of, ground, progress, [grown(c, care.band) for c in shown]) for of, ground, shown in places]
         tables = bare(views, covered, known, progress) or known[0].patterns()
     return masks.settle(space, covered, tables, progress, care)
 

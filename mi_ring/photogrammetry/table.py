@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from mi_ring.capture.outlines import disk
+from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
@@ -192,7 +192,7 @@ def bare(
         result, wrong, inside = [], 0, 0
         for view, cover, off in zip(views, covered, differences):
             size, known = np.sqrt(max(1, int(cover.sum()))), view.shown & np.isfinite(off).all(-1)
-            around = known & (cv2.dilate(cover, disk(NEAR * size)) == 0)
+            around = known & (grown(cover, NEAR) == 0)
             usual = np.quantile(np.abs(off[around]), NEARLY_ALL, 0) if around.any() else 0
             value, red, blue = np.moveaxis(off, -1, 0)
             limit, *limits = np.clip(usual, AT_LEAST, AT_MOST)
@@ -200,7 +200,7 @@ def bare(
             same &= (value if shadows else np.abs(value)) < limit
             smooth = cv2.medianBlur(same.astype(np.uint8), 5)
             result.append(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, disk(SPECK * size)))
-            core = known & (cv2.erode(cover, disk(INSIDE * size)) > 0)
+            core = known & (grown(cover, -INSIDE) > 0)
             wrong, inside = wrong + (result[-1][core] > 0).sum(), inside + core.sum()
         if wrong <= CONFUSED * inside:
             return result
