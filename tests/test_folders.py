@@ -300,6 +300,28 @@ def test_raw_photographs_are_turned_as_libraw_turns_them(orientation, tmp_path):
     assert Picture(tmp_path / "a.dng", upright=False).size == (64, 48)
 
 
+def test_cameras_of_another_tool_are_taken_whatever_photographs_lack_or_are_gone(tmp_path):
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    (tmp_path / "images").mkdir()
+    label = ("<camera id='{0}' sensor_id='0' label='p{0}'>"
+             "<transform>1 0 0 {0} 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>")  # fmt: skip
+    (tmp_path / "cameras.xml").write_text(
+        "<document><chunk><sensors><sensor id='0' type='frame'><calibration class='adjusted' type='frame'>"
+        "<resolution width='64' height='40'/><f>60</f></calibration></sensor></sensors><cameras>"
+        f"{''.join(label.format(k) for k in range(12))}</cameras></chunk></document>"
+    )
+    pixels = np.random.default_rng(0).integers(0, 255, (10, 40, 64, 3), np.uint8)
+    for k in range(10):  # one has exposure in its EXIF, the others have none; two were deleted
+        exif = Image.Exif()
+        if k == 3:
+            exif.get_ifd(0x8769).update({33434: 0.01, 33437: 2.0, 34855: 100})
+        Image.fromarray(pixels[k]).save(tmp_path / f"images/p{k}.{'heic' if k % 2 else 'jpg'}", exif=exif)
+    motion = cameras_beside(find_pictures(tmp_path / "images", upright=False))
+    assert list(motion.cameras) == [f"p{k}" for k in range(10)] and not motion.failed
+    assert [pose[0, 3] for _, pose in motion.cameras.values()] == list(range(10))
+
+
 def test_cameras_of_another_tool_are_those_of_the_pixels_as_stored(tmp_path):
     pixels, eye = np.random.default_rng(0).integers(0, 255, (8, 40, 60, 3), np.uint8), np.eye(4).tolist()
     for k in range(8):

@@ -4,6 +4,7 @@ import copy
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -458,6 +459,21 @@ def test_cameras_are_detected(tmp_path, kind):
     source = detect(folder)
     assert type(source) is kind and len(taken(source)) == 3
     assert {frame.image.parent for frame in source.frames()} == {folder}
+
+
+@pytest.mark.parametrize("kind", [Metashape, RealityCapture, Middlebury, SfmData])
+def test_cameras_of_photographs_that_are_not_meant_are_left_out(tmp_path, kind):
+    WRITERS[kind](tmp_path / "images" if kind is RealityCapture else tmp_path)
+    folder = tmp_path if kind is Middlebury else tmp_path / "images"
+    whole = {frame.image: frame.pose for frame in detect(folder).frames()}
+    gone, *others = whole
+    gone.unlink()
+    if kind is not RealityCapture:  # whose sidecars are looked for by the photographs
+        with pytest.raises(InputError, match=f"no photograph '{gone.stem}"):
+            list(detect(folder).frames())
+    frames = list(replace(detect(folder), photographs=others).frames())
+    assert [frame.image for frame in frames] == others
+    assert all((frame.pose == whole[frame.image]).all() for frame in frames)
 
 
 def test_of_several_cameras_the_first_kind_counts(tmp_path):

@@ -41,14 +41,19 @@ class Colmap(Photogrammetry):
             raise InputError(f"{model}: images: no photograph has a pose")
         beside = [f / "images" for f in (self.src, model, model.parent, model.parent.parent)]
         images = self.images or next((f for f in beside if f.is_dir()), None)
-        if images is None:
+        if images is None and self.photographs is None:
             raise InputError(f"{self.src}: --images: no folder images beside or above {model}; give it")
         registered = {*reconstruction.reg_image_ids()}
         for key, image in sorted(reconstruction.images.items(), key=lambda item: item[1].name):
             if key not in registered:
                 self.left_out.add(image.name)
                 continue
-            path = existing(images / image.name, "photograph")
+            if images and self.photographs is None:
+                path: Path | None = existing(images / image.name, "photograph")
+            else:
+                path = self.photograph(image.name, str(model))
+            if path is None:
+                continue
             pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
             name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
             own = reconstruction.cameras[image.camera_id]

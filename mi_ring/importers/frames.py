@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
@@ -51,6 +51,16 @@ class Frame:
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
+def called(name: str, files: Sequence[Path]) -> Path | None:
+    """The photograph of this name, whatever its folder, its suffix and that of the name are; None if there is none."""
+    name = PureWindowsPath(name).name
+    stem = PureWindowsPath(name).stem
+    for file in sorted(files, key=lambda file: (file.name != name, file.stem != name)):
+        if file.name == name or file.stem in (name, stem):
+            return file
+    return None
+
+
 @dataclass(frozen=True)
 class Source:
     """What all formats have in common."""
@@ -64,6 +74,8 @@ class Source:
     encoding: Literal["auto", "srgb", "linear"] = "auto"
     """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
     are written anew with 16."""
+    photographs: Suppress[Sequence[Path] | None] = None
+    """Those that are meant: cameras of others are left out. By default each camera must have its photograph."""
 
     def frames(self) -> Iterator[Frame]:
         """The photographs that have a pose. Raises InputError for what is no data of the format."""

@@ -48,7 +48,8 @@ class Metashape(Photogrammetry):
                 if transform is not None:
                     pose = in_world(pose, transform, f"{self.src}: transform")
                     break
-            image = self.photograph(label, what)
+            if (image := self.photograph(label, what)) is None:
+                continue
             yield image.name, Frame(image, lens(sensor, f"{self.src}: sensor {sensor.get('id')!r}"), pose)
 
 

@@ -30,5 +30,6 @@ class Middlebury(Photogrammetry):
             what = f"{path}: {name}"
             values = matrix(numbers, (21,), f"{what}: K, R, t")
             K, R, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
-            image = self.photograph(name, what)
+            if (image := self.photograph(name, what)) is None:
+                continue
             yield image.name, Frame(image, pinhole(K, image_size(image), 0.5, what), inverse(R, t))  # OpenCV's pixels

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.importers.frames import Frame, Source
+from mi_ring.importers.frames import Frame, Source, called
 from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
 
 
@@ -44,14 +44,17 @@ class Photogrammetry(Source):
         """The image files of `folder`."""
         return pictures(self.folder)
 
-    def photograph(self, name: str, what: str) -> Path:
-        """The photograph of this name in `folder`, whatever its suffix and that of the name are."""
-        name = PureWindowsPath(name).name
-        stem = PureWindowsPath(name).stem
-        for file in sorted(self.pictures, key=lambda file: (file.name != name, file.stem != name)):
-            if file.name == name or file.stem in (name, stem):
-                return file
-        raise InputError(f"{what}: no photograph {name[:99]!r} with any of {' '.join(SUFFIXES)} in {self.folder}; give "
+    def photograph(self, name: str, what: str) -> Path | None:
+        """The photograph of this name, whatever its suffix and that of the name are; None if it is not meant.
+
+        Raises InputError if `folder` has none.
+        """
+        if self.photographs is not None:
+            return called(name, self.photographs)
+        if file := called(name, self.pictures):
+            return file
+        name = PureWindowsPath(name).name[:99]
+        raise InputError(f"{what}: no photograph {name!r} with any of {' '.join(SUFFIXES)} in {self.folder}; give "
                          "--images")  # fmt: skip
 
     def frames(self) -> Iterator[Frame]:

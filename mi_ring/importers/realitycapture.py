@@ -41,7 +41,8 @@ class RealityCapture(Photogrammetry):
         if not any(self.src.glob("*.xmp")):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
-        for image in pictures(self.images or (self.src if pictures(self.src) else self.folder)):
+        images = pictures(self.images or (self.src if pictures(self.src) else self.folder))
+        for image in images if self.photographs is None else self.photographs:
             path = self.src / f"{image.stem}.xmp"
             fields = xmp_fields(load_xml(path)) if path.is_file() else {}
             if "Rotation" not in fields or "Position" not in fields:
@@ -63,7 +64,8 @@ class RealityCapture(Photogrammetry):
                 raise InputError(f"{what}: has {len(row)} columns; must have {len(columns)}")
             given = dict(zip(columns, row))
             numbers = {name: float(matrix(given[name], (), f"{what}: {name}")) for name in columns if name in NUMBERS}
-            image = self.photograph(given["name"], what)
+            if (image := self.photograph(given["name"], what)) is None:
+                continue
             seen.add(image)
             pose = np.eye(4)
             # At zero the camera looks down, the upper side to y. The heading is clockwise, as a compass's.

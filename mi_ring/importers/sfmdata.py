@@ -55,7 +55,7 @@ class SfmData(Photogrammetry):
             pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
             key = str(view.get("intrinsicId"))
             lens = alicevision_lens(found(intrinsics, key, what), version, f"{self.src}: intrinsic {key!r}")
-            yield self.frame(file, lens, pose, what)
+            yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
         """Of OpenMVG, whose JSON is cereal's: names of types stand where they come first."""
@@ -82,7 +82,7 @@ class SfmData(Photogrammetry):
             intrinsic = found(intrinsics, key, what)
             kind = types.get(polymorphic(intrinsic["value"], self.src))
             lens = openmvg_lens(cereal(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
-            yield self.frame(file, lens, inverse(R, -R @ place), what)
+            yield from self.frame(file, lens, inverse(R, -R @ place), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
         """A list of the file by the keys of its entries; empty if there is none."""
@@ -91,12 +91,12 @@ class SfmData(Photogrammetry):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(entry(value, f"{self.src}: {name}").get(key)): value for value in values}
 
-    def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> tuple[str, Frame]:
-        """Of a photograph that may have been elsewhere, on another system."""
+    def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[tuple[str, Frame]]:
+        """Of a photograph that may have been elsewhere, on another system, if it is meant."""
         path = self.src.parent / file
-        if self.images or not is_file(path):
-            path = self.photograph(file, what)
-        return path.name, Frame(path, lens, pose)
+        own = path if is_file(path) and not self.images and self.photographs is None else self.photograph(file, what)
+        if own:
+            yield own.name, Frame(own, lens, pose)
 
 
 def entry(value: Any, what: str) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens, brown
-from mi_ring.importers.frames import OPENGL, Frame, Light, Source
+from mi_ring.importers.frames import OPENGL, Frame, Light, Source, called
 from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
 
 
@@ -36,7 +36,12 @@ class Transforms(Source):
             name = own.get("file_path", own.get("img_path"))
             if not isinstance(name, str):
                 raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
-            image = with_suffix(path.parent / name, f"{path}: {where}.file_path")
+            if self.photographs is None:
+                image: Path | None = with_suffix(path.parent / name, f"{path}: {where}.file_path")
+            else:
+                image = called(name, self.photographs)
+            if image is None:
+                continue
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
             camera = transforms_camera({**top, **own}, image, f"{path}: {where}")
             mask = own.get("mask_path")

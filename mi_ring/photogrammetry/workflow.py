@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from mi_ring.errors import InputError
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
+from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
-from mi_ring.photogrammetry.folder import Picture, relative_exposures, turned_with
+from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
 from mi_ring.photogrammetry.object import Object
 from mi_ring.photogrammetry.scene import Shot
@@ -101,6 +103,11 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
     source = detect(pictures[0].path.parent)
     if source is None:
         return None
+    source = replace(source, photographs=[picture.path for picture in pictures])
+    if isinstance(source, Photogrammetry):  # exposures are found elsewhere, where some may be missing
+        source = replace(source, exif=False)
+    for picture in pictures:
+        let_open(picture.path)
     frames = {frame.image.stem: frame for frame in source.frames()}
     for p in pictures:
         if p.name in frames and frames[p.name].size != p.size:
