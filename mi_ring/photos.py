@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,6 +34,7 @@ from mi_ring.photogrammetry.workflow import (
 )
 from mi_ring.system import command
 from mi_ring.system.files import writing
+from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
@@ -150,8 +152,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
     try:
-        for shot, window in progress(list(zip(taken, windows(taken))), "writing"):
-            root.append(write_shot(writer, shot, window))
+        written = in_threads(partial(write_shot, writer), taken, windows(taken))
+        root.extend(progress(written, "writing", len(taken)))
         writer.finish(scene_bytes(root))
     finally:
         writer.close()

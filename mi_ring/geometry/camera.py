@@ -34,6 +34,13 @@ class Camera(NamedTuple):
         """(3,) unit length."""
         return self.to_world[:3, 1]
 
+    @property
+    def projection(self) -> np.ndarray:
+        """(3, 4): of a point (x, y, z, 1) pixel coordinates times depth, and depth."""
+        across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
+        rows = np.column_stack([across, self.forward]).T
+        return np.column_stack([rows, -rows @ self.position])
+
     def directions(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) in the world through pixel coordinates (n, 2)."""
         x, y = ((pixels - self.centre) / self.focal).T

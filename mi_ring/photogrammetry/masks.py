@@ -5,11 +5,9 @@ photograph drop out, and GrabCut finds the outline that the coarse votes leave o
 photographs, a shadow for one, drops out where a few others see through it.
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import cv2
@@ -21,6 +19,7 @@ from mi_ring.capture.outlines import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
 from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
+from mi_ring.system.machine import in_threads
 
 SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
 AGREE = 0.9  #: share of those that must call it object
@@ -53,17 +52,16 @@ class Body:
     spacing: float
     voxels: np.ndarray  #: (n, n, n) bool
 
-    @property
+    @cached_property
     def points(self) -> np.ndarray:
         """(N, 3) centres of the object's voxels."""
         return self.corner + self.spacing * np.argwhere(self.voxels)
 
     def coverage(self, view: View) -> np.ndarray:
         """(H, W) uint8: which pixels show it."""
-        points = self.points
-        pixel, inside = view.places(points)
+        row, column, inside = view.places(self.points)
         mask = np.zeros(view.shown.shape, np.uint8)
-        mask[pixel[inside, 1], pixel[inside, 0]] = 1
+        mask[row[inside], column[inside]] = 1
         return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.pixels(view) + 1))
 
     def reach(self, view: View, coverage: np.ndarray) -> np.ndarray:
@@ -112,11 +110,15 @@ class Space:
         `voters`: whose masks count; by default all.
         """
         yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
-        for number, (view, mask) in enumerate(zip(self.views, masks)):
-            if voters is None or voters[number]:
-                pixel, inside = view.places(self.grid)
-                shown += inside
-                yes += inside & (mask[pixel[:, 1], pixel[:, 0]] > 0)
+
+        def said(view: View, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            row, column, inside = view.places(self.grid)
+            return inside, inside & (mask[row, column] > 0)
+
+        voting = [k for k in range(len(masks)) if voters is None or voters[k]]
+        for inside, object_ in in_threads(said, [self.views[k] for k in voting], [masks[k] for k in voting]):
+            shown += inside
+            yes += object_
         object_ = (yes >= agree * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
         pieces, _ = ndimage.label(object_.reshape([len(self.axis)] * 3))
         sizes = np.bincount(pieces.ravel())
@@ -176,18 +178,17 @@ def settle(
     if body is None:
         return None
     covered = [body.coverage(view) for view in space.views]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for number in range(care.rounds):
-            before = masks
-            found = pool.map(partial(outlined, band=care.band), space.views, covered, backgrounds)
-            masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
-            body = space.vote(masks, care.agree, reliable(space.views, masks, covered) if care.strict else None)
-            if body is None:
-                return None
-            covered = [body.coverage(view) for view in space.views]
-            masks = [mask & body.reach(view, cover) for mask, view, cover in zip(masks, space.views, covered)]
-            if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
-                break
+    for number in range(care.rounds):
+        before = masks
+        found = in_threads(partial(outlined, band=care.band), space.views, covered, backgrounds)
+        masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
+        body = space.vote(masks, care.agree, reliable(space.views, masks, covered) if care.strict else None)
+        if body is None:
+            return None
+        covered = [body.coverage(view) for view in space.views]
+        masks = [mask & body.reach(view, cover) for mask, view, cover in zip(masks, space.views, covered)]
+        if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
+            break
     return Found(masks, body, [overlap(mask, cover) for mask, cover in zip(masks, covered)])
 
 

@@ -12,6 +12,7 @@ from mi_ring.capture.outlines import grown
 from mi_ring.errors import InputError
 from mi_ring.images import read_image, write_image
 from mi_ring.importers.reading import read_as
+from mi_ring.importers.undistortion import Window
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.motion import Motion, Progress
@@ -20,6 +21,7 @@ from mi_ring.photogrammetry.table import FLAT, Ground, Plane, Table, bare, find_
 from mi_ring.photogrammetry.trial import coverages, sphere_of
 from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.system.files import write_file
+from mi_ring.system.machine import in_threads
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
@@ -78,11 +80,14 @@ def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folde
         plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
         return Object(masks_, np.array(known["center"]), known["level"], plane)
     shown = [picture for picture in pictures if picture.name in motion.cameras]
-    views = []
-    for picture in progress(shown, "reading"):
+
+    def whole(picture: Picture) -> View:
         lens, pose = motion.cameras[picture.name]
-        views.append(reduced(picture, lens, pose, whole_of(lens, COARSE)))
+        view = reduced(picture, lens, pose, whole_of(lens, COARSE))
         picture.close()
+        return view
+
+    views = list(progress(in_threads(whole, shown), "reading", len(shown)))
     space = masks.Space.seen_by(views)
     plane, sheet = hints.plane, hints.plane is not None
     if not sheet:
@@ -140,27 +145,29 @@ def searched(
     if body is None or len(showing) < len(pictures) / 2:
         raise InputError(f"{folder}: masks: no object was found, neither one that stands on a table nor one that the "
                          "flash lights more than what is around it; give --masks")  # fmt: skip
-    small, close, windows = [], [], {}
-    for picture, cover in progress(showing, "reading"):
+
+    def near(picture: Picture, cover: np.ndarray) -> tuple[View, View, Window]:
         lens, pose = motion.cameras[picture.name]
-        windows[picture.name] = around(lens, cover, CLOSE)
-        small.append(reduced(picture, lens, pose, around(lens, cover, SMALL)))
-        close.append(reduced(picture, lens, pose, windows[picture.name]))
+        window = around(lens, cover, CLOSE)
+        coarse, fine = (reduced(picture, lens, pose, part) for part in (around(lens, cover, SMALL), window))
         picture.close()
+        return coarse, fine, window
+
+    small, close, windows = zip(*progress(in_threads(near, *zip(*showing)), "reading", len(showing)))
     found = outlines(small, body, space, hints, masks.HOLLOWS, progress)
     found = found and outlines(close, found.body, space, hints, masks.OUTLINES, progress)
     sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
     if found is None or sure < len(pictures) / 2:
         raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
     shades = {}
-    for view, mask, agreed in zip(close, found.masks, found.agreement):
+    for view, window, mask, agreed in zip(close, windows, found.masks, found.agreement):
         if agreed >= SURE:
             if plane:  # beside the object there are shadows
                 maybe = masks.disputed(mask, found.body.coverage(view), found.body.pixels(view))
             else:
                 maybe = masks.unsure(mask, masks.bright(view))
             shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
-            shades[view.name] = pasted(shade, motion.cameras[view.name][0], windows[view.name])
+            shades[view.name] = pasted(shade, motion.cameras[view.name][0], window)
     return found.body, shades
 
 

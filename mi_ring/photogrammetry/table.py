@@ -1,6 +1,7 @@
 """The table that an object stands on: its plane, what it looks like, and what in a photograph is not the table."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -11,6 +12,7 @@ from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
+from mi_ring.system.machine import in_threads
 
 FLAT = 0.004  #: distance from the plane, in that of the cameras, up to which a point belongs to it
 FEWEST = 0.15  #: share of the points that a table has at least
@@ -87,27 +89,27 @@ class Ground:
     """The part of a plane about its point below `center`, as a square of texels `reach` times 4 wide."""
 
     def __init__(self, plane: Plane, center: np.ndarray, reach: float, texels: int = TEXELS) -> None:
-        self.axes, self.width, self.texels = plane.axes(), 4 * reach, texels
-        self.foot = center - plane.height(center) * plane.normal
-        line = np.linspace(-0.5, 0.5, texels)
-        self.u, self.v = (grid.ravel() for grid in np.meshgrid(line, line))
-        across = self.u[:, None] * self.axes[0] + self.v[:, None] * self.axes[1]
-        self.points = self.foot + self.width * across  #: (texels², 3)
+        self.texels, across = texels, plane.axes()[:2]
+        corner = center - plane.height(center) * plane.normal - 2 * reach * across.sum(0)
+        #: (4, 3) where the texel of a column and row is: (x, y, z, 1) of (column, row, 1)
+        self.to_world = np.vstack([np.stack([*4 * reach / (texels - 1) * across, corner], 1), [0, 0, 1]])
+        row, column = np.divmod(np.arange(texels**2), texels)
+        self.u, self.v = column / (texels - 1) - 0.5, row / (texels - 1) - 0.5
+        self.points = np.stack([column, row, np.ones_like(row)], 1) @ self.to_world[:3].T  #: (texels², 3)
 
     def seen_by(self, view: View, texels: np.ndarray) -> np.ndarray:
-        """Texels (texels², …) as a view shows them (H, W, …); NaN, or False, beyond."""
-        height, width = view.shown.shape
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-        rays = view.camera.directions(pixels)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            away = (self.foot - view.camera.position) @ self.axes[2] / (rays @ self.axes[2])
-        hit = view.camera.position + away[:, None] * rays - self.foot
-        place = (hit @ self.axes[:2].T / self.width + 0.5) * self.texels
-        known = (away > 0) & ((place >= 0) & (place < self.texels)).all(1)
-        column, row = np.where(known[:, None], place, 0).astype(int).T
-        shown = texels[row * self.texels + column]
-        shown[~known] = False if shown.dtype == bool else np.nan
-        return shown.reshape(height, width, *texels.shape[1:])
+        """Texels (texels², …) float32 or uint8 as a view shows them (H, W, …); NaN, or 0, beyond."""
+        width, height = view.camera.size
+        middle = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # of a pixel
+        from_pixel = np.linalg.inv(view.camera.projection @ self.to_world) @ middle
+        none = 0 if texels.dtype == np.uint8 else np.nan
+        shown = cv2.warpPerspective(
+            texels.reshape(self.texels, self.texels, -1), from_pixel, (width, height), borderValue=[none] * 4,
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        )  # fmt: skip
+        x, y, one = from_pixel[2]  # of a texel, its inverse depth
+        shown[x * np.arange(width) + y * np.arange(height)[:, None] + one <= 0] = none
+        return shown
 
 
 class Table:
@@ -139,8 +141,7 @@ class Table:
 
     def shown(self, number: int, texels: np.ndarray) -> np.ndarray:
         """How a view has some texels (N,): (N, 3) log radiance, as if lit like the others; NaN where not shown."""
-        pixel, inside = self.views[number].places(self.ground.points[texels])
-        column, row = pixel.T
+        row, column, inside = self.views[number].places(self.ground.points[texels])
         if self.hidden:
             inside &= self.hidden[number][row, column] == 0
         own = log_radiance(self.views[number].rgb[row, column]) - (self.smooth[texels] @ self.lights[number])[:, None]
@@ -148,7 +149,7 @@ class Table:
 
     def stack(self, texels: np.ndarray) -> np.ndarray:
         """The same of all views: (views, N, 3)"""
-        return np.stack([self.shown(number, texels) for number in range(len(self.views))])
+        return np.stack(list(in_threads(partial(self.shown, texels=texels), range(len(self.views)))))
 
     def others(self) -> list[np.ndarray]:
         """Of each view (H, W) uint8 what differs from the table as the others show it: what stands on it."""
@@ -157,7 +158,7 @@ class Table:
             rest = np.abs(self.shown(number, everywhere) - self.colours).max(1)
             usual = float(np.nanmedian(rest)) if np.isfinite(rest).any() else 0.0  # it shows nothing of the table
             other = rest > max(LEAST, SIGNIFICANT * usual)
-            mask = cv2.medianBlur(self.ground.seen_by(view, other).astype(np.uint8), 5)
+            mask = cv2.medianBlur(self.ground.seen_by(view, other.astype(np.uint8)), 5)
             result.append(ndimage.binary_fill_holes(mask).astype(np.uint8))
         return result
 

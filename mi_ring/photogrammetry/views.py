@@ -28,15 +28,16 @@ class View(NamedTuple):
         """(H, W, 3) float32"""
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
-    def places(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points (N, 3) are: pixels (N, 2) int, column and row, and which of them are in the picture (N,)."""
-        local = (points - self.camera.position) @ self.camera.to_world[:3, :3]
+    def places(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where points (N, 3) are: rows and columns (N,) of pixels, and which points are in the picture (N,)."""
+        projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
+        x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixel = self.camera.centre - self.camera.focal * local[:, :2] / local[:, 2:]
-        inside = (local[:, 2] > 0) & (pixel >= 0).all(1) & (pixel < self.camera.size).all(1)
-        pixel = np.where(inside[:, None], pixel, 0).astype(np.int32)
-        inside &= self.shown[pixel[:, 1], pixel[:, 0]]
-        return pixel, inside
+            x, y = x / depth, y / depth
+        inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        row, column = (np.where(inside, pixel, 0).astype(np.int32) for pixel in (y, x))
+        inside &= self.shown[row, column]
+        return row, column, inside
 
 
 def camera_of(lens: Lens, pose: np.ndarray) -> Camera:

@@ -22,6 +22,7 @@ from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.trial import DIM
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
+from mi_ring.system.machine import in_threads
 
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
@@ -85,12 +86,15 @@ def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progres
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
     else:
-        known, board = {}, Board(1.0)
-        for picture in progress(pictures, "sheet"):
-            if sighting := board.detect(picture.srgb()):
-                paper = white(picture.linear(), sighting)
-                known[picture.name] = [a.tolist() for a in (*sighting, *paper)]
+
+        def seen(picture: Picture) -> list | None:
+            sighting = Board(1.0).detect(picture.srgb())
+            paper = white(picture.linear(), sighting) if sighting else ()
             picture.close()
+            return [a.tolist() for a in (*sighting, *paper)] if sighting else None
+
+        found = list(progress(in_threads(seen, pictures), "sheet", len(pictures)))
+        known = {picture.name: values for picture, values in zip(pictures, found) if values}
         write_file(kept, json.dumps(known))
     sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, *_) in known.items()}
     if len(sightings) < FEWEST_SIGHTINGS:
