@@ -21,7 +21,8 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with
-from mi_ring.photogrammetry.motion import alike, structure_from_motion
+from mi_ring.photogrammetry.matching import alike
+from mi_ring.photogrammetry.motion import structure_from_motion
 from mi_ring.photogrammetry.views import camera_of
 from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs
 from mi_ring.system.progress import progress

@@ -17,9 +17,9 @@ from skimage.filters import threshold_otsu
 
 from mi_ring.capture.outlines import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
-from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
 from mi_ring.system.machine import in_threads
+from mi_ring.system.progress import Progress
 
 SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
 AGREE = 0.9  #: share of those that must call it object

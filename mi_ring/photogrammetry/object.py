@@ -15,13 +15,14 @@ from mi_ring.importers.reading import read_as
 from mi_ring.importers.undistortion import Window
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.motion import Motion, Progress
+from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE
 from mi_ring.photogrammetry.table import FLAT, Ground, Plane, Table, bare, find_plane
 from mi_ring.photogrammetry.trial import coverages, sphere_of
 from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import in_threads
+from mi_ring.system.progress import Progress
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
 COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given

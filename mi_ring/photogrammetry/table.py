@@ -10,9 +10,9 @@ from scipy import ndimage
 
 from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
-from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
 from mi_ring.system.machine import in_threads
+from mi_ring.system.progress import Progress
 
 FLAT = 0.004  #: distance from the plane, in that of the cameras, up to which a point belongs to it
 FEWEST = 0.15  #: share of the points that a table has at least

@@ -11,10 +11,10 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.photogrammetry.motion import Progress
 from mi_ring.photogrammetry.views import View
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light
+from mi_ring.system.progress import Progress
 
 ITERATIONS = 100
 FEWEST = 30  #: points that tell where the object is

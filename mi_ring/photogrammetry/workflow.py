@@ -15,7 +15,7 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
-from mi_ring.photogrammetry.motion import Motion, Progress, model_points, structure_from_motion
+from mi_ring.photogrammetry.motion import Motion, model_points, structure_from_motion
 from mi_ring.photogrammetry.object import Object
 from mi_ring.photogrammetry.scene import Shot
 from mi_ring.photogrammetry.table import Plane
@@ -23,6 +23,7 @@ from mi_ring.photogrammetry.trial import DIM
 from mi_ring.rendering.lights import Light
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import in_threads
+from mi_ring.system.progress import Progress
 
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet

@@ -5,9 +5,9 @@ import ctypes
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -81,6 +81,14 @@ def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[R
     """`map`, each in a thread, as many at once as there are cores; for what leaves Python's lock alone."""
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(function, *things)
+
+
+def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
+    """What a long native call returns. Ctrl-C is heard meanwhile, not only at its end: it runs in another thread."""
+    future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
+    while not wait([future], 0.1).done:
+        pass
+    return future.result()
 
 
 def quota(root: Path) -> float:

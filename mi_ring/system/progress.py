@@ -1,9 +1,11 @@
 """How far something is."""
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from tqdm import tqdm
+
+Progress = Callable[..., Iterable]  #: what `progress` is; another shows nothing
 
 
 def progress(things: Iterable | None, what: str, total: int | None = None) -> tqdm:
