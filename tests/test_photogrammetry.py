@@ -17,6 +17,7 @@ from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import masks, motion, table, trial
 from mi_ring.photogrammetry.folder import Picture, find_pictures
+from mi_ring.photogrammetry.matching import pairs_to_match
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, find_body
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, windows, write_shot
