@@ -1,6 +1,6 @@
 """Real photographs: cameras, masks and a fit of the flash skull, judged on photographs that the fit has not seen.
 
-    python benchmarks/skull.py PHOTOS OUT [--preset default] [--flash-offset X Y Z]
+    python benchmarks/skull.py PHOTOS OUT [--preset default] [--flash-offset X Y Z] [--fit OPTIONS]
 
 PHOTOS is the folder of the 66 JPEGs. Every eighth photograph from the fifth is held out of the fit, though not of the
 search for cameras and masks. If `../shared` is there, cameras are compared with COLMAP's of the full-size photographs,
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from trimesh.registration import procrustes
 
 from mi_ring.system.files import write_file
 
@@ -72,10 +73,7 @@ def cameras_off(capture: Path) -> str:
     )
     names = sorted(found.keys() & true.keys())
     a, b = (np.array([centers[name] for name in names]) for centers in (found, true))
-    u, s, v = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ v))])
-    rotation, scale = u * sign @ v, (s * sign).sum() / ((a - a.mean(0)) ** 2).sum()
-    moved = scale * (a - a.mean(0)) @ rotation.T + b.mean(0)
+    _, moved, _ = procrustes(a, b, reflection=False)
     cameras = pycolmap.Reconstruction(REFERENCE / "sparse/0").images.values()
     ahead = np.array([i.cam_from_world().rotation.matrix()[2] for i in cameras])
     origins = np.array([i.projection_center() for i in cameras])

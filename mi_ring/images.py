@@ -59,7 +59,7 @@ def read_image(path: Path) -> np.ndarray:
     """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32."""
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # which Mitsuba does not read
-        pixels = np.array(imageio.imread(path))
+        pixels = np.array(imageio.imread(path, page=0))
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
         with Image.open(path) as image:
             pixels = np.array(image if image.mode == "L" else image.convert("RGB"))

@@ -1,6 +1,8 @@
 """From a folder of photographs to a capture to fit: `python -m mi_ring.photos FOLDER DIR`."""
 
+import json
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -19,7 +21,7 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
-from mi_ring.photogrammetry.folder import find_pictures
+from mi_ring.photogrammetry.folder import find_pictures, ups
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object
 from mi_ring.photogrammetry.scene import windows, write_shot
@@ -33,7 +35,7 @@ from mi_ring.photogrammetry.workflow import (
     upright,
 )
 from mi_ring.system import command
-from mi_ring.system.files import writing
+from mi_ring.system.files import locked, write_file, writing
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
@@ -77,11 +79,16 @@ class PhotosConfig:
         if self.masks == "rembg":
             need("rembg", "--masks rembg")
 
+    def words(self) -> list[str]:
+        """What tells it from others."""
+        return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
+
 
 def cameras_report(motion: Motion) -> str:
     """What structure from motion has found."""
     count, failed = len(motion.cameras), motion.failed
-    how = f"by {len(motion.points)} points, reprojection error {motion.error:.2f} px" if motion.error else "as given"
+    how = f"as given by {motion.source}" if motion.source else f"by {len(motion.points)} points"
+    how += f", reprojection error {motion.error:.2f} px" if motion.error else ""
     return "\n".join([
         f"Cameras: {count} of {count + len(failed)} photographs, {how}",
         *(f"  without: {name}: {why}" for name, why in failed.items()),
@@ -102,15 +109,18 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if `check` finds something to mend."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
-    if scene.exists() and sheet.exists():
+    require_apart(config)
+    if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/ and "
                          f"valid/ beside it, to make it anew from {config.out}/work")  # fmt: skip
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        if not scene.exists():
-            make(config, scene)
-        inspection = inspect(load_capture(scene))
+        with locked(config.out, "DIR"):
+            if not scene.exists():
+                make(config, scene)
+            inspection = inspect(load_capture(scene))
     except KeyboardInterrupt:
+        sys.stdout.flush()
         print("mi_ring.photos: interrupted; the same command goes on", file=sys.stderr, flush=True)
         os._exit(130)  # native threads do not let themselves be ended; what they write is whole or not at all
     finally:
@@ -120,11 +130,30 @@ def main(arguments: Sequence[str]) -> int:
     return int(bool(inspection.findings))
 
 
+def require_apart(config: PhotosConfig) -> None:
+    """Raise InputError if what is written would come among the photographs or masks that are given."""
+    given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
+    out = config.out.resolve()
+    written = [out / name for name in ("images", "masks", "valid", "work")]
+    for field, folder in given.items():
+        place = folder.resolve()
+        if place == out or any(place.is_relative_to(taken) for taken in written):
+            raise InputError(f"{folder}: {field}: is where the capture is written; give another DIR than {config.out}")
+
+
+def made_by(out: Path) -> list[str] | None:
+    """The `words` that a capture was made with; None if that is not known."""
+    file = out / "work/options.json"
+    return json.loads(file.read_text("utf-8")) if file.exists() else None
+
+
 def make(config: PhotosConfig, scene: Path) -> None:
     """The capture, from what has been found so far."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
     with writing(config.out):
         config.out.mkdir(parents=True, exist_ok=True)
+    for left in config.out.glob(".scene.*/"):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
     require_same_photographs(pictures, work)
     sheet = find_sheet(pictures, config.square_mm, work, progress)
@@ -147,13 +176,15 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if config.masks == "auto":  # what shows a table and no mask would be taken for the object
         motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
     if not sheet:
-        motion, plane = upright(motion, found.center, plane)
+        motion, plane = upright(motion, found.center, plane, ups(pictures))
+        found = found._replace(center=np.zeros(3))
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
     try:
         written = in_threads(partial(write_shot, writer), taken, windows(taken))
         root.extend(progress(written, "writing", len(taken)))
+        write_file(work / "options.json", json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:
         writer.close()

@@ -82,7 +82,7 @@ with locked(pathlib.Path(sys.argv[1])):
     folder = tmp_path / "out" / "pot"
     holder = subprocess.Popen([sys.executable, "-c", code, folder], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert holder.stdout.readline() == b"locked\n"
-    with pytest.raises(InputError, match="pot: --out: another fit is writing there"), files.locked(folder):
+    with pytest.raises(InputError, match="pot: --out: another process is writing there"), files.locked(folder):
         pass
     with files.locked(folder.with_name("other")):
         pass

@@ -7,6 +7,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -16,11 +17,13 @@ from test_photogrammetry import CENTER, LENS, hit_ellipsoid, in_a_dim_room, pose
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.photogrammetry.folder import Picture, relative_exposures
+from mi_ring.images import write_image
+from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures
 from mi_ring.photogrammetry.motion import Motion
+from mi_ring.photogrammetry.object import box_in, kept_masks
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.views import camera_of
-from mi_ring.photogrammetry.workflow import PAPER, Sheet, require_sides, upright
+from mi_ring.photogrammetry.workflow import PAPER, Sheet, cameras_beside, require_sides, upright
 from mi_ring.system import command
 
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -45,7 +48,10 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     out = tmp_path / "capture"
     assert photos.main([str(folder), str(out), "--flash-offset", "0.1", "-0.05", "0"]) == 0
     text = capsys.readouterr().out
-    assert "Cameras: 20 of 20 photographs, as given" in text and "Nothing to mend found" in text
+    assert (
+        f"Cameras: 20 of 20 photographs, as given by {folder / 'transforms.json'}" in text
+        and "Nothing to mend found" in text
+    )
     capture = load_capture(out / "scene.xml")
     assert len(capture) == 20 and all(mask is not None for mask in capture.masks)
     center, radius = capture.sphere()
@@ -79,6 +85,62 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     (out / "scene.xml").unlink()
     with pytest.raises(InputError, match="work: is of other photographs"):
         photos.main([str(folder), str(out)])
+
+
+def test_masks_that_were_painted_in(folder, tmp_path):
+    file = tmp_path / "01.png"
+    soft = np.linspace(0, 65535, 80).astype(np.uint16)[None].repeat(60, 0)[..., None]
+    write_image(soft, file)  # half of the photograph's size
+    found = kept_masks([Picture(folder / f"{k:02}.png") for k in range(3)], tmp_path)
+    assert list(found) == ["01"] and np.unique(found["01"]).tolist() == [0, 128, 255]
+    assert [(found["01"] == value).mean() for value in (0, 128, 255)] == [0.25, 0.5, 0.25]
+    write_image(np.zeros((100, 160, 1), np.uint8), file)
+    with pytest.raises(InputError, match=r"01.png: is 160 x 100 pixels, .* 160 x 120 of its photograph"):
+        kept_masks([Picture(folder / "01.png")], tmp_path)
+    with pytest.raises(InputError, match="has no masks any more"):
+        kept_masks([Picture(folder / "00.png")], tmp_path)
+
+
+def test_a_box_in_a_photograph_is_where_its_corners_are(folder):
+    camera = camera_of(LENS, next(poses(20)))
+    low, high = CENTER + [[-2, -3, -1], [1, 2, 3]]
+    shown = box_in(camera, np.stack([low, high], 1).ravel())
+    points = np.random.default_rng(0).uniform(low, high, (20_000, 3))
+    pixel, _ = camera.project(points)
+    column, row = pixel.astype(int).T
+    inside = np.zeros((120, 160), np.uint8)
+    inside[row, column] = 1
+    assert (inside <= cv2.dilate(shown, np.ones((3, 3)))).all()
+    assert (shown <= cv2.dilate(inside, np.ones((5, 5)))).all()
+
+
+def test_a_capture_is_not_written_among_what_it_is_made_of(folder, tmp_path):
+    for arguments in ([folder, folder], [folder, folder.parent, "--masks", folder.parent / "masks"]):
+        (folder.parent / "masks").mkdir(exist_ok=True)
+        with pytest.raises(InputError, match="is where the capture is written"):
+            photos.main([str(argument) for argument in arguments])
+    folder.rename(tmp_path / "images")
+    with pytest.raises(InputError, match="images: FOLDER: is where the capture is written"):
+        photos.main([str(tmp_path / "images"), str(tmp_path)])
+
+
+def test_geocentric_cameras_and_wrong_ones(folder):
+    file = folder / "transforms.json"
+    top = json.loads(file.read_text())
+    pictures = find_pictures(folder, upright=False)
+    near = cameras_beside(pictures)
+    for frame in top["frames"]:
+        for row, shift in zip(frame["transform_matrix"], (4.1e6, 6.2e5, -4.8e6)):
+            row[3] += shift
+    file.write_text(json.dumps(top))
+    far = cameras_beside(pictures)
+    for name, (_, pose) in far.cameras.items():
+        np.testing.assert_allclose(pose, near.cameras[name][1], atol=1e-8)
+    for frame in top["frames"]:
+        frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    file.write_text(json.dumps(top))
+    with pytest.raises(InputError, match=r"00.png: camera: the last row of its pose is .*; is it transposed"):
+        cameras_beside(pictures)
 
 
 def test_masks_that_the_user_brings(folder, tmp_path):
@@ -138,14 +200,15 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
         turned[:3, :3], turned[:3, 3] = turn @ pose[:3, :3], turn @ pose[:3, 3]
         cameras[str(k)] = LENS, turned
     motion = Motion(cameras, (turn @ CENTER)[None], None, {})
-    moved, none = upright(motion, turn @ CENTER, None)
+    ups = dict.fromkeys(cameras, np.array([0.0, -1, 0]))
+    moved, none = upright(motion, turn @ CENTER, None, ups)
     np.testing.assert_allclose(moved.points, 0, atol=1e-9)
     heights = [pose[2, 3] for _, pose in moved.cameras.values()]
     distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
     assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
     assert none is None
     low = Plane(turn[:, 2], float(turn[:, 2] @ turn @ (CENTER - [0, 0, 3])))  # 3 below the object's middle
-    exact, plane = upright(motion, turn @ CENTER, low)
+    exact, plane = upright(motion, turn @ CENTER, low, ups)
     np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-9)
     assert plane.offset * 18 == pytest.approx(-3, rel=0.1)  # the cameras are 18 away, now 1
     for (_, pose), before in zip(exact.cameras.values(), poses(12)):

@@ -91,6 +91,15 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise InputError for invalid cameras, lights and names, and for files of another size than their camera's."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
+    require_cameras(frames)
+    for frame in frames:
+        for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
+            if file and (size := image_size(file)) != frame.size:
+                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *size, *frame.size))
+
+
+def require_cameras(frames: Sequence[Frame]) -> None:
+    """Raise InputError for invalid cameras, lights and names."""
     for frame in frames:
         what = f"{frame.image}: camera"
         command.require_utf8(str(frame.image))
@@ -107,6 +116,3 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
         if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
             raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
                              "must be finite and not negative")  # fmt: skip
-        for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
-            if file and (size := image_size(file)) != frame.size:
-                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *size, *frame.size))

@@ -1,7 +1,7 @@
 """What formats of photogrammetry have in common: ordinary photographs, taken with a light beside the camera."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
@@ -13,6 +13,8 @@ from PIL import ExifTags, Image
 from mi_ring.errors import InputError
 from mi_ring.importers.frames import Frame, Source, called
 from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
+
+EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
 
 
 @dataclass(frozen=True)
@@ -84,19 +86,24 @@ def exif_exposure(path: Path) -> float | None:
     if path.suffix.lower() == ".exr":
         return None
     exif = read_as(path, "image", read_exif)
-    tags = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
-    values: list[Any] = [exif.get(tag) for tag in tags]
+    exposure = exposure_of(exif)
+    if exposure is not None and not 0 < exposure < math.inf:
+        values = ", ".join(str(exif[tag]) for tag in EXPOSURE)
+        raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {values}; must be positive numbers, or "
+                         "give --no-exif if all photographs have the same exposure")  # fmt: skip
+    return exposure
+
+
+def exposure_of(exif: Mapping[int, Any]) -> float | None:
+    """The same of the part of EXIF data that is about it; None if there is nothing, NaN if it is no number."""
+    values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
     if not all(values):
         return None
     try:
         seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
-        exposure = seconds * iso / f_number**2
+        return seconds * iso / f_number**2
     except (TypeError, ValueError, ZeroDivisionError):
-        exposure = math.nan
-    if not 0 < exposure < math.inf:
-        raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {', '.join(map(str, values))}; must be "
-                         "positive numbers, or give --no-exif if all photographs have the same exposure")  # fmt: skip
-    return exposure
+        return math.nan
 
 
 def read_exif(path: Path) -> dict[int, Any]:

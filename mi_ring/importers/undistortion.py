@@ -57,8 +57,11 @@ def undistort(
     part of it, not reduced.
     """
     places = distorted(lens, window or whole(lens))
-    size = np.array(pixels.shape[:2])[:, None, None]
-    valid = np.all((places >= -0.5) & (places <= size - 0.5), 0)  # a pixel is as wide as 1
+    size = np.array(pixels.shape[:2])
+    valid = np.all((places >= -0.5) & (places <= size[:, None, None] - 0.5), 0)  # a pixel is as wide as 1
+    low = np.clip(np.floor(places.min((1, 2))), 0, size - 1).astype(int)  # of what is needed
+    high = np.clip(np.ceil(places.max((1, 2))) + 1, low + 1, size).astype(int)
+    pixels, places = pixels[low[0] : high[0], low[1] : high[1]], places - low[:, None, None]
     full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
 
     def resampled(channel: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from trimesh.registration import procrustes
 
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens, inverse
@@ -20,6 +21,7 @@ LONGEST = 2000  #: markers are looked for in pictures of so many pixels at most;
 FEWEST = 6  #: corners that are worth something
 STRAY = 0.25  #: of a square: a corner that is so far from where the others want it is something else
 FIT = 0.02  #: of the width that is seen: how well corners of a true sheet lie where they should
+CLIPPED = 0.95  #: of full scale, linear: a colour above may be brighter than a file can say
 OFF = 0.002  #: of a photograph's longer side: a corner so far from where other photographs see it is wrong
 
 Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
@@ -210,7 +212,7 @@ def triangulate(
 
 
 def nearest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """The points (..., 3) nearest to rays (..., n, 3)."""
+    """The points (..., 3) nearest to rays (..., n, 3), which are not parallel."""
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     return np.linalg.solve(across.sum(-3), (across @ origins[..., None]).sum(-3))[..., 0]
 
@@ -239,16 +241,15 @@ def consistent(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def umeyama(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation (3, 3), shift (3,) that move points (n, 3) to the true ones by least squares (Umeyama 1991)."""
-    middle, target = found.mean(0), true.mean(0)
-    u, s, vt = np.linalg.svd((true - target).T @ (found - middle))
-    sign = np.array([1, 1, np.linalg.det(u) * np.linalg.det(vt)])
-    rotation = u * sign @ vt
-    scale = float((s * sign).sum() / ((found - middle) ** 2).sum())
-    return scale, rotation, target - scale * rotation @ middle
+    matrix = procrustes(found, true, reflection=False, return_cost=False)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    return scale, matrix[:3, :3] / scale, matrix[:3, 3]
 
 
 def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarray]:
     """White squares of which a photograph (H, W, 3) float32 shows all four corners: middles (n, 3) and colours (n, 3).
+
+    But for those that are too bright for the file to tell how bright.
 
     Middles are on the sheet, as the sighting has them; colours are linear, medians about the markers.
     """
@@ -270,6 +271,8 @@ def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarra
         plane = cv2.getPerspectiveTransform(unit, four)
         x, y = (cv2.perspectiveTransform(rims[None], plane)[0] - 0.5).astype(np.float32).T
         seen = cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        middles.append(np.mean([places[k] for k in ring], 0))
-        colours.append(np.median(seen, 0))
+        colour = np.median(seen, 0)
+        if colour.max() < CLIPPED:
+            middles.append(np.mean([places[k] for k in ring], 0))
+            colours.append(colour)
     return np.array(middles).reshape(-1, 3), np.array(colours).reshape(-1, 3)

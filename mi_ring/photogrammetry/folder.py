@@ -12,7 +12,9 @@ from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
+from mi_ring.system import command
 from mi_ring.system.optional import need
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -20,6 +22,8 @@ HEIF = (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF
 FEWEST = 8  #: photographs that a reconstruction needs at least
+
+Image.MAX_IMAGE_PIXELS = None  # photographs of phones have more than what Pillow takes for an attack
 
 
 @dataclass(frozen=True)
@@ -55,25 +59,28 @@ class Picture:
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
-    @cached_property
+    @property
     def orientation(self) -> int:
         """By EXIF's numbers, how the pixels of the file are still to be turned; HEIF's reader has done so."""
+        return self.held if self.upright and self.path.suffix.lower() not in HEIF else 1
+
+    @cached_property
+    def held(self) -> int:
+        """By EXIF's numbers, how the camera was held, whoever turns the pixels, if anybody does."""
         suffix = self.path.suffix.lower()
-        if not self.upright or suffix in HEIF:
-            return 1
+        if suffix in HEIF:
+            let_open(self.path)
+            with Image.open(self.path) as image:
+                return image.info.get("original_orientation") or 1
         if suffix in RAW:
             return FLIPS.get(read_as(self.path, "raw photograph", flip), 1)
         value = exif_of(self.path).get(ExifTags.Base.Orientation)
         return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
-    @cached_property
-    def held(self) -> int:
-        """By EXIF's numbers, how the camera was held, whoever turns the pixels."""
-        if self.upright and self.path.suffix.lower() in HEIF:
-            let_open(self.path)
-            with Image.open(self.path) as image:
-                return image.info.get("original_orientation") or 1
-        return self.orientation
+    @property
+    def axes(self) -> np.ndarray:
+        """(3, 3): from the axes of the sensor, x right, y down, z forward, to those of `pixels`."""
+        return axes_of(self.held if self.upright or self.path.suffix.lower() in HEIF else 1)
 
     @property
     def encoding(self) -> str:
@@ -194,7 +201,12 @@ def axes_of(orientation: int) -> np.ndarray:
 def turned_with(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
     """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name."""
     usual, _ = Counter(picture.held for picture in pictures).most_common(1)[0]
-    return {p.name: axes_of(p.held) @ axes_of(usual).T @ vector for p in pictures}
+    return {p.name: p.axes @ axes_of(usual).T @ vector for p in pictures}
+
+
+def ups(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
+    """Where up is as each photograph is to be shown (3,), in the axes of its pixels, by its name."""
+    return {p.name: p.axes @ axes_of(p.held).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
@@ -208,8 +220,11 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         kind = path.suffix.lower()
-        if kind not in PLAIN + HEIF + RAW or path.name.startswith("."):
+        if kind not in PLAIN + HEIF + RAW or path.name.startswith(".") or not path.is_file():
             continue
+        command.require_utf8(str(path))
+        if "$" in path.name:
+            raise InputError(f"{path}: FOLDER: has a $ in its name, which scene files take for a parameter; rename it")
         # A camera that writes both raw and JPEG: the raw one is linear.
         if path.stem not in found or kind in RAW:
             found[path.stem] = path
@@ -246,15 +261,7 @@ def focal_35mm(pictures: Sequence[Picture]) -> float | None:
 
 def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
     """(N,) by EXIF, 1 for the one in the middle; all 1 unless all photographs say."""
-    exposures = []
-    for picture in pictures:
-        exif = exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)
-        tags = ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber
-        try:
-            seconds, iso, number = (float(np.ravel(exif[tag])[0]) for tag in tags)
-            exposures.append(seconds * iso / number**2)
-        except (KeyError, TypeError, ValueError, ZeroDivisionError):
-            exposures.append(np.nan)
+    exposures = [exposure_of(exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)) or np.nan for picture in pictures]
     found = np.array(exposures)
     return found / np.median(found) if np.isfinite(found).all() and (found > 0).all() else np.ones(len(found))
 

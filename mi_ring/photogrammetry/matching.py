@@ -33,7 +33,7 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
     database, grey = folder / "database.db", folder / "grey"
     cameras = {image.name: image.camera_id for image in images_of(database)}
     lenses: dict[tuple[int, int], int] = {}
-    equivalent = focal_35mm(pictures)
+    equivalent = {size: focal_35mm([p for p in pictures if p.size == size]) for size in {p.size for p in pictures}}
     for picture in progress(pictures, "features"):
         file = file_of(picture)
         if file not in cameras:
@@ -43,8 +43,8 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
             reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
             if picture.size in lenses:
                 reader.existing_camera_id = lenses[picture.size]
-            elif equivalent:
-                focal = equivalent / 36 * max(reduced.size)
+            elif known := equivalent[picture.size]:
+                focal = known / 36 * max(reduced.size)
                 reader.camera_params = f"{focal},{reduced.width / 2},{reduced.height / 2},0"
             mode = pycolmap.CameraMode.SINGLE
             interruptible(pycolmap.extract_features, database, grey, [file], mode, reader, options)

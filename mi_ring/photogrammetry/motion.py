@@ -31,11 +31,13 @@ class Motion:
     points: np.ndarray  #: (N, 3)
     error: float | None  #: mean reprojection error [px of the photographs], if it is known
     failed: dict[str, str]  #: photographs without a camera, and why
+    source: str = ""  #: where the cameras are from, if not from structure from motion
 
     def digest(self) -> str:
         """What tells these cameras from others."""
-        poses = b"".join(name.encode() + pose.round(6).tobytes() for name, (_, pose) in sorted(self.cameras.items()))
-        return hashlib.blake2b(poses, digest_size=8).hexdigest()
+        found = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
+                 for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
+        return hashlib.blake2b("\n".join(found).encode(), digest_size=8).hexdigest()
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Motion":
         """In another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
@@ -83,7 +85,7 @@ def put_together(folder: Path, count: int, progress: Progress) -> Any:
     that fit; these may be nearly in one plane, and what is mirrored then stays so. The latter is better at
     photographs whose matches are mostly wrong, by a pattern that repeats or shadows that move.
     """
-    models = [mapping(folder, count, progress) for mapping in (map_globally, map_incrementally)]
+    models = [map_globally(folder, progress), map_incrementally(folder, count, progress)]
     best: Any = max(filter(None, models), key=lambda model: explained(model, folder / "database.db"), default=None)
     for k in list(best.reg_image_ids()) if best else []:
         if best.images[k].num_points3D < FEWEST_POINTS:
@@ -91,7 +93,7 @@ def put_together(folder: Path, count: int, progress: Progress) -> Any:
     return best
 
 
-def map_globally(folder: Path, count: int, progress: Progress) -> Any:
+def map_globally(folder: Path, progress: Progress) -> Any:
     """The largest `pycolmap.Reconstruction` by rotations and places of all cameras together; None if there is none."""
     pycolmap = need("pycolmap", "structure from motion")
     options = pycolmap.GlobalPipelineOptions(random_seed=0)

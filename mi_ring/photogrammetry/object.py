@@ -1,15 +1,19 @@
 """The object as the photographs show it: where it is, and its masks."""
 
 import contextlib
+import hashlib
+import itertools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from mi_ring.capture.outlines import grown
 from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, write_image
 from mi_ring.importers.reading import read_as
 from mi_ring.importers.undistortion import Window
@@ -19,9 +23,10 @@ from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE
 from mi_ring.photogrammetry.table import FLAT, Ground, Plane, Table, bare, find_plane
 from mi_ring.photogrammetry.trial import coverages, sphere_of
-from mi_ring.photogrammetry.views import View, around, pasted, reduced, reduced_mask, whole_of
+from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, reduced_mask, whole_of
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import in_threads
+from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
@@ -47,6 +52,13 @@ class Hints(NamedTuple):
     box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
     masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
 
+    def digest(self) -> str:
+        """What tells where masks come from, and those of a folder, from others."""
+        if not isinstance(self.masks, Path):
+            return self.masks
+        files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
+        return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
+
     def allow(self, points: np.ndarray, distance: float, flat: float = 2 * FLAT) -> np.ndarray:
         """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras.
 
@@ -69,18 +81,17 @@ def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folde
     """
     folder.mkdir(exist_ok=True)
     kept = folder / "object.json"
-    asked = {"masks": str(hints.masks), "box": hints.box and list(hints.box), "cameras": motion.digest()}
+    asked = {"masks": hints.digest(), "box": hints.box and list(hints.box), "cameras": motion.digest()}
+    shown = [picture for picture in pictures if picture.name in motion.cameras]
     if kept.exists():
         known = json.loads(kept.read_text("utf-8"))
         if other := [name for name, value in asked.items() if known["asked"][name] != value]:
             what = "cameras" if "cameras" in other else f"--{other[0]}"
             raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
                              "anew, or give another DIR")  # fmt: skip
-        files = {name: folder / f"{name}.png" for name in known["sure"]}
-        masks_ = {n: read_as(f, "mask", read_image)[..., 0] for n, f in files.items() if f.exists()}
         plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
-        return Object(masks_, np.array(known["center"]), known["level"], plane)
-    shown = [picture for picture in pictures if picture.name in motion.cameras]
+        return Object(kept_masks(shown, folder), np.array(known["center"]), known["level"], plane)
+    need("pycolmap", "lenses")  # here, for it handles signals, which threads may not
 
     def whole(picture: Picture) -> View:
         lens, pose = motion.cameras[picture.name]
@@ -104,10 +115,31 @@ def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folde
     levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
     result = Object(shades, body.points.mean(0), float(np.median(levels)), plane)
     write_file(kept, json.dumps({
-        "asked": asked, "sure": list(shades), "center": result.center.tolist(), "level": result.level,
+        "asked": asked, "center": result.center.tolist(), "level": result.level,
         "plane": plane and [plane.normal.tolist(), plane.offset],
     }))  # fmt: skip
     return result
+
+
+def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
+    """By the photograph's name, masks of a folder as `Object` has them; what anybody painted is the nearest of these.
+
+    Raises InputError if there is none, or one that is no reduction of its photograph.
+    """
+    found = {}
+    for picture in pictures:
+        file = folder / f"{picture.name}.png"
+        if file.exists():
+            mask = read_as(file, "mask", read_image)[..., 0]
+            (height, width), scale = mask.shape, max(1, round(picture.size[0] / mask.shape[1]))
+            if (width, height) != (picture.size[0] // scale, picture.size[1] // scale):
+                raise InputError("{}: is {} x {} pixels, which is no whole part of the {} x {} of its photograph; keep "
+                                 "the size of masks".format(file, width, height, *picture.size))  # fmt: skip
+            shade = mask / np.iinfo(mask.dtype).max if mask.dtype != np.float32 else mask
+            found[picture.name] = np.array([0, UNSURE, OBJECT], np.uint8)[np.digitize(shade, [0.25, 0.75])]
+    if not found:
+        raise InputError(f"{folder}: has no masks any more; remove it to have them found anew")
+    return found
 
 
 def brought(
@@ -119,17 +151,33 @@ def brought(
         mask = picture.mask(source)
         picture.close()
         if mask is not None:
-            shades[picture.name] = OBJECT * reduced_mask(mask, motion.cameras[picture.name][0], BROUGHT)
+            lens, pose = motion.cameras[picture.name]
+            shade = OBJECT * reduced_mask(mask, lens, BROUGHT)
+            if hints.box:
+                shade *= box_in(camera_of(lens, pose).shrunk(whole_of(lens, BROUGHT).scale), hints.box)
+            shades[picture.name] = shade
     if len(shades) < len(pictures) / 2:
-        raise InputError(f"--masks: {source}: has masks for {len(shades)} of {len(pictures)} photographs; they must be "
-                         "called like the photographs, with .png added or instead of the suffix")  # fmt: skip
+        what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
+        how = "PNG with transparency" if source == "alpha" else (
+            "they must be called like the photographs, with .png added or instead of the suffix")  # fmt: skip
+        raise InputError(f"{what} masks for {len(shades)} of {len(pictures)} photographs; {how}")
     space = masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
     space.allowed = hints.allow(space.grid, space.distance)
     body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views], masks.AGREE)
     if body is None:
-        raise InputError(f"--masks: {source}: no point in space is inside most of these masks; are they of these "
-                         "photographs?")  # fmt: skip
+        raise InputError(f"--masks: {source}: no point in space {'of --box ' * bool(hints.box)}is inside most of these "
+                         "masks; are they of these photographs?")  # fmt: skip
     return body, shades
+
+
+def box_in(camera: Camera, box: Sequence[float]) -> np.ndarray:
+    """(H, W) uint8: 1 where a photograph shows a box, as `Hints.box` has it."""
+    corners = np.array(list(itertools.product(*np.reshape(box, (3, 2)))))
+    pixels, depth = camera.project(corners)
+    if depth.min() <= 0:  # the camera is next to it
+        return np.ones(camera.size[::-1], np.uint8)
+    hull = cv2.convexHull(np.clip(pixels, -1e6, 1e6).astype(np.float32))
+    return cv2.fillConvexPoly(np.zeros(camera.size[::-1], np.uint8), np.round(hull).astype(np.int32), 1)
 
 
 def searched(
@@ -144,8 +192,9 @@ def searched(
     covered = [(p, body.coverage(view)) for p, view in zip(pictures, space.views)] if body else []
     showing = [(picture, cover) for picture, cover in covered if cover.any()]
     if body is None or len(showing) < len(pictures) / 2:
-        raise InputError(f"{folder}: masks: no object was found, neither one that stands on a table nor one that the "
-                         "flash lights more than what is around it; give --masks")  # fmt: skip
+        where = " in --box" if hints.box else ""
+        raise InputError(f"{folder}: masks: no object was found{where}, neither one that stands on a table nor one "
+                         "that the flash lights more than what is around it; give --masks")  # fmt: skip
 
     def near(picture: Picture, cover: np.ndarray) -> tuple[View, View, Window]:
         lens, pose = motion.cameras[picture.name]

@@ -1,5 +1,6 @@
 """The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,8 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.importers.cameras import Lens
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
+from mi_ring.importers.frames import require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
@@ -41,14 +44,18 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
     write_file(known, json.dumps(listed))
 
 
-def upright(motion: Motion, center: np.ndarray, plane: Plane | None) -> tuple[Motion, Plane | None]:
+def upright(
+    motion: Motion, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
+) -> tuple[Motion, Plane | None]:
     """Moved so that the object's `center` (3,) is the origin, and z the table's normal or the photographs' mean up.
+
+    `ups` (3,): where that is in the axes of each camera.
 
     The unit is the median distance from the cameras to the object.
     """
     poses = np.stack([pose for _, pose in motion.cameras.values()])
     scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
-    up = plane.normal if plane else -poses[:, :3, 1].mean(0)
+    up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in motion.cameras.items()], 0)
     rotation = rotation_to_z(up / np.linalg.norm(up)) if np.linalg.norm(up) > 0.1 else np.eye(3)
     table = plane and Plane(rotation @ plane.normal, scale * (plane.offset - float(center @ plane.normal)))
     return motion.moved(scale, rotation, -scale * rotation @ center), table
@@ -113,7 +120,9 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
         source = replace(source, exif=False)
     for picture in pictures:
         let_open(picture.path)
-    frames = {frame.image.stem: frame for frame in source.frames()}
+    taken = list(source.frames())
+    require_cameras(taken)
+    frames = {frame.image.stem: frame for frame in taken}
     for p in pictures:
         if p.name in frames and frames[p.name].size != p.size:
             raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
@@ -125,7 +134,9 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
                          "to have cameras found in the photographs")  # fmt: skip
     model = Colmap.model(source.src)
     points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
-    return Motion(cameras, points, None, failed)
+    # Geocentric coordinates of metres are too large for float32.
+    middle = np.median([pose[:3, 3] for _, pose in cameras.values()], axis=0)
+    return Motion(cameras, points, None, failed, f"{source.src}").moved(1.0, np.eye(3), -middle)
 
 
 def require_sides(motion: Motion, folder: Path) -> None:
@@ -153,22 +164,32 @@ def find_cameras(
         return beside
     try:
         return structure_from_motion(pictures, folder, progress)
-    except InputError:
+    except InputError as error:
         if sheet is None or len(sheet.sightings) < len(pictures) / 2:
             raise
+        print(f"{error}\nThe cameras are those by the sheet alone.")
         return cameras_of_sheet(pictures, sheet)
 
 
 def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
     """Cameras from the sheet alone, in its frame [mm]: of objects without texture, and on turntables."""
-    sizes = [picture.size for picture in pictures]
-    size = max(set(sizes), key=sizes.count)
-    names = {picture.name for picture in pictures if picture.size == size}
-    lens, poses, errors = calibrate({n: s for n, s in sheet.sightings.items() if n in names}, size)
-    why = "does not show enough of the sheet, or is of another size"
-    failed = {picture.name: why for picture in pictures if picture.name not in poses}
-    cameras = {name: (lens, pose) for name, pose in poses.items()}
-    return Motion(cameras, np.zeros((0, 3)), float(np.mean(list(errors.values()))), failed)
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for picture in pictures:
+        by_size.setdefault(picture.size, []).append(picture.name)
+    cameras: dict[str, tuple[Lens, np.ndarray]] = {}
+    errors: list[float] = []
+    for size, names in by_size.items():
+        sightings = {name: sheet.sightings[name] for name in names if name in sheet.sightings}
+        with contextlib.suppress(InputError):  # too few of this size
+            lens, poses, own = calibrate(sightings, size)
+            cameras |= {name: (lens, pose) for name, pose in poses.items()}
+            errors += own.values()
+    if len(cameras) < len(pictures) / 2:
+        raise InputError(f"{pictures[0].path.parent}: sheet: {len(cameras)} of {len(pictures)} photographs show enough "
+                         "of it and fit each other; must be half of them: let more show more of it")  # fmt: skip
+    why = "does not show enough of the sheet, or does not fit the others of its size"
+    failed = {picture.name: why for picture in pictures if picture.name not in cameras}
+    return Motion(cameras, np.zeros((0, 3)), float(np.mean(errors)), failed, "the sheet")
 
 
 def shots(
@@ -180,12 +201,12 @@ def shots(
     """
     flash = turned_with(pictures, offset)
     known = sheet.strengths(motion, flash) if sheet else {}
-    usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM)
-    result = []
-    for picture, exposure in zip(pictures, relative_exposures(pictures)):
-        if picture.name in motion.cameras:
-            lens, pose = motion.cameras[picture.name]
-            light = Light("point", pose[:3, :3] @ flash[picture.name] + pose[:3, 3],
-                          known.get(picture.name, exposure * usual))  # fmt: skip
-            result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
+    away = np.median([np.linalg.norm(pose[:3, 3] - object_.center) for _, pose in motion.cameras.values()])
+    usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM * away**2)
+    result, taken = [], [picture for picture in pictures if picture.name in motion.cameras]
+    for picture, exposure in zip(taken, relative_exposures(taken)):
+        lens, pose = motion.cameras[picture.name]
+        light = Light("point", pose[:3, :3] @ flash[picture.name] + pose[:3, 3],
+                      known.get(picture.name, exposure * usual))  # fmt: skip
+        result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
     return result

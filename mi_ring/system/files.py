@@ -63,21 +63,21 @@ def write_state(state: dict, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, field: str = "--out") -> Iterator[None]:
     """Keep other processes from writing into a folder. Raises InputError if one does already.
 
     The lock is beside the folder, which may be moved meanwhile, and goes with the process.
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
-    with writing(f"{folder}: --out"):
+    with writing(f"{folder}: {field}"):
         place.parent.mkdir(parents=True, exist_ok=True)
         lock = filelock.FileLock(file, timeout=0)
         try:
             lock.acquire()
         except filelock.Timeout:
             raise InputError(
-                f"{folder}: --out: another fit is writing there; wait for it, or give another folder"
+                f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
             ) from None
     try:
         yield
