@@ -173,6 +173,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     found = find_object(pictures, motion, hints, work / "masks", progress)
     plane = found.plane
     print(masks_report(found, motion, config.masks))
+    if not plane:
+        print("Table: none found; if the object stands on one, see in the contact sheet that it is not in the masks")
     if config.masks == "auto":  # what shows a table and no mask would be taken for the object
         motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
     if not sheet:

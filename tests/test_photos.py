@@ -103,7 +103,7 @@ def test_masks_that_were_painted_in(folder, tmp_path):
 
 def test_a_box_in_a_photograph_is_where_its_corners_are(folder):
     camera = camera_of(LENS, next(poses(20)))
-    low, high = CENTER + [[-2, -3, -1], [1, 2, 3]]
+    low, high = CENTER + np.array([[-2, -3, -1], [1, 2, 3]])
     shown = box_in(camera, np.stack([low, high], 1).ravel())
     points = np.random.default_rng(0).uniform(low, high, (20_000, 3))
     pixel, _ = camera.project(points)
