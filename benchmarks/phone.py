@@ -1,7 +1,8 @@
 """Simulated phone captures with their truth: an object on a printed sheet, photographed by hand with the flash on.
 
     python benchmarks/phone.py OUT [--object NAME|MESH] [--disturbances all|none|NAME,NAME…] [--ambient 0.03]
-        [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|none] [--turntable] [--spp N] [--no-exact]
+        [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|white|none] [--turntable] [--spp N]
+        [--no-exact]
 
 Writes, in the world of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
 
@@ -248,7 +249,8 @@ def parse(arguments: list[str] | None = None) -> tuple[Path, Settings]:
     parser.add_argument("--views", type=int, default=Settings.views, help="number of photographs")
     parser.add_argument("--size", default="1440x1080", help="WIDTHxHEIGHT [px]")
     parser.add_argument("--seed", type=int, default=Settings.seed)
-    parser.add_argument("--sheet", default="board", choices=("board", "random", "none"), help="what lies on the table")
+    sheets = "board", "random", "white", "none"
+    parser.add_argument("--sheet", default="board", choices=sheets, help="what lies on the table")
     parser.add_argument("--turntable", action="store_true", help="the object turns, camera and light stand")
     parser.add_argument("--spp", type=int, default=Settings.spp, help="paths per pixel, a square number")
     parser.add_argument("--no-exact", dest="exact", action="store_false", help="leave out the exact capture")

@@ -268,7 +268,7 @@ def averaged(values: list, shot: Shot, window: Window, spp: int) -> np.ndarray:
 class Stage:
     """The object, what it stands on and the light, to be photographed.
 
-    `sheet`: board, random, none, or bare: no table either. `turntable`: a plain backdrop stands behind.
+    `sheet`: board, random, white, none, or bare: no table either. `turntable`: a plain backdrop stands behind.
     """
 
     brightest = 0.3  #: of what one path brings by way of other surfaces
@@ -281,8 +281,9 @@ class Stage:
         self.flash = mi.load_dict({"type": "cone_flash"})
         self.own, self.standing = {"object": self.object}, {}
         to_world = mi.ScalarTransform4f()
-        if sheet in ("board", "random"):
-            albedo = board_page() if sheet == "board" else random_page(rng)
+        if sheet in ("board", "random", "white"):
+            white = np.full((2, 2), PAPER)
+            albedo = board_page() if sheet == "board" else random_page(rng) if sheet == "random" else white
             self.own["sheet"] = mi.load_dict({
                 "type": "rectangle", "to_world": to_world.scale([*(PAGE / 2).tolist(), 1.0]),
                 "bsdf": {"type": "diffuse", "reflectance": textured(albedo)},
