@@ -23,7 +23,7 @@ from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
 from mi_ring.photogrammetry.folder import find_pictures, ups
 from mi_ring.photogrammetry.motion import Motion
-from mi_ring.photogrammetry.object import Hints, Object, find_object
+from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
 from mi_ring.photogrammetry.scene import windows, write_shot
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
@@ -150,6 +150,8 @@ def made_by(out: Path) -> list[str] | None:
 def make(config: PhotosConfig, scene: Path) -> None:
     """The capture, from what has been found so far."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
+    if isinstance(config.masks, Path):  # before all the work
+        require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     with writing(config.out):
         config.out.mkdir(parents=True, exist_ok=True)
     for left in config.out.glob(".scene.*/"):  # by a process that was killed

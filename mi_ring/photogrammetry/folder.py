@@ -133,8 +133,7 @@ class Picture:
             return None if alpha is None else (alpha // (np.iinfo(alpha.dtype).max // 255)).astype(np.uint8)
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
-        names = (f"{self.path.name}.png", f"{self.name}.png")
-        file = next((f for name in names if (f := Path(source) / name).is_file()), None)
+        file = self.mask_file(Path(source))
         if file is None:
             return None
         mask = Picture(file, self.upright).pixels[:, :, 0]
@@ -142,6 +141,11 @@ class Picture:
             sizes = *mask.shape[::-1], *self.size
             raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
+
+    def mask_file(self, folder: Path) -> Path | None:
+        """That of a folder that is called like this photograph; None if there is none."""
+        files = (folder / f"{self.path.name}.png", folder / f"{self.name}.png")
+        return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
         """Let go of the pixels."""

@@ -17,6 +17,7 @@ from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
 
 ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
+SMALL = 1000  #: pixels along photographs, below which they may have too few features
 TEXTURED = 300  #: features of a photograph, from which they are worth something
 EPIPOLAR = 2.5e-3  #: of a picture's width, by which a match may be off from what two cameras say
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
@@ -67,7 +68,7 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
     found = model.num_reg_images() if model else 0
     if found < max(3, len(pictures) / 2):
         raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put "
-                         f"together: {why_not(folder)}")  # fmt: skip
+                         f"together: {why_not(pictures, folder)}")  # fmt: skip
     for _ in progress(adjustments(model), "bundle adjustment"):
         pass
     growing = folder / "sparse.partial"
@@ -215,7 +216,7 @@ def reason_of(picture: Picture, folder: Path) -> str:
     return "nothing in it fits the others: it shows something else, or there are too few photographs in between"
 
 
-def why_not(folder: Path) -> str:
+def why_not(pictures: Sequence[Picture], folder: Path) -> str:
     """Why photographs could not be put together, and what to do."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(folder / "database.db") as opened:
@@ -225,6 +226,10 @@ def why_not(folder: Path) -> str:
     if features < TEXTURED:
         return (f"they have {features:.0f} features each; they are out of focus or too dark, or the object has no "
                 "texture: lay a sheet of `mi-ring board` under it")  # fmt: skip
+    largest = max(max(picture.size) for picture in pictures)
+    if largest < SMALL:
+        return (f"they have {largest} pixels along at most, which is too few for features; give them as the camera "
+                f"wrote them, {SMALL} or more")  # fmt: skip
     if matched >= 2 * count:
         return "they fit each other but show everything from one place; walk around the object, 10 degrees at a time"
     return "they show different things, or too little of the same; photograph one object, 10 degrees at a time"

@@ -156,11 +156,7 @@ def brought(
             if hints.box:
                 shade *= box_in(camera_of(lens, pose).shrunk(whole_of(lens, BROUGHT).scale), hints.box)
             shades[picture.name] = shade
-    if len(shades) < len(pictures) / 2:
-        what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
-        how = "PNG with transparency" if source == "alpha" else (
-            "they must be called like the photographs, with .png added or instead of the suffix")  # fmt: skip
-        raise InputError(f"{what} masks for {len(shades)} of {len(pictures)} photographs; {how}")
+    require_half(len(shades), pictures, source)
     space = masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
     space.allowed = hints.allow(space.grid, space.distance)
     body = space.vote([masks.resized(shades[view.name] == OBJECT, view) for view in space.views], masks.AGREE)
@@ -168,6 +164,15 @@ def brought(
         raise InputError(f"--masks: {source}: no point in space {'of --box ' * bool(hints.box)}is inside most of these "
                          "masks; are they of these photographs?")  # fmt: skip
     return body, shades
+
+
+def require_half(count: int, pictures: Sequence[Picture], source: str | Path) -> None:
+    """Raise InputError unless half of the photographs have a mask."""
+    if count < len(pictures) / 2:
+        name = pictures[0].path.name
+        what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
+        how = "PNG with transparency" if source == "alpha" else f"{name}.png or {pictures[0].name}.png for {name}"
+        raise InputError(f"{what} masks for {count} of {len(pictures)} photographs; must be half of them: {how}")
 
 
 def box_in(camera: Camera, box: Sequence[float]) -> np.ndarray:
