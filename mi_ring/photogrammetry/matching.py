@@ -82,6 +82,8 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
     """
     pycolmap = need("pycolmap", "features")
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0  # else it depends on which thread has a pair
     pairs = pairs_to_match(len(pictures))
     batches = [pairs[k : k + PAIRS_AT_ONCE] for k in range(0, len(pairs), PAIRS_AT_ONCE)]
     chosen = folder / "pairs.txt"
@@ -89,7 +91,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
         named = [(file_of(pictures[a]), file_of(pictures[b])) for a, b in batch]
         chosen.write_text("".join(f"{a} {b}\n" for a, b in named), "utf-8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
-        interruptible(pycolmap.match_image_pairs, folder / "database.db", matching, pairing)
+        interruptible(pycolmap.match_image_pairs, folder / "database.db", matching, pairing, verification)
         if batch is batches[0] and (share := alike(folder / "database.db", named)) >= MOST:
             raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {len(batch)} pairs are "
                              "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
