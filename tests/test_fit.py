@@ -696,7 +696,7 @@ def test_scenes_of_the_same_name_do_not_share_a_folder_by_default(small_capture,
 def test_two_fits_into_one_folder_are_refused(small_capture, tmp_path):
     with (
         files.locked(tmp_path / "run"),
-        pytest.raises(InputError, match="--out: another process is writing there"),
+        pytest.raises(InputError, match="run: --out: another process is writing there"),
     ):
         fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK])
     assert not (tmp_path / "run").exists()

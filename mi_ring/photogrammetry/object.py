@@ -20,13 +20,12 @@ from mi_ring.importers.undistortion import Window
 from mi_ring.photogrammetry import masks
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.motion import Motion
-from mi_ring.photogrammetry.scene import OBJECT, UNSURE
+from mi_ring.photogrammetry.scene import OBJECT, UNSURE, reduction
 from mi_ring.photogrammetry.table import FLAT, Ground, Plane, Table, bare, find_plane
 from mi_ring.photogrammetry.trial import coverages, sphere_of
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, reduced_mask, whole_of
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import in_threads
-from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
 
 SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
@@ -91,7 +90,8 @@ def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folde
                              "anew, or give another DIR")  # fmt: skip
         plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
         return Object(kept_masks(shown, folder), np.array(known["center"]), known["level"], plane)
-    need("pycolmap", "lenses")  # here, for it handles signals, which threads may not
+    for lens, _ in motion.cameras.values():
+        lens.is_pinhole  # noqa: B018  (loads pycolmap, if need be: it handles signals, which threads may not)
 
     def whole(picture: Picture) -> View:
         lens, pose = motion.cameras[picture.name]
@@ -131,7 +131,7 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
         file = folder / f"{picture.name}.png"
         if file.exists():
             mask = read_as(file, "mask", read_image)[..., 0]
-            (height, width), scale = mask.shape, max(1, round(picture.size[0] / mask.shape[1]))
+            (height, width), scale = mask.shape, max(1, reduction(mask, picture.size))
             if (width, height) != (picture.size[0] // scale, picture.size[1] // scale):
                 raise InputError("{}: is {} x {} pixels, which is no whole part of the {} x {} of its photograph; keep "
                                  "the size of masks".format(file, width, height, *picture.size))  # fmt: skip
