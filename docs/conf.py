@@ -56,6 +56,7 @@ PLUGINS = {
     "flash": "mi_ring.plugins.flash.Flash",
     "room": "mi_ring.plugins.room.Room",
     "shapenet": "mi_ring.plugins.shapenet.ShapeNetMesh",
+    "table": "mi_ring.plugins.table.Table",
     "cooktorrance": "mi_ring.plugins.cooktorrance.CookTorrance",
     "photometric": "mi_ring.plugins.photometric.Photometric",
 }

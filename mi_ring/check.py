@@ -20,8 +20,8 @@ class CheckConfig:
     The table: distance of the camera and of the light from the object, in its radii; angle between the two [deg]; share
     of the photograph that is object; shares of the object that are clipped, and dark; brightness of the background, in
     that of the object; brightness for the light it gets, in that of the others; share of the mask that the other masks
-    agree to. The contact sheet: masks outlined in red, the visual hull in green. The exit status is 1 if there is
-    something to mend.
+    agree to. The contact sheet: masks outlined in red, what says nothing in yellow, the visual hull in green. The exit
+    status is 1 if there is something to mend.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]

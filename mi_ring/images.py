@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
+import tifffile
 import torch
 from PIL import Image
 from torch import Tensor
@@ -56,9 +57,12 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32."""
+    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32. Raises ValueError for inks."""
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # which Mitsuba does not read
+        with tifffile.TiffFile(path) as file:
+            if file.pages.first.photometric == tifffile.PHOTOMETRIC.SEPARATED:
+                raise ValueError("its colours are those of inks, CMYK; save it as RGB")
         pixels = np.array(imageio.imread(path, page=0))
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
         with Image.open(path) as image:

@@ -15,16 +15,16 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import scene_bytes, scene_element
+from mi_ring.capture.scenefile import room_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
-from mi_ring.photogrammetry.folder import find_pictures, ups
+from mi_ring.photogrammetry.folder import find_pictures, ups, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
-from mi_ring.photogrammetry.scene import windows, write_shot
+from mi_ring.photogrammetry.scene import windows, write_shot, write_table
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
     find_cameras,
@@ -34,6 +34,7 @@ from mi_ring.photogrammetry.workflow import (
     shots,
     upright,
 )
+from mi_ring.rendering.rooms import COUNT
 from mi_ring.system import command
 from mi_ring.system.files import locked, write_file, writing
 from mi_ring.system.machine import in_threads
@@ -182,12 +183,19 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not sheet:
         motion, plane = upright(motion, found.center, plane, ups(pictures))
         found = found._replace(center=np.zeros(3))
+    if silent := without_exposure([picture for picture in pictures if picture.name in motion.cameras]):
+        print(f"Exposure: EXIF data of {len(silent)} photographs do not tell it, which is taken to be the usual one: "
+              f"{', '.join(silent)}")  # fmt: skip
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
+    if config.turntable:  # the object sees the room turn
+        root.append(room_element("camera", np.zeros((COUNT, 3))))
     try:
         written = in_threads(partial(write_shot, writer), taken, windows(taken))
         root.extend(progress(written, "writing", len(taken)))
+        if sheet and plane and (table := write_table(writer, taken, plane, found.center)) is not None:
+            root.append(table)
         write_file(work / "options.json", json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:

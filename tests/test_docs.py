@@ -22,7 +22,7 @@ import trimesh
 
 from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
-from mi_ring.plugins import cooktorrance, flash, photograph, photometric, room, shapenet
+from mi_ring.plugins import cooktorrance, flash, photograph, photometric, room, shapenet, table
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 
@@ -33,7 +33,7 @@ def plugins():
     """By name; the modules are loaded anew with each variant, so that they must be asked each time."""
     return {
         "photograph": photograph.Photograph, "flash": flash.Flash, "room": room.Room, "shapenet": shapenet.ShapeNetMesh,
-        "cooktorrance": cooktorrance.CookTorrance, "photometric": photometric.Photometric,
+        "cooktorrance": cooktorrance.CookTorrance, "table": table.Table, "photometric": photometric.Photometric,
     }  # fmt: skip
 
 
@@ -100,8 +100,8 @@ def test_the_readme_leads_to_pages(built):
 def tables(plugin) -> dict[str, list[tuple[str, str, str, str]]]:
     """The tables of a docstring, rows of four cells, by the first cell of the heading."""
     found = {}
-    for table in re.split(r"\n\n", inspect.getdoc(plugin)):
-        lines = table.split("\n")
+    for paragraph in re.split(r"\n\n", inspect.getdoc(plugin)):
+        lines = paragraph.split("\n")
         if not lines[0].startswith("==="):
             continue
         starts = [m.start() for m in re.finditer("=+", lines[0])]
@@ -147,6 +147,7 @@ def values(tmp_path):
              "bsdf": {"type": "cooktorrance", "diffuse": grey, "specular": 0.2, "roughness": 0.4}},
         ],
         "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "distribution": "beckmann"}],
+        "table": [{"to_world": moved, "bsdf": {"type": "diffuse", "reflectance": grey}}],
         "photometric": [{"shadows": False}],
     }  # fmt: skip
 

@@ -18,13 +18,14 @@ from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
-from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures
+from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import box_in, kept_masks
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.views import camera_of
-from mi_ring.photogrammetry.workflow import PAPER, Sheet, cameras_beside, require_sides, upright
+from mi_ring.photogrammetry.workflow import PAPER, Sheet, cameras_beside, find_sheet, require_sides, upright
 from mi_ring.system import command
+from mi_ring.system.progress import progress
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 
@@ -242,4 +243,29 @@ def test_exposures_of_exif(tmp_path):
         pictures.append(Picture(tmp_path / f"{k}.jpg"))
     np.testing.assert_allclose(relative_exposures(pictures), [0.5, 1, 1, 2.5], rtol=1e-3)
     Image.new("RGB", (8, 6)).save(tmp_path / "none.jpg")
-    np.testing.assert_array_equal(relative_exposures([*pictures, Picture(tmp_path / "none.jpg")]), np.ones(5))
+    silent = Picture(tmp_path / "none.jpg")
+    np.testing.assert_allclose(relative_exposures([*pictures, silent]), [0.5, 1, 1, 2.5, 1], rtol=1e-3)
+    assert without_exposure([*pictures, silent]) == ["none.jpg"]
+    np.testing.assert_array_equal(relative_exposures([silent, silent]), np.ones(2))
+    assert without_exposure([silent, silent]) == []
+
+
+def test_damaged_photographs_are_named_together(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    for k in range(9):
+        Image.fromarray(np.roll(noise, k)).save(tmp_path / f"{k}.jpg")
+    for k in (2, 5):
+        file = tmp_path / f"{k}.jpg"
+        file.write_bytes(file.read_bytes()[:1500])
+    with pytest.raises(InputError, match=r"2.jpg: cannot be read .* \(2 photographs cannot .*: 2.jpg, 5.jpg; copy"):
+        find_sheet(find_pictures(tmp_path), 1.0, tmp_path, progress)
+    assert not (tmp_path / "sheet.json").exists()
+
+
+def test_inks_are_not_taken_for_light(tmp_path):
+    inks = Image.new("CMYK", (9, 7), (20, 90, 200, 10))
+    inks.save(tmp_path / "a.tif")
+    inks.save(tmp_path / "a.jpg")
+    with pytest.raises(InputError, match=r"a.tif: cannot be read as image \(its colours are those of inks, CMYK; save"):
+        _ = Picture(tmp_path / "a.tif").pixels
+    assert Picture(tmp_path / "a.jpg").pixels.shape == (7, 9, 3)  # Pillow converts these

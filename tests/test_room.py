@@ -9,11 +9,12 @@ import pytest
 import torch
 from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
+from mi_ring.capture.scenefile import load_element, room_elements
 from mi_ring.fitting.room import Room
 from mi_ring.rendering import bridge, indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_photographs
-from mi_ring.rendering.rooms import BASIS, COUNT, room_of
+from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, frames_of, room_of
 
 LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value": i}}
           for p, i in zip([[0.9, 0.5, 2.0], [-0.6, 0.3, 1.2]], INTENSITY.tolist())]  # fmt: skip
@@ -139,11 +140,16 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     assert np.array(dr.grad(params[key])) @ step == pytest.approx(sides[0] - sides[1], rel=5e-3)
 
 
-def test_least_squares_finds_the_room_among_wrong_pixels():
-    """Of pictures by `path`, of which some pixels show something else; what is missing is then as the room makes it."""
+@pytest.mark.parametrize("frames", [("world",), ("camera",), ("world", "camera")])
+def test_least_squares_finds_the_room_among_wrong_pixels(frames):
+    """In the axes that it is in; what is not in these stays as it was. What is missing is then as the room makes it.
+
+    Of pictures by `path`, of which some pixels show something else.
+    """
     ball = {"type": "sphere", "center": [0.5, -0.3, -0.1], "radius": 0.3, "bsdf": material([0.1, 0.2, 0.2], 0.05)}
     parts = {"cup": cup(material(0.8 * ALBEDO / np.pi, 0.04)), "ball": ball}
-    truth = some_room()
+    truth, free = some_room(), sorted({k for frame in frames for k in FRAMES[frame]})
+    truth[np.setdiff1d(np.arange(BASIS), free)] = 0
     lit, dark = load(LIGHTS, **parts, **emitters(truth)), load(LIGHTS, **parts)
     photographs = Photographs.of(dark.sensors())
     path = mi.load_dict({"type": "path", "max_depth": 5, "rr_depth": 100})
@@ -151,9 +157,10 @@ def test_least_squares_finds_the_room_among_wrong_pixels():
     observed[:, ::9, ::7] *= 30
     observed = torch.from_numpy(observed)
     direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0)))
-    room = Room(torch.zeros(BASIS, 3), float(observed.mean()))
+    room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames)
+    surface = SimpleNamespace(scene=dark, table=None)
     for seed in range(12):
-        around = bridge.surroundings(SimpleNamespace(scene=dark), photographs, direct[..., 3], seed, 70, 64, room=True)
+        around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=True)
         predicted = direct[..., :3] + around.interreflection
         room.see(around, predicted, observed, direct[..., 3] > 0.99)
     good = (direct[..., 3] == 1) & ((observed - predicted).abs() < 1).all(-1)
@@ -162,11 +169,12 @@ def test_least_squares_finds_the_room_among_wrong_pixels():
         for picture in (observed - predicted, around.room(room.harmonics))
     )
     assert float((shown - missing).abs().mean()) < 0.13 * float(missing.abs().mean())
+    assert not room.harmonics[truth.sum(1) == 0].any()
 
 
 def test_without_anything_seen_the_room_is_as_given():
     given = torch.from_numpy(some_room()).float()
-    room = Room(given, 0.3)
+    room = Room(given, 0.3, ("world", "camera"))
     around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), torch.zeros(BASIS, 1, 5, 7, 3), torch.ones(1, 5, 7),
                                  torch.ones(1, 10, 14), 2)  # fmt: skip
     room.see(around, torch.zeros(1, 10, 14, 3), torch.ones(1, 10, 14, 3), torch.ones(1, 10, 14) > 0)
@@ -178,3 +186,14 @@ def test_wrong_fields_are_named(field, value):
     good = {"type": "room", "harmonics": " ".join(["0.1"] * 27)}
     with pytest.raises((ValueError, RuntimeError), match=field):
         mi.load_dict(good | {field: value})
+
+
+@pytest.mark.parametrize("frames", [("world",), ("camera",), ("world", "camera")])
+def test_a_scene_says_in_which_axes_its_room_is(frames):
+    room = some_room()
+    room[np.setdiff1d(np.arange(BASIS), [k for frame in frames for k in FRAMES[frame]])] = 0
+    written = {str(k): load_element(element) for k, element in enumerate(room_elements(room))}
+    scene = load(LIGHTS, **written)
+    assert frames_of(scene) == set(frames)
+    np.testing.assert_allclose(room_of(scene), room, atol=1e-6)
+    assert frames_of(load(LIGHTS)) == {"world"}

@@ -61,6 +61,18 @@ def scene_element(photographs: Iterable[Element], ground: np.ndarray | None = No
     return root
 
 
+def table_element(picture: str, square: np.ndarray) -> Element:
+    """A diffuse `table` with the picture of its albedo; `square` (4, 4): its to_world."""
+    element = ElementTree.Element("shape", type="table", id="table")
+    transform = ElementTree.SubElement(element, "transform", name="to_world")
+    ElementTree.SubElement(transform, "matrix", value=numbers(square))
+    bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
+    texture = ElementTree.SubElement(bsdf, "texture", name="reflectance", type="bitmap")
+    ElementTree.SubElement(texture, "string", name="filename", value=picture)
+    ElementTree.SubElement(texture, "string", name="wrap_mode", value="clamp")
+    return element
+
+
 def scene_bytes(root: Element) -> bytes:
     """A scene as the content of its file."""
     ElementTree.indent(root)
@@ -169,14 +181,20 @@ def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]
 
 
 def room_elements(room: np.ndarray) -> list[Element]:
-    """The light of a room as XML: what is fixed in the world, and what is in the camera."""
-    elements = []
-    for frame, harmonics in (("world", room[:COUNT]), ("camera", np.vstack([np.zeros((1, 3)), room[COUNT:]]))):
-        element = ElementTree.Element("emitter", type="room")
-        ElementTree.SubElement(element, "string", name="frame", value=frame)
-        ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))
-        elements.append(element)
-    return elements
+    """The light of a room as XML: what is fixed in the world, and what is in the camera, where there is something."""
+    world, camera = room[:COUNT], np.vstack([np.zeros_like(room[:1]), room[COUNT:]])
+    if camera.any() and not world[1:].any():  # what is alike from all sides belongs to it, too
+        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[COUNT:])])
+    frames = {"world": world, "camera": camera}
+    return [room_element(frame, harmonics) for frame, harmonics in frames.items() if harmonics.any()]
+
+
+def room_element(frame: str, harmonics: np.ndarray) -> Element:
+    """A `room` as XML: `harmonics` (9, 3) in the axes of the world or of the camera."""
+    element = ElementTree.Element("emitter", type="room")
+    ElementTree.SubElement(element, "string", name="frame", value=frame)
+    ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))
+    return element
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:

@@ -4,7 +4,8 @@ The paper refines calibration together with the shape (its Table 3). Gauges, wha
 against albedo, but for interreflection (the logarithms of `power` have the mean zero in each colour, and `scale` takes
 the reflectance along); where the whole is, how it is turned and how large it is, which only the priors hold; focal
 length against distance, likewise; the cone of a flash against vignetting, nearly, where it is beside the lens. A room
-that is alike from all sides is in the world's axes and in the camera's: it counts as the world's.
+that is alike from all sides is in the world's axes and in the camera's: it counts as the world's. One fixed in the
+camera looks like a flash that is elsewhere, and like another reflectance: it is refined only where the scene has one.
 """
 
 import math
@@ -24,7 +25,7 @@ from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS
+from mi_ring.rendering.rooms import BASIS, frames_of
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
 UNKNOWNS: dict[str, dict[str, float]] = {
@@ -126,7 +127,7 @@ class Calibration(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room
         room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
-        self.room = Room(room, exposure)
+        self.room = Room(room, exposure, frames_of(capture.scene))
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""

@@ -1,11 +1,13 @@
 """The light of the room as an unknown: spherical harmonics, by linear least squares in the course of a fit."""
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mi_ring.rendering.bridge import Surroundings
-from mi_ring.rendering.rooms import BASIS
+from mi_ring.rendering.rooms import BASIS, FRAMES
 
 MEMORY = 0.95  #: weight of what was seen before, by iteration: the surface was another
 RIDGE = 0.01  #: pull toward what the capture says, by the mean of what the photographs say of a harmonic
@@ -22,10 +24,14 @@ class Room(nn.Module):
     matrix: Tensor  #: (3, BASIS, BASIS) of the normal equations, by colour
     vector: Tensor  #: (3, BASIS), their right sides
 
-    def __init__(self, given: Tensor, exposure: float) -> None:
-        """`exposure`: mean radiance of the object."""
+    def __init__(self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",)) -> None:
+        """`exposure`: mean radiance of the object; `frames`: whose harmonics are unknown, the others are as given.
+
+        Both at once could stand for a flash that is elsewhere, and for a reflectance that is another.
+        """
         super().__init__()
         self.exposure = exposure
+        self.free = sorted({k for frame in frames for k in FRAMES[frame]})
         self.register_buffer("given", given, persistent=False)
         self.register_buffer("harmonics", given.clone())
         self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
@@ -54,5 +60,8 @@ class Room(nn.Module):
         self.vector = MEMORY * self.vector + torch.einsum("jnc,nc,n->cj", basis, missing, weight)
         ridge = RIDGE * self.matrix.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
-            right = self.vector[..., None] + ridge @ self.given.T[..., None]
-            self.harmonics = torch.linalg.solve(self.matrix + ridge, right)[..., 0].T.contiguous()
+            free = self.free
+            right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
+            more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
+            self.harmonics = self.given.clone()
+            self.harmonics[free] += more.T

@@ -15,7 +15,13 @@ from mi_ring.metrics.mask_agreement import CONFORMS
 from mi_ring.metrics.surfaces import hits
 from mi_ring.rendering.plain_mesh import scene_of
 
-CELL = 200  # of the contact sheet [px]
+CELL, LINE = 200, 16  # of the contact sheet: its photographs, lines of text [px]
+GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # names of photographs
+RED, YELLOW, GREEN = (255, 51, 51), (255, 220, 40), (26, 255, 51)
+LEGEND = (
+    ("outlines of masks", RED), ("says nothing (unsure, or beyond the lens)", YELLOW), ("hull of all masks", GREEN),
+    ("mask agrees with the others to so much", GOOD), ("too little", DOUBTED),
+)  # fmt: skip
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
@@ -41,7 +47,7 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
 
 
 def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
-    """The contact sheet: where everything is; on photographs the visual hull in green and the mask's outline in red."""
+    """The contact sheet: where everything is; on photographs the visual hull, masks' outlines and what says nothing."""
     top = plan(capture, center, radius)
     try:
         mesh = capture.hull.surface() if capture.hull else None
@@ -50,25 +56,31 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
     hull = mesh and scene_of(mesh.vertices, mesh.faces)
     some = capture.spread()
     columns = max(1, min(top.width // CELL, len(some)))
-    page = Image.new("RGB", (max(top.width, columns * CELL), top.height + -(-len(some) // columns) * (CELL + 16)))
+    above, lines = top.height + LINE, -(-len(some) // columns)
+    page = Image.new("RGB", (max(top.width, columns * CELL), above + lines * (CELL + LINE)))
     page.paste(top)
+    draw, place_of_text = ImageDraw.Draw(page), 2.0
+    for words, colour in LEGEND:
+        draw.text((place_of_text, top.height + 2), words, fill=colour)
+        place_of_text += draw.textlength(words) + 16
     white = 3 * capture.exposure()
     for place, k in enumerate(some):
         scale = max(1, max(capture.sensors[k].size) // CELL)
-        observed, _, mask, masked, _ = capture.observe([k], scale)
+        observed, _, mask, masked, valid = capture.observe([k], scale)
         picture = linear_to_srgb(observed[0].numpy() / white)
         if hull:
             seen = hits(hull, capture.photograph(k, scale))[0].reshape(picture.shape[:2])
-            picture = 0.7 * picture + 0.3 * seen[..., None] * np.array([0.1, 1.0, 0.2])
-        if masked:
-            inside = mask[0].numpy() > 0.5
-            picture[inside & ~ndimage.binary_erosion(inside)] = (1.0, 0.2, 0.2)
+            picture = 0.7 * picture + 0.3 * seen[..., None] * np.divide(GREEN, 255)
+        outlined = [(mask[0].numpy() > 0.5, RED)] if masked else []
+        outlined += [(~valid[0].numpy(), YELLOW)] if valid is not None else []
+        for inside, colour in outlined:
+            picture[inside & ~ndimage.binary_erosion(inside)] = np.divide(colour, 255)
         cell = Image.fromarray(to_bytes(picture))
         cell.thumbnail((CELL, CELL))
-        x, y = place % columns * CELL, top.height + place // columns * (CELL + 16)
-        page.paste(cell, (x, y + 16))
+        x, y = place % columns * CELL, above + place // columns * (CELL + LINE)
+        page.paste(cell, (x, y + LINE))
         agreement = rows[k].agreement
         fits = "" if agreement is None else f"  {agreement:.0%}"
         good = agreement is None or agreement >= CONFORMS
-        ImageDraw.Draw(page).text((x + 2, y + 2), rows[k].name + fits, fill=(255, 255, 255) if good else (255, 90, 90))
+        draw.text((x + 2, y + 2), rows[k].name + fits, fill=GOOD if good else DOUBTED)
     return page

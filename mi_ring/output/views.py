@@ -21,7 +21,7 @@ from mi_ring.output.atlas import flowed
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import LANES, Photographs
-from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.scenes import assembled, is_table, own_emitters
 from mi_ring.rendering.shading import is_flash, is_room
 from mi_ring.ring.material import MaterialOptions
 from mi_ring.ring.ring import Ring
@@ -219,7 +219,7 @@ def in_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int,
 
 
 def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.Surface:
-    """The object and what else is in the scene, lit by an environment and by fixed lamps."""
+    """The object and what else is in the scene but its table, lit by an environment and by fixed lamps."""
     to_world = np.eye(4)
     to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
     require_file(envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
@@ -229,6 +229,6 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
     lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
-    others = [s for s in capture.scene.shapes() if s != capture.shape]
+    others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring)

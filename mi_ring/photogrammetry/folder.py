@@ -263,11 +263,23 @@ def focal_35mm(pictures: Sequence[Picture]) -> float | None:
     return None
 
 
+def exposures(pictures: Sequence[Picture]) -> np.ndarray:
+    """(N,) by EXIF, NaN where it says nothing."""
+    found = [exposure_of(exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)) or np.nan for picture in pictures]
+    return np.where(np.greater(found, 0), found, np.nan)
+
+
+def without_exposure(pictures: Sequence[Picture]) -> list[str]:
+    """Which photographs do not say their exposure, where others do."""
+    missing = np.isnan(exposures(pictures))
+    return [] if missing.all() else [picture.path.name for picture, lacks in zip(pictures, missing) if lacks]
+
+
 def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """(N,) by EXIF, 1 for the one in the middle; all 1 unless all photographs say."""
-    exposures = [exposure_of(exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)) or np.nan for picture in pictures]
-    found = np.array(exposures)
-    return found / np.median(found) if np.isfinite(found).all() and (found > 0).all() else np.ones(len(found))
+    """(N,) by EXIF, 1 for the one in the middle, and where nothing is said."""
+    found = exposures(pictures)
+    known = np.isfinite(found)
+    return np.where(known, found / np.median(found[known]), 1.0) if known.any() else np.ones(len(found))
 
 
 def exif_of(path: Path) -> Image.Exif:

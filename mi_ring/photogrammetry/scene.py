@@ -6,16 +6,23 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mi_ring.capture.scenefile import Element, photograph_element
+from mi_ring.capture.outlines import grown
+from mi_ring.capture.scenefile import Element, photograph_element, table_element
 from mi_ring.geometry.camera import Camera
+from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window, undistort
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.table import Ground, Plane, reflectance
+from mi_ring.photogrammetry.views import View, camera_of, reduced, whole_of
 from mi_ring.rendering.lights import Light
+from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: of the object's size, left free around it
+#: Pixels along photographs in which the table's albedo is looked for, a quarter of its width by the cameras' distance,
+#: and texels across: what it reflects varies slowly.
+TABLE_SEEN, TABLE_REACH, TABLE_TEXELS = 600, 0.5, 128
 OBJECT, UNSURE = 255, 128  #: in masks; 0 is the background
 
 
@@ -80,6 +87,30 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
     camera = camera_of(shot.lens, shot.pose)
     camera = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
     return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid)
+
+
+def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray) -> Element | None:
+    """A `table`, for the light that it reflects onto the object at `center` (3,), and its picture.
+
+    None if no photograph shows it. The lights must be as strong as the shots say.
+    """
+
+    def seen(shot: Shot) -> tuple[View, np.ndarray]:
+        view = reduced(shot.picture, shot.lens, shot.pose, whole_of(shot.lens, TABLE_SEEN))
+        shot.picture.close()
+        if shot.mask is None:  # it may be anywhere
+            return view, np.ones(view.shown.shape, np.uint8)
+        mask = cv2.resize((shot.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
+        return view, grown(mask, MARGIN)
+
+    views, hidden = zip(*in_threads(seen, shots))
+    away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
+    ground = Ground(plane, center, TABLE_REACH * away, TABLE_TEXELS)
+    albedo = reflectance(views, [shot.light for shot in shots], hidden, ground)
+    if albedo is None:
+        return None
+    picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))
+    return table_element(writer.relative(picture), ground.square)
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:

@@ -11,6 +11,7 @@ from scipy import ndimage
 from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.views import View
+from mi_ring.rendering.lights import Light
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
@@ -89,13 +90,21 @@ class Ground:
     """The part of a plane about its point below `center`, as a square of texels `reach` times 4 wide."""
 
     def __init__(self, plane: Plane, center: np.ndarray, reach: float, texels: int = TEXELS) -> None:
-        self.texels, across = texels, plane.axes()[:2]
+        self.texels, self.normal, across = texels, plane.normal, plane.axes()[:2]
         corner = center - plane.height(center) * plane.normal - 2 * reach * across.sum(0)
         #: (4, 3) where the texel of a column and row is: (x, y, z, 1) of (column, row, 1)
         self.to_world = np.vstack([np.stack([*4 * reach / (texels - 1) * across, corner], 1), [0, 0, 1]])
         row, column = np.divmod(np.arange(texels**2), texels)
         self.u, self.v = column / (texels - 1) - 0.5, row / (texels - 1) - 0.5
         self.points = np.stack([column, row, np.ones_like(row)], 1) @ self.to_world[:3].T  #: (texels², 3)
+
+    @property
+    def square(self) -> np.ndarray:
+        """(4, 4): from the square of -1 to 1 in x and y, facing z, to the texels; the first row is at y = -1."""
+        middle = self.to_world @ np.array([(self.texels - 1) / 2, (self.texels - 1) / 2, 1])
+        across = self.to_world[:, :2] * self.texels / 2
+        normal = np.cross(across[:3, 0], across[:3, 1]) / np.linalg.norm(across[:, 0])
+        return np.column_stack([across, [*normal, 0], middle])
 
     def seen_by(self, view: View, texels: np.ndarray) -> np.ndarray:
         """Texels (texels², …) float32 or uint8 as a view shows them (H, W, …); NaN, or 0, beyond."""
@@ -110,6 +119,30 @@ class Ground:
         x, y, one = from_pixel[2]  # of a texel, its inverse depth
         shown[x * np.arange(width) + y * np.arange(height)[:, None] + one <= 0] = none
         return shown
+
+
+def reflectance(
+    views: Sequence[View], lights: Sequence[Light], hidden: Sequence[np.ndarray], ground: Ground
+) -> np.ndarray | None:  # fmt: skip
+    """(texels, texels, 3) diffuse albedo of the ground in views under these lights; None if they show nothing of it.
+
+    `hidden` (H, W): where something may hide it from a view. The median of the views, in few of which a place is in a
+    shadow or shines; where none shows it, the median of the rest.
+    """
+    found = np.full((len(views), ground.texels**2, 3), np.nan, np.float32)
+    for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
+        row, column, inside = view.places(ground.points)
+        inside &= (mask[row, column] == 0) & (view.rgb[row, column].max(-1) < 255)
+        way = light.vector - ground.points[inside]
+        distance = np.linalg.norm(way, axis=1, keepdims=True)
+        received = light.rgb * (way @ ground.normal)[:, None] / distance**3
+        own[inside] = np.where(received > 0, np.pi * view.linear[row, column][inside] / received, np.nan)
+    albedo = median(found)
+    known = np.isfinite(albedo).all(1)
+    if not known.any():
+        return None
+    albedo[~known] = np.median(albedo[known], 0)
+    return albedo.reshape(ground.texels, ground.texels, 3).clip(0, 1)
 
 
 class Table:

@@ -88,6 +88,16 @@ class Sheet(NamedTuple):
         return found
 
 
+def require_read(pictures: Sequence[Picture], found: Sequence[object]) -> None:
+    """Raise InputError, which names all of them, if photographs could not be read: those with an error."""
+    bad = [(picture.path, error) for picture, error in zip(pictures, found) if isinstance(error, InputError)]
+    if len(bad) > 1:
+        names = ", ".join(path.name for path, _ in bad)
+        raise InputError(f"{bad[0][1]} ({len(bad)} photographs cannot be read: {names}; copy or remove them)")
+    if bad:
+        raise InputError(f"{bad[0][1]}; copy it anew or remove it")
+
+
 def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progress: Progress) -> Sheet | None:
     """Where photographs show the sheet, whose squares measure so much [mm]; None if fewer than three do."""
     kept = folder / "sheet.json"
@@ -95,13 +105,22 @@ def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progres
         known = json.loads(kept.read_text("utf-8"))
     else:
 
-        def seen(picture: Picture) -> list | None:
+        def seen(picture: Picture) -> list | InputError | None:
+            try:
+                return shown(picture)
+            except InputError as error:
+                if error.__cause__ is None:  # not the file's fault: a package is missing
+                    raise
+                return error
+
+        def shown(picture: Picture) -> list | None:
             sighting = Board(1.0).detect(picture.srgb())
             paper = white(picture.linear(), sighting) if sighting else ()
             picture.close()
             return [a.tolist() for a in (*sighting, *paper)] if sighting else None
 
         found = list(progress(in_threads(seen, pictures), "sheet", len(pictures)))
+        require_read(pictures, found)
         known = {picture.name: values for picture, values in zip(pictures, found) if values}
         write_file(kept, json.dumps(known))
     sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, *_) in known.items()}

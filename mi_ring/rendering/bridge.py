@@ -19,7 +19,7 @@ from mi_ring.rendering.indirect import BOUNCES, render_indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
-from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.scenes import assembled, own_emitters, parted
 
 
 def to_drjit(tensor: Tensor):
@@ -37,10 +37,12 @@ class Surface:
 
     With a `Ring` it is a shape of its own, with the BSDF that the ring's parameters are those of, in a scene of its own
     that shares all other objects with the given one and leaves that as it is. Without, it is the given shape itself.
-    Other shapes and top-level emitters of the scene take part in every picture but are not changed.
+    Other shapes and top-level emitters of the scene take part in every picture but are not changed; a `table` does so
+    only by the light that it reflects onto the others.
     """
 
     def __init__(self, scene: mi.Scene, shape: mi.Mesh, ring=None):
+        scene, self.table = parted(scene)
         if ring is not None:
             scene, shape = dressed(scene, shape, ring)
         self.scene, self.shape = scene, shape
@@ -245,7 +247,7 @@ def surroundings(
     """
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)
-    channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room)]
+    channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, surface.table)]
     rgb, alpha = pictures(channels[:4], small)
     harmonics = torch.stack(channels[4:]).reshape(-1, 3, *alpha.shape).movedim(1, -1) if room else None
     return Surroundings(rgb, harmonics, alpha, coverage, factor)

@@ -10,12 +10,12 @@ from mi_ring.rendering.shading import next_2d, shade
 BOUNCES = 3  # after the first surface
 
 
-def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False):
+def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False, table=None):
     """Light that has been reflected more than once: [R, G, B, coverage], Floats of N·H·W pixels, no gradients.
 
     Paths are traced from the camera, the BSDFs sampled, and shaded directly lit wherever they arrive (the light of
     each photograph casts shadows); `bounces` more points after the first. Box-filtered linear radiance, unbiased but
-    for the light of longer paths.
+    for the light of longer paths. `table`: a scene that paths meet, too, after their first point; it casts no shadow.
 
     `room`: followed by R, G, B for each of the harmonics of `mi_ring.rendering.rooms`, of what the surface shows of a
     room whose radiance is that harmonic: what paths meet that escape after at most `bounces` points.
@@ -29,7 +29,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False):
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
-            radiance, escaped, direction = reflect(scene, si, view, photographs, bounces, seed)
+            radiance, escaped, direction = reflect(scene, si, view, photographs, bounces, seed, table)
             values = [*radiance]
             if room:
                 harmonics = harmonics_toward(direction, photographs.camera(view)[0])
@@ -41,7 +41,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False):
         return [dr.block_sum(c, spp) / spp for c in channels]
 
 
-def reflect(scene, si, view, photographs, bounces, seed):
+def reflect(scene, si, view, photographs, bounces, seed, table=None):
     """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane.
 
     And where the paths that escape go: (radiance, their throughput, 0 for those that do not, and their direction).
@@ -56,6 +56,9 @@ def reflect(scene, si, view, photographs, bounces, seed):
         out = si.spawn_ray(si.to_world(sample.wo))
         active &= dr.any(throughput > 0)
         si = scene.ray_intersect(out, active)
+        if table is not None:
+            below = table.ray_intersect(out, active)
+            si = dr.select(below.t < si.t, below, si)
         leaves = active & ~si.is_valid()
         escaped, direction = dr.select(leaves, throughput, escaped), dr.select(leaves, out.d, direction)
         active = si.is_valid()

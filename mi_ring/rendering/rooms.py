@@ -10,6 +10,7 @@ ORDER = 2  #: of the harmonics
 COUNT = (ORDER + 1) ** 2
 #: Of the world's harmonics and the camera's, without the camera's first: it is the world's.
 BASIS = 2 * COUNT - 1
+FRAMES = {"world": [*range(COUNT)], "camera": [0, *range(COUNT, BASIS)]}  #: which of them are in these axes
 
 
 def room_of(scene) -> np.ndarray | None:
@@ -24,6 +25,11 @@ def room_of(scene) -> np.ndarray | None:
         else:
             total[:COUNT] += harmonics
     return total if rooms else None
+
+
+def frames_of(scene) -> set[str]:
+    """In which axes the `room` emitters of a scene have their harmonics; the world's if there are none."""
+    return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
 def harmonics_toward(direction, to_world) -> list:

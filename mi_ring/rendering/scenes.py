@@ -18,3 +18,17 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
     for part, name in zip(parts, ids):  # which Mitsuba has changed to the keys
         part.set_id(name)
     return scene
+
+
+def parted(scene) -> tuple[mi.Scene, mi.Scene | None]:
+    """A scene without its `table` shapes, the same if it has none, and a scene of these alone, None likewise."""
+    tables = [shape for shape in scene.shapes() if is_table(shape)]
+    if not tables:
+        return scene, None
+    others = [shape for shape in scene.shapes() if not is_table(shape)]
+    return assembled(others, own_emitters(scene), scene.sensors(), scene.integrator()), assembled(tables)
+
+
+def is_table(shape) -> bool:
+    """Is it a `table`, whatever the variant that its class belongs to?"""
+    return getattr(shape, "of_tables", False)

@@ -1,0 +1,68 @@
+"""The `table` shape: what the object stands on, which reflects light onto it (Mitsuba plugin)."""
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.rendering.plain_mesh import FACES, POSITIONS
+
+CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+
+
+class Table(mi.Mesh):
+    """What the object stands on: a rectangle whose reflected light, and the room's that it hides, reach the object.
+
+    ============ ========= ===================================================================== =====
+    Parameter    Type      Description                                                           Flags
+    ============ ========= ===================================================================== =====
+    ``to_world`` transform of the square from −1 to 1 in x and y that faces z. Default: none
+    (nested)     bsdf      usually diffuse, with a bitmap, whose first row is at y = −1          P, ∂
+    ============ ========= ===================================================================== =====
+
+    Mitsuba's integrators see it like any other rectangle. In what a fit predicts of photographs it is one of the ways
+    of light between surfaces, and nothing that a camera sees: the object is what the masks say, and photographs show
+    more of a table than its reflectance. `mi_ring.photos` writes it where the printed sheet is seen.
+
+    What it does not do: it hides nothing from a camera or a lamp in these predictions.
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <shape type="table">
+                <transform name="to_world"><scale value="200"/></transform>
+                <bsdf type="diffuse"><rgb name="reflectance" value="0.4 0.3 0.2"/></bsdf>
+            </shape>
+
+        .. code-block:: python
+
+            {
+                "type": "table", "to_world": mi.ScalarTransform4f().scale(200),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.3, 0.2]}},
+            }
+    """
+
+    of_tables = True  #: to `mi_ring.rendering`, whatever the variant that this class belongs to
+
+    def __init__(self, props):
+        to_world = props.get("to_world", mi.ScalarTransform4f())
+        if isinstance(to_world, str | int | float):
+            raise ValueError(f'table "{props.id()}": to_world is {to_world}, must be a <transform>')
+        matrix = np.array(to_world.matrix)
+        if np.linalg.det(matrix[:3, :3]) <= 0:
+            raise ValueError(f'table "{props.id()}": to_world is flat or a mirror; its z must be up from the table')
+        super().__init__(props.id(), 4, 2, props, False, True)
+        square = np.column_stack([2 * CORNERS - 1, np.zeros(4)])
+        values = {
+            POSITIONS: square @ matrix[:3, :3].T + matrix[:3, 3], "vertex_texcoords": CORNERS, FACES: TRIANGLES,
+        }  # fmt: skip
+        params = mi.traverse(self)
+        for name, value in values.items():  # scalar variants have array types of their own
+            params[name] = type(params[name])(value.astype(np.uint32 if name == FACES else np.float32).ravel())
+        params.update()
+
+    def to_string(self):
+        return f"Table[id={self.id()}]"
+
+
+mi.register_shape("table", Table)

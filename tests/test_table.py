@@ -1,0 +1,138 @@
+"""The `table` shape: where its picture lies, and the light that it reflects, against Mitsuba's path tracer."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_photogrammetry import CENTER, LENS, hit_ellipsoid, poses, rays_of, view
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.images import linear_to_srgb, write_image
+from mi_ring.metrics.path_tracing import open_lit_scene, render_path
+from mi_ring.photogrammetry.table import Ground, Plane, reflectance
+from mi_ring.photogrammetry.views import camera_of
+from mi_ring.rendering import bridge
+from mi_ring.rendering.lights import Light
+
+SIZE = (49, 35)  # [px]
+TURNED = mi.ScalarTransform4f().translate([0.3, -0.2, -1.1]).rotate([1, 0.4, 0], 12).scale([6, 4, 1])
+ROOM = '<emitter type="room"><string name="harmonics" value="0.4 0.3 0.2 {}"/></emitter>'.format("0 " * 24)
+#: An ellipsoid that is lit from aside, above a table, red to the left, seen from below its middle.
+SCENE = """<scene version="3.0.0">
+  <integrator type="photometric"/>
+  <shape type="shapenet" id="object">
+    <transform name="to_world"><scale x="1" y="0.7" z="0.8"/><rotate x="1" y="2" z="0" angle="20"/></transform>
+    <bsdf type="cooktorrance"><rgb name="diffuse" value="0.5, 0.6, 0.7"/><float name="specular" value="0.05"/>
+      <float name="roughness" value="0.5"/></bsdf></shape>
+  <sensor type="photograph" id="a"><string name="filename" value="a.png"/>
+    <float name="fx" value="52"/><float name="fy" value="55"/><float name="cx" value="23.2"/>
+    <float name="cy" value="18.4"/>
+    <transform name="to_world"><lookat origin="0.5, -4, 0.4" target="0, 0, -0.1" up="0.1, 0.1, 1"/></transform>
+    <film type="hdrfilm"><integer name="width" value="49"/><integer name="height" value="35"/></film>
+    <emitter type="point"><point name="position" x="-1.5" y="-3" z="3"/><rgb name="intensity" value="40"/></emitter>
+  </sensor>
+  {table}{more}
+</scene>"""
+TABLE = """<shape type="table"><transform name="to_world"><matrix value="{}"/></transform><bsdf type="diffuse">
+  <texture name="reflectance" type="bitmap"><string name="filename" value="table.png"/></texture></bsdf></shape>"""
+
+
+def write(folder, table=True, more=""):
+    matrix = " ".join(f"{v:.9g}" for v in np.array(TURNED.matrix).ravel())
+    picture = np.zeros((5, 7, 3), np.uint8) + 190
+    picture[:, :3] = 240, 90, 60
+    picture[0, 6] = 10, 250, 90
+    write_image(picture, folder / "table.png")
+    (folder / "try.xml").write_text(SCENE.format(table=TABLE.format(matrix) if table else "", more=more))
+    return folder / "try.xml"
+
+
+def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
+    scene = load_capture(write(tmp_path), images=False).scene
+    table = next(shape for shape in scene.shapes() if getattr(shape, "of_tables", False))
+    alone = bridge.parted(scene)[1]
+    x, y = 2 * (6 + 0.5) / 7 - 1, 2 * 0.5 / 5 - 1  # the middle of the last pixel of the first row
+    place, up = TURNED @ mi.ScalarPoint3f(x, y, 0), TURNED @ mi.ScalarNormal3f(0, 0, 1)
+    si = alone.ray_intersect(mi.Ray3f(mi.Point3f(place) + mi.Vector3f(up), -mi.Vector3f(up)))
+    assert si.is_valid()[0]
+    np.testing.assert_allclose(np.array(si.t), 1, rtol=1e-5)
+    srgb = np.array([10, 250, 90]) / 255
+    linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(np.array(table.bsdf().eval_diffuse_reflectance(si)).ravel(), linear, atol=2e-3)
+
+
+@pytest.mark.parametrize("more", ["", ROOM], ids=["dark", "room"])
+def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
+    path = write(tmp_path, more=more)
+    capture = load_capture(path, images=False)
+    surface = bridge.Surface(capture.scene, capture.shape)
+    rgb, coverage = bridge.draw(surface, capture.photograph(0), spp=256, indirect=True)
+    without = load_capture(write(tmp_path, table=False, more=more), images=False)
+    alone, same = bridge.draw(bridge.Surface(without.scene, without.shape), without.photograph(0), spp=256,
+                              indirect=True)  # fmt: skip
+    np.testing.assert_array_equal(coverage, same)  # no camera sees it
+
+    scene, sensors = open_lit_scene(write(tmp_path, more=more))
+    if more:
+        scene = mi.load_file(str(path), optimize=False)
+    batch = capture.photographs.select([0], sensors[0].size)
+    channels = [np.array(c) for c in render_path(scene, batch, sensors[0], 1024, 3, 5)]
+    traced = np.stack(channels, -1).reshape(rgb[0].shape)
+    inside = coverage[0].numpy() == 1
+    from_below, bounced = traced[inside], (rgb - alone)[0].numpy()[inside]
+    assert bounced.mean() > 0.05 * from_below.mean()
+    # Its light is drawn in few pixels and smoothed: compared as means of rows and of columns.
+    for axis in (0, 1):
+        weight = inside.sum(axis)
+        ours, theirs = ((picture * inside[..., None]).sum(axis)[weight > 5] / weight[weight > 5, None]
+                        for picture in (rgb[0].numpy(), traced))  # fmt: skip
+        np.testing.assert_allclose(ours, theirs, rtol=0.05, atol=0.015)
+    np.testing.assert_allclose(rgb[0].numpy()[inside].mean(0), from_below.mean(0), rtol=0.01)
+
+
+@pytest.mark.parametrize("scale", ['x="-1" y="1" z="1"', 'x="1" y="1" z="0"'])
+def test_a_mirrored_or_flat_one_is_refused(scale):
+    transform = f'<transform name="to_world"><scale {scale}/></transform>'
+    with pytest.raises(RuntimeError, match="to_world is flat or a mirror"):
+        mi.load_string(f'<shape type="table" version="3.0.0">{transform}</shape>')
+
+
+def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows():
+    """A tilted plane with a linear albedo, flashes beside the lenses, an object that hides it and casts shadows."""
+    random = np.random.default_rng(4)
+    up = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+    plane = Plane(up, float(CENTER @ up) - 3.0)
+    ground = Ground(plane, CENTER, 5.0, 40)
+
+    def albedo(points):
+        x, y = (points - CENTER)[..., 0], (points - CENTER)[..., 1]
+        return np.stack([0.4 + 0.02 * x, 0.5 - 0.015 * y, 0.3 + 0.005 * x + 0.01 * y], -1)
+
+    views, lights, hidden = [], [], []
+    for k, pose in enumerate(poses(14)):
+        camera = camera_of(LENS, pose)
+        flash = Light("point", camera.position + pose[:3, 0] * 0.8, random.uniform(100, 160, 3))
+        rays = rays_of(camera)
+        t = (plane.offset - camera.position @ up) / (rays @ up)
+        points = camera.position + t[:, None] * rays
+        way = flash.vector - points
+        away = np.linalg.norm(way, axis=1, keepdims=True)
+        radiance = albedo(points) / np.pi * flash.rgb * (way @ up)[:, None] / away**3
+        radiance[random.uniform(size=len(t)) < 0.1] *= 0.05  # shadows
+        object_ = np.isfinite(hit_ellipsoid(camera)[0])
+        radiance[object_] = 0.4
+        srgb = 255 * linear_to_srgb(radiance.clip(0, 1).astype(np.float32))
+        views.append(view(str(k), pose, srgb.round()))
+        lights.append(flash)
+        hidden.append(object_.reshape(LENS.size[::-1]).astype(np.uint8))
+    found = reflectance(views, lights, hidden, ground)
+    true = albedo(ground.points).reshape(found.shape)
+    near = np.linalg.norm(ground.points - CENTER, axis=1).reshape(40, 40) < 6
+    assert np.median(np.abs(found - true)[near]) < 0.01
+    assert reflectance(views, lights, [np.ones_like(mask) for mask in hidden], ground) is None
+    # Its square is where the texels are: half a texel beyond the first and the last.
+    corner = ground.square @ [-1, -1, 0, 1] - ground.square @ [1, -1, 0, 1]
+    np.testing.assert_allclose(np.linalg.norm(corner), 20 * 40 / 39)
+    first, second = ground.points.reshape(40, 40, 3)[0, 0], ground.points.reshape(40, 40, 3)[0, 1]
+    np.testing.assert_allclose((ground.square @ [-1 + 1 / 40, -1 + 1 / 40, 0, 1])[:3], first)
+    np.testing.assert_allclose((ground.square @ [-1 + 3 / 40, -1 + 1 / 40, 0, 1])[:3], second)
+    np.testing.assert_allclose(ground.square[:3, 2] / np.linalg.norm(ground.square[:3, 2]), up)
