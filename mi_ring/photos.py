@@ -112,8 +112,8 @@ def main(arguments: Sequence[str]) -> int:
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
     if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
-        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/ and "
-                         f"valid/ beside it, to make it anew from {config.out}/work")  # fmt: skip
+        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
+                         f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with locked(config.out, "DIR"):

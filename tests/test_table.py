@@ -6,8 +6,12 @@ import pytest
 from test_photogrammetry import CENTER, LENS, hit_ellipsoid, poses, rays_of, view
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.images import linear_to_srgb, write_image
+from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
+from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.scene import OBJECT, Shot, write_table
 from mi_ring.photogrammetry.table import Ground, Plane, reflectance
 from mi_ring.photogrammetry.views import camera_of
 from mi_ring.rendering import bridge
@@ -96,43 +100,64 @@ def test_a_mirrored_or_flat_one_is_refused(scale):
         mi.load_string(f'<shape type="table" version="3.0.0">{transform}</shape>')
 
 
-def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows():
-    """A tilted plane with a linear albedo, flashes beside the lenses, an object that hides it and casts shadows."""
+UP = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+PLANE = Plane(UP, float(CENTER @ UP) - 3.0)
+
+
+def albedo(points):
+    x, y = (points - CENTER)[..., 0], (points - CENTER)[..., 1]
+    return np.stack([0.4 + 0.02 * x, 0.5 - 0.015 * y, 0.3 + 0.005 * x + 0.01 * y], -1)
+
+
+def photographs_of_a_table():
+    """A tilted plane, flashes beside the lenses, an object that hides it and casts shadows: pose, flash, sRGB, mask."""
     random = np.random.default_rng(4)
-    up = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
-    plane = Plane(up, float(CENTER @ up) - 3.0)
-    ground = Ground(plane, CENTER, 5.0, 40)
-
-    def albedo(points):
-        x, y = (points - CENTER)[..., 0], (points - CENTER)[..., 1]
-        return np.stack([0.4 + 0.02 * x, 0.5 - 0.015 * y, 0.3 + 0.005 * x + 0.01 * y], -1)
-
-    views, lights, hidden = [], [], []
-    for k, pose in enumerate(poses(14)):
+    for pose in poses(14):
         camera = camera_of(LENS, pose)
         flash = Light("point", camera.position + pose[:3, 0] * 0.8, random.uniform(100, 160, 3))
         rays = rays_of(camera)
-        t = (plane.offset - camera.position @ up) / (rays @ up)
+        t = (PLANE.offset - camera.position @ UP) / (rays @ UP)
         points = camera.position + t[:, None] * rays
         way = flash.vector - points
         away = np.linalg.norm(way, axis=1, keepdims=True)
-        radiance = albedo(points) / np.pi * flash.rgb * (way @ up)[:, None] / away**3
+        radiance = albedo(points) / np.pi * flash.rgb * (way @ UP)[:, None] / away**3
         radiance[random.uniform(size=len(t)) < 0.1] *= 0.05  # shadows
         object_ = np.isfinite(hit_ellipsoid(camera)[0])
         radiance[object_] = 0.4
-        srgb = 255 * linear_to_srgb(radiance.clip(0, 1).astype(np.float32))
-        views.append(view(str(k), pose, srgb.round()))
-        lights.append(flash)
-        hidden.append(object_.reshape(LENS.size[::-1]).astype(np.uint8))
-    found = reflectance(views, lights, hidden, ground)
-    true = albedo(ground.points).reshape(found.shape)
+        srgb = (255 * linear_to_srgb(radiance.clip(0, 1).astype(np.float32))).round().astype(np.uint8)
+        mask = object_.reshape(LENS.size[::-1]).astype(np.uint8)
+        yield pose, flash, srgb.reshape(*mask.shape, 3), mask
+
+
+def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows():
+    taken, flashes, pictures, hidden = zip(*photographs_of_a_table())
+    views = [view(str(k), pose, srgb) for k, (pose, srgb) in enumerate(zip(taken, pictures))]
+    ground = Ground(PLANE, CENTER, 5.0, 40)
+    found = reflectance(views, flashes, hidden, ground)
     near = np.linalg.norm(ground.points - CENTER, axis=1).reshape(40, 40) < 6
-    assert np.median(np.abs(found - true)[near]) < 0.01
-    assert reflectance(views, lights, [np.ones_like(mask) for mask in hidden], ground) is None
-    # Its square is where the texels are: half a texel beyond the first and the last.
-    corner = ground.square @ [-1, -1, 0, 1] - ground.square @ [1, -1, 0, 1]
-    np.testing.assert_allclose(np.linalg.norm(corner), 20 * 40 / 39)
-    first, second = ground.points.reshape(40, 40, 3)[0, 0], ground.points.reshape(40, 40, 3)[0, 1]
-    np.testing.assert_allclose((ground.square @ [-1 + 1 / 40, -1 + 1 / 40, 0, 1])[:3], first)
-    np.testing.assert_allclose((ground.square @ [-1 + 3 / 40, -1 + 1 / 40, 0, 1])[:3], second)
-    np.testing.assert_allclose(ground.square[:3, 2] / np.linalg.norm(ground.square[:3, 2]), up)
+    assert np.median(np.abs(found - albedo(ground.points).reshape(found.shape))[near]) < 0.01
+    assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground) is None
+
+
+def test_the_table_of_a_capture_has_its_picture_where_the_table_is(tmp_path):
+    shots = []
+    for k, (pose, flash, srgb, mask) in enumerate(photographs_of_a_table()):
+        write_image(srgb, tmp_path / f"{k}.png")
+        shots.append(Shot(Picture(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, flash))
+    writer = Writer(tmp_path / "capture/scene.xml")
+    element = write_table(writer, shots, PLANE, CENTER)
+    root = scene_element([])
+    root.append(element)
+    writer.finish(scene_bytes(root))
+    writer.close()
+    _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False))
+    across = PLANE.axes()[:2]
+    below = CENTER - PLANE.height(CENTER) * UP
+    points = below + np.random.default_rng(1).uniform(-4, 4, (200, 2)) @ across
+    rays = mi.Ray3f(mi.Point3f((points + 2 * UP).T.astype(np.float32)), mi.Vector3f((-UP).tolist()))
+    si = table.ray_intersect(rays)
+    assert np.array(si.is_valid()).all()
+    np.testing.assert_allclose(np.array(si.t), 2, atol=1e-4)
+    seen = np.array(si.bsdf().eval_diffuse_reflectance(si)).T
+    assert np.median(np.abs(seen - albedo(points)), 0).max() < 0.012
+    assert np.corrcoef(seen[:, 0], points[:, 0])[0, 1] > 0.8 and np.corrcoef(seen[:, 1], points[:, 1])[0, 1] < -0.8
