@@ -226,7 +226,8 @@ def make_capture(out: Path, settings: Settings) -> None:
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
         light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png"))
+        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
+                                           calibrated=True))  # fmt: skip
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
         (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

@@ -247,7 +247,7 @@ def test_the_power_that_is_refined_begins_with_a_usual_albedo(broken_capture):
 def test_what_is_refined_on_demand_goes_with_auto(small_capture):
     capture = mi_ring.load_capture(small_capture)
     assert refined_of(capture, Config(refine=("auto", "contrast")), 0.5) == (
-        "light", "power", "curve", "contrast", "ambient")  # fmt: skip
+        "light", "power", "contrast", "ambient")  # fmt: skip
     assert "scale" in refined_of(capture, Config(), 1.5) and "scale" not in refined_of(capture, Config(), 0.5)
     with pytest.raises(InputError, match="none alone"):
         Config(refine=("none", "light"))
@@ -457,6 +457,6 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
     assert Fit(capture).calibration is None
     assert Fit(capture, Config(refine=("cameras",))).calibration.refined == ("cameras",)
     unknown = mi_ring.load_capture(small_capture)
-    assert Fit(unknown).calibration.refined == ("light", "power", "curve", "ambient")
+    assert Fit(unknown).calibration.refined == ("light", "power", "ambient")
     assert Fit(unknown, Config(refine=("none",))).calibration is None
     assert fit.parse_options(["scene.xml", "--refine", "light", "cameras"]).refine == ("light", "cameras")

@@ -44,7 +44,9 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
 }
-AUTO = "light", "power", "curve", "ambient"  #: what is refined by default; `scale`, too, where it must be wrong
+#: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
+#: the reflectance, and takes the flash's place and the room along (docs/phone.md).
+AUTO = "light", "power", "ambient"
 ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 BLACK = 1e-6  #: radiance, in units of the file's, below which an S goes on straight

@@ -87,8 +87,8 @@ class Config:
     how steep the S of a curve as of film is; scale: the power of all lights together, by interreflection; ambient: the
     light of the room, which is the same for all, fixed in the world, or in the camera if the scene has a `room` in its
     axes, as that of a turntable has; masks: the object's outlines in
-    the photographs, found anew about the surface at half and at three quarters of the fit. auto: light, power, curve
-    and ambient, and scale where lights cannot be as strong as the scene says, but nothing if it says that it is
+    the photographs, found anew about the surface at half and at three quarters of the fit. auto: light, power and
+    ambient, and scale where lights cannot be as strong as the scene says, but nothing if it says that it is
     calibrated; none: nothing."""
     holdout: int = 0
     """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
