@@ -53,6 +53,39 @@ def test_where_there_is_no_glibc_memory_is_left_alone(error, monkeypatch):
 
     monkeypatch.setattr(machine.ctypes, "CDLL", cdll)
     machine.keep_memory()
+    machine.release_memory()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_that_is_kept_can_be_released():
+    """Between what stays, where it would otherwise be held as long as the process lives."""
+    code = """
+import ctypes
+import re
+from pathlib import Path
+
+import numpy as np
+from mi_ring.system import machine
+
+if not hasattr(ctypes.CDLL(None), "malloc_trim"):
+    raise SystemExit(3)
+held = lambda: int(re.search(r"VmRSS:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
+machine.keep_memory()
+before = held()
+large, small = [], []
+for _ in range(200):
+    large.append(np.ones(2**17))
+    small.append(np.ones(100))
+large.clear()
+kept = held()
+machine.release_memory()
+assert kept > before + 150, (before, kept)
+assert held() < before + 50, (before, kept, held())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if done.returncode == 3:
+        pytest.skip("needs glibc")
+    assert not done.returncode, done.stderr
 
 
 def test_workers_are_kept_and_their_one_thread_does_not_spread():

@@ -33,7 +33,7 @@ from mi_ring.rendering import bridge
 from mi_ring.rendering.indirect import BOUNCES
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.saved import ring_of, ring_state
-from mi_ring.system.machine import autocast, device
+from mi_ring.system.machine import autocast, device, release_memory
 
 LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
@@ -146,6 +146,8 @@ class Fit:
         it.detach()
         self.restraint.note(it, self.iterations)
         self.iteration += 1
+        if self.iteration == it.stage.last:
+            release_memory()  # what comes next has other sizes
         self.seconds += time.perf_counter() - started
         if it.number == self.iterations and len(self.held_out):
             self.confirmed = confirm(self)

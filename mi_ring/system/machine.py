@@ -144,14 +144,25 @@ def threads_of(count: int = 0) -> Iterator[None]:
         dr.set_thread_count(before[1])
 
 
+def glibc(name: str) -> Callable[..., int]:
+    """A function of glibc's; one that does nothing where there is none: macOS, musl, Windows."""
+    try:
+        return getattr(ctypes.CDLL(None), name)
+    except (AttributeError, TypeError, OSError):
+        return lambda *_: 0
+
+
 def keep_memory() -> None:
     """Have glibc keep freed memory, for the rest of the process.
 
     The system takes longer to hand out and clear pages than most operations take to use them.
     """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt  # glibc alone has it
-    except (AttributeError, TypeError, OSError):  # macOS, musl; Windows
-        return
+    mallopt = glibc("mallopt")
     mallopt(M_MMAP_MAX, 0)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def release_memory() -> None:
+    """Give the system back what has been freed so far, between what stays, too: up to half of what a fit holds."""
+    dr.flush_malloc_cache()
+    glibc("malloc_trim")(0)
