@@ -183,10 +183,10 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not sheet:
         motion, plane = upright(motion, found.center, plane, ups(pictures))
         found = found._replace(center=np.zeros(3))
-    if silent := without_exposure([picture for picture in pictures if picture.name in motion.cameras]):
+    taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
+    if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: EXIF data of {len(silent)} photographs do not tell it, which is taken to be the usual one: "
               f"{', '.join(silent)}")  # fmt: skip
-    taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
     if config.turntable:  # the object sees the room turn
@@ -194,8 +194,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     try:
         written = in_threads(partial(write_shot, writer), taken, windows(taken))
         root.extend(progress(written, "writing", len(taken)))
-        if sheet and plane and (table := write_table(writer, taken, plane, found.center)) is not None:
-            root.append(table)
+        if plane and any(shot.measured for shot in taken):
+            root.extend(write_table(writer, taken, plane, found.center))
         write_file(work / "options.json", json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:

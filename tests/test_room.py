@@ -1,5 +1,6 @@
 """Light of the room: its emitter, the pictures of its harmonics, and whether least squares finds it."""
 
+import xml.etree.ElementTree as ElementTree
 from types import SimpleNamespace
 
 import drjit as dr
@@ -9,7 +10,8 @@ import pytest
 import torch
 from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
-from mi_ring.capture.scenefile import load_element, room_elements
+from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import load_element, recalibrated_xml, room_element, room_elements, scene_bytes
 from mi_ring.fitting.room import Room
 from mi_ring.rendering import bridge, indirect
 from mi_ring.rendering.photographs import Photographs
@@ -197,3 +199,12 @@ def test_a_scene_says_in_which_axes_its_room_is(frames):
     assert frames_of(scene) == set(frames)
     np.testing.assert_allclose(room_of(scene), room, atol=1e-6)
     assert frames_of(load(LIGHTS)) == {"world"}
+
+
+def test_a_turntable_stays_one_though_its_room_is_dark(small_capture):
+    """It is told by a room of zeros in the camera's axes."""
+    sensors = load_capture(small_capture, images=False).sensors
+    root = ElementTree.fromstring(small_capture.read_bytes())
+    root.append(room_element("camera", np.zeros((COUNT, 3))))
+    fitted = ElementTree.fromstring(recalibrated_xml(scene_bytes(root), sensors, np.zeros((BASIS, 3))))
+    assert [string.get("value") for string in fitted.findall("emitter/string[@name='frame']")] == ["camera"]

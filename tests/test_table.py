@@ -7,7 +7,7 @@ from test_photogrammetry import CENTER, LENS, hit_ellipsoid, poses, rays_of, vie
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import scene_bytes, scene_element
-from mi_ring.images import linear_to_srgb, write_image
+from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
 from mi_ring.photogrammetry.folder import Picture
@@ -66,8 +66,7 @@ def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
 
 @pytest.mark.parametrize("more", ["", ROOM], ids=["dark", "room"])
 def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
-    path = write(tmp_path, more=more)
-    capture = load_capture(path, images=False)
+    capture = load_capture(write(tmp_path, more=more), images=False)
     surface = bridge.Surface(capture.scene, capture.shape)
     rgb, coverage = bridge.draw(surface, capture.photograph(0), spp=256, indirect=True)
     without = load_capture(write(tmp_path, table=False, more=more), images=False)
@@ -75,11 +74,9 @@ def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
                               indirect=True)  # fmt: skip
     np.testing.assert_array_equal(coverage, same)  # no camera sees it
 
-    scene, sensors = open_lit_scene(write(tmp_path, more=more))
-    if more:
-        scene = mi.load_file(str(path), optimize=False)
-    batch = capture.photographs.select([0], sensors[0].size)
-    channels = [np.array(c) for c in render_path(scene, batch, sensors[0], 1024, 3, 5)]
+    scene, sensor = mi.load_file(str(write(tmp_path, more=more)), optimize=False), capture.sensors[0]
+    batch = capture.photographs.select([0], sensor.size)
+    channels = [np.array(c) for c in render_path(scene, batch, sensor, 1024, 3, 5)]
     traced = np.stack(channels, -1).reshape(rgb[0].shape)
     inside = coverage[0].numpy() == 1
     from_below, bounced = traced[inside], (rgb - alone)[0].numpy()[inside]
@@ -93,8 +90,23 @@ def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
     np.testing.assert_allclose(rgb[0].numpy()[inside].mean(0), from_below.mean(0), rtol=0.01)
 
 
+def test_without_interreflection_a_table_changes_nothing(tmp_path):
+    pictures = []
+    for table in (True, False):
+        capture = load_capture(write(tmp_path, table, ROOM), images=False)
+        surface = bridge.Surface(capture.scene, capture.shape)
+        pictures.append(bridge.draw(surface, capture.photograph(0), spp=16)[0].numpy())
+        assert not bridge.parted(open_lit_scene(tmp_path / "try.xml")[0])[1]  # nor does it to `validate`
+    np.testing.assert_allclose(*pictures, rtol=1e-5)
+
+
 @pytest.mark.parametrize("scale", ['x="-1" y="1" z="1"', 'x="1" y="1" z="0"'])
 def test_a_mirrored_or_flat_one_is_refused(scale):
+    light = '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'
+    with pytest.raises(RuntimeError, match="has an emitter; give light to a rectangle"):
+        mi.load_string(f'<shape type="table" version="3.0.0">{light}</shape>')
+    with pytest.raises(RuntimeError, match="to_world is .* must be a <transform>"):
+        mi.load_string('<shape type="table" version="3.0.0"><vector name="to_world" x="1" y="1" z="1"/></shape>')
     transform = f'<transform name="to_world"><scale {scale}/></transform>'
     with pytest.raises(RuntimeError, match="to_world is flat or a mirror"):
         mi.load_string(f'<shape type="table" version="3.0.0">{transform}</shape>')
@@ -139,15 +151,25 @@ def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shad
     assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground) is None
 
 
-def test_the_table_of_a_capture_has_its_picture_where_the_table_is(tmp_path):
+class Raw(Picture):
+    """As a raw photograph is developed: linear, with no brightness of its own."""
+
+    encoding = "linear"
+
+    def stored(self):
+        linear = srgb_to_linear(super().stored().astype(np.float32) / 255)
+        return (0.3 * 65535 * linear).round().astype(np.uint16)
+
+
+@pytest.mark.parametrize(("kind", "brightness"), [(Picture, 1.0), (Raw, 0.3)])
+def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightness, tmp_path):
     shots = []
     for k, (pose, flash, srgb, mask) in enumerate(photographs_of_a_table()):
         write_image(srgb, tmp_path / f"{k}.png")
-        shots.append(Shot(Picture(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, flash))
+        light = flash._replace(rgb=brightness * flash.rgb)
+        shots.append(Shot(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
     writer = Writer(tmp_path / "capture/scene.xml")
-    element = write_table(writer, shots, PLANE, CENTER)
-    root = scene_element([])
-    root.append(element)
+    root = scene_element(write_table(writer, shots, PLANE, CENTER))
     writer.finish(scene_bytes(root))
     writer.close()
     _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False))

@@ -63,7 +63,7 @@ def scene_element(photographs: Iterable[Element], ground: np.ndarray | None = No
 
 def table_element(picture: str, square: np.ndarray) -> Element:
     """A diffuse `table` with the picture of its albedo; `square` (4, 4): its to_world."""
-    element = ElementTree.Element("shape", type="table", id="table")
+    element = ElementTree.Element("shape", type="table")
     transform = ElementTree.SubElement(element, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=numbers(square))
     bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
@@ -154,10 +154,13 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
             if lit or child.get("name") in ("gamma", "contrast", "falloff", "vignetting", *fields):
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
+    frames = set()
     for emitter in root.findall("emitter[@type='room']"):
+        frame = emitter.find("string[@name='frame']")
+        frames.add("world" if frame is None else frame.get("value", ""))
         root.remove(emitter)
     if room is not None:
-        root.extend(room_elements(room))
+        root.extend(room_elements(room) or [room_element(frame, np.zeros((COUNT, 3))) for frame in sorted(frames)])
     return scene_bytes(root)
 
 

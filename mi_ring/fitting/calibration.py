@@ -26,6 +26,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
+from mi_ring.rendering.scenes import has_table
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
 UNKNOWNS: dict[str, dict[str, float]] = {
@@ -63,7 +64,8 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     """
     names: set[str] = set(config.refine)
     if "auto" in names and not capture.known:
-        names |= {*AUTO, "scale"} if config.indirect and albedo >= 1 else {*AUTO}
+        untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
+        names |= {*AUTO, "scale"} if untold else {*AUTO}
     return tuple(name for name in UNKNOWNS if name in names)
 
 

@@ -43,7 +43,7 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
 
 
 def digests(capture: Capture, config: Config) -> dict[str, str]:
-    """What tells one file from another, of all that a fit reads: by name, relative to the scene."""
+    """What tells one file from another, of all that a fit reads but textures: by name, relative to the scene."""
     files = {capture.path, capture.shape.domain_file}
     files |= {file for sensor in capture.sensors for file in (sensor.filename, sensor.mask, sensor.valid)}
     if isinstance(config.domain, tuple):

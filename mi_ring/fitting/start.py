@@ -15,6 +15,7 @@ from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
+from mi_ring.rendering.scenes import has_table
 from mi_ring.ring.ring import Ring
 
 
@@ -39,6 +40,9 @@ def starting_ring(
         raise InputError(f"{capture.path}: --refine scale: what the power of the lights is tells interreflection "
                          "alone, and a reflectance without bounds; it goes neither with --no-indirect nor with "
                          "these --parameters")  # fmt: skip
+    if "scale" in refined and has_table(capture.scene):
+        raise InputError(f"{capture.path}: --refine scale: the scene has a table, whose reflectance tells how strong "
+                         "the lights are; leave scale out, or remove the table")  # fmt: skip
     scale /= overall(refined, math.pi * scale)
     indirect = config.indirect and math.pi * scale < 1
     if networks:

@@ -14,7 +14,7 @@ from mi_ring.plugins import flash, photograph, shapenet
 from mi_ring.rendering.attributes import attributes_of, require_attributes
 from mi_ring.rendering.photographs import Photographs, pixel_rays
 from mi_ring.rendering.pictures import render_photographs
-from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.scenes import assembled, own_emitters, parted
 from mi_ring.rendering.shading import is_room
 
 BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
@@ -32,7 +32,7 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """The scene with its photographs, lit for stock integrators too. Raises InputError, one line."""
+    """The scene without tables and its photographs, lit for stock integrators too. Raises InputError, one line."""
     scene, sensors = open_scene(path)
     try:
         for shape in scene.shapes():
@@ -40,7 +40,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(sensors)
-        return with_flash(without_rooms(scene)), sensors
+        return with_flash(without_rooms(parted(scene)[0])), sensors
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -35,6 +35,7 @@ class Shot:
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes [scene units]
     mask: np.ndarray | None  #: (h, w) uint8 of all of the undistorted photograph, perhaps reduced
     light: Light
+    measured: bool = False  #: does the sheet tell how strong the light is?
 
     def extent(self) -> np.ndarray | None:
         """Of the object [px]: (2, 2), lowest and highest column and row."""
@@ -89,28 +90,31 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
     return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid)
 
 
-def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray) -> Element | None:
+def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray) -> list[Element]:
     """A `table`, for the light that it reflects onto the object at `center` (3,), and its picture.
 
-    None if no photograph shows it. The lights must be as strong as the shots say.
+    None of it if no photograph shows it. The lights must be as strong as the shots say.
     """
 
-    def seen(shot: Shot) -> tuple[View, np.ndarray]:
+    def seen(shot: Shot) -> tuple[View, np.ndarray, Light]:
         view = reduced(shot.picture, shot.lens, shot.pose, whole_of(shot.lens, TABLE_SEEN))
+        # What is white to a view is less in a raw photograph, whose light is as strong as that says.
+        white = shot.picture.white if shot.picture.encoding == "linear" else 1.0
+        light = shot.light._replace(rgb=shot.light.rgb / white)
         shot.picture.close()
         if shot.mask is None:  # it may be anywhere
-            return view, np.ones(view.shown.shape, np.uint8)
+            return view, np.ones(view.shown.shape, np.uint8), light
         mask = cv2.resize((shot.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
-        return view, grown(mask, MARGIN)
+        return view, grown(mask, MARGIN), light
 
-    views, hidden = zip(*in_threads(seen, shots))
+    views, hidden, lights = zip(*in_threads(seen, shots))
     away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     ground = Ground(plane, center, TABLE_REACH * away, TABLE_TEXELS)
-    albedo = reflectance(views, [shot.light for shot in shots], hidden, ground)
+    albedo = reflectance(views, lights, hidden, ground)
     if albedo is None:
-        return None
+        return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))
-    return table_element(writer.relative(picture), ground.square)
+    return [table_element(writer.relative(picture), ground.square)]
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:

@@ -93,9 +93,9 @@ def require_read(pictures: Sequence[Picture], found: Sequence[object]) -> None:
     bad = [(picture.path, error) for picture, error in zip(pictures, found) if isinstance(error, InputError)]
     if len(bad) > 1:
         names = ", ".join(path.name for path, _ in bad)
-        raise InputError(f"{bad[0][1]} ({len(bad)} photographs cannot be read: {names}; copy or remove them)")
+        raise InputError(f"{bad[0][1]}; {len(bad)} photographs cannot be read: {names}; mend or remove them")
     if bad:
-        raise InputError(f"{bad[0][1]}; copy it anew or remove it")
+        raise InputError(f"{bad[0][1]}; mend or remove it")
 
 
 def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progress: Progress) -> Sheet | None:
@@ -109,7 +109,7 @@ def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progres
             try:
                 return shown(picture)
             except InputError as error:
-                if error.__cause__ is None:  # not the file's fault: a package is missing
+                if isinstance(error.__cause__, ImportError):  # not the file's fault: a package is missing
                     raise
                 return error
 
@@ -225,7 +225,7 @@ def shots(
     result, taken = [], [picture for picture in pictures if picture.name in motion.cameras]
     for picture, exposure in zip(taken, relative_exposures(taken)):
         lens, pose = motion.cameras[picture.name]
-        light = Light("point", pose[:3, :3] @ flash[picture.name] + pose[:3, 3],
-                      known.get(picture.name, exposure * usual))  # fmt: skip
-        result.append(Shot(picture, lens, pose, object_.masks.get(picture.name), light))
+        name = picture.name
+        light = Light("point", pose[:3, :3] @ flash[name] + pose[:3, 3], known.get(name, exposure * usual))
+        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, name in known))
     return result

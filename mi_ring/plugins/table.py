@@ -46,12 +46,14 @@ class Table(mi.Mesh):
 
     def __init__(self, props):
         to_world = props.get("to_world", mi.ScalarTransform4f())
-        if isinstance(to_world, str | int | float):
+        if not isinstance(to_world, mi.ScalarTransform4f | mi.ScalarTransform4d):
             raise ValueError(f'table "{props.id()}": to_world is {to_world}, must be a <transform>')
         matrix = np.array(to_world.matrix)
         if np.linalg.det(matrix[:3, :3]) <= 0:
             raise ValueError(f'table "{props.id()}": to_world is flat or a mirror; its z must be up from the table')
         super().__init__(props.id(), 4, 2, props, False, True)
+        if self.is_emitter():
+            raise ValueError(f'table "{props.id()}": has an emitter; give light to a rectangle instead')
         square = np.column_stack([2 * CORNERS - 1, np.zeros(4)])
         values = {
             POSITIONS: square @ matrix[:3, :3].T + matrix[:3, 3], "vertex_texcoords": CORNERS, FACES: TRIANGLES,

@@ -245,9 +245,10 @@ def surroundings(
     `photographs`: as they were rendered; `coverage` (N, H, W): of that picture. This light varies slowly: it is
     rendered at most `width` pixels wide (a few good pixels did better than many noisy ones), and smoothed.
     """
+    table = surface.table if bounces > 1 else None  # it would only keep the room's light from the object
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)
-    channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, surface.table)]
+    channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, table)]
     rgb, alpha = pictures(channels[:4], small)
     harmonics = torch.stack(channels[4:]).reshape(-1, 3, *alpha.shape).movedim(1, -1) if room else None
     return Surroundings(rgb, harmonics, alpha, coverage, factor)

@@ -57,8 +57,10 @@ def reflect(scene, si, view, photographs, bounces, seed, table=None):
         active &= dr.any(throughput > 0)
         si = scene.ray_intersect(out, active)
         if table is not None:
+            apart(si)
             below = table.ray_intersect(out, active)
             si = dr.select(below.t < si.t, below, si)
+            apart(si)
         leaves = active & ~si.is_valid()
         escaped, direction = dr.select(leaves, throughput, escaped), dr.select(leaves, out.d, direction)
         active = si.is_valid()
@@ -66,3 +68,9 @@ def reflect(scene, si, view, photographs, bounces, seed, table=None):
         lit = shade(scene, si, lambda si: photographs.light(view, si), random, True)
         radiance += dr.select(active, throughput * lit, 0)
     return radiance, escaped, direction
+
+
+def apart(values) -> None:
+    """On a GPU, have values computed before what follows: OptiX refuses rays through two scenes in one kernel."""
+    if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+        dr.eval(values)

@@ -29,6 +29,11 @@ def parted(scene) -> tuple[mi.Scene, mi.Scene | None]:
     return assembled(others, own_emitters(scene), scene.sensors(), scene.integrator()), assembled(tables)
 
 
+def has_table(scene) -> bool:
+    """Has a scene a `table`?"""
+    return any(is_table(shape) for shape in scene.shapes())
+
+
 def is_table(shape) -> bool:
     """Is it a `table`, whatever the variant that its class belongs to?"""
     return getattr(shape, "of_tables", False)
