@@ -58,7 +58,8 @@ class RenderConfig(MaterialOptions):
     envmap: Path | None = None
     """Environment, an EXR or HDR file of latitude and longitude, to light the object instead."""
     integrator: str | None = None
-    """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection."""
+    """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection. A
+    `table` is part of photometric's pictures alone."""
     format: Literal["png", "exr"] | None = None
     """Of the pictures. Default: as the scene's file names say; png for the three films."""
     fps: float = 24.0
