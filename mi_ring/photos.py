@@ -21,7 +21,7 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
-from mi_ring.photogrammetry.folder import find_pictures, ups, without_exposure
+from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, ups, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
 from mi_ring.photogrammetry.scene import windows, write_shot, write_table
@@ -153,6 +153,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
     if isinstance(config.masks, Path):  # before all the work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
+    elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
+        require_half(0, pictures, "alpha")
     with writing(config.out):
         config.out.mkdir(parents=True, exist_ok=True)
     for left in config.out.glob(".scene.*/"):  # by a process that was killed
@@ -185,8 +187,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         found = found._replace(center=np.zeros(3))
     taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
-        print(f"Exposure: EXIF data of {len(silent)} photographs do not tell it, which is taken to be the usual one: "
-              f"{', '.join(silent)}")  # fmt: skip
+        print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
     if config.turntable:  # the object sees the room turn

@@ -346,18 +346,28 @@ def test_how_far_matches_are_from_what_two_cameras_say():
 def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_is_taken(tmp_path, monkeypatch):
     def model(name, points):
         images = {k: SimpleNamespace(num_points3D=n, frame_id=k) for k, n in enumerate(points)}
-        removed = []
-        return SimpleNamespace(name=name, images=images, removed=removed, reg_image_ids=lambda: list(images),
-                               deregister_frame=removed.append)  # fmt: skip
+        left = list(images)
+        return SimpleNamespace(name=name, images=images, reg_image_ids=lambda: list(left), deregister_frame=left.remove)
 
-    together, after = model("together", [90, 80, 12]), model("after", [90, 80, 70])
+    for counts, best, kept in (((50, 40), "together", [0, 1]), ((40, 50), "after", [0, 1, 2])):
+        together, after = model("together", [90, 80, 12]), model("after", [90, 80, 70])
+        monkeypatch.setattr(motion, "map_globally", lambda *_, model=together: model)
+        monkeypatch.setattr(motion, "map_incrementally", lambda *_, model=after: model)
+        found = {name: [motion.Agreement(0, 1, n, n), motion.Agreement(2, 1, 50, 45)]
+                 for name, n in zip(("together", "after"), counts)}  # fmt: skip
+        monkeypatch.setattr(motion, "agreements", lambda model, _, found=found: found[model.name])
+        taken = motion.put_together(tmp_path, 3, None)
+        assert taken.name == best and taken.reg_image_ids() == kept
+    # What hangs on matches that do not fit is left out, and what it explains within itself does not count.
+    together, after = model("together", [90] * 5), model("after", [90] * 5)
     monkeypatch.setattr(motion, "map_globally", lambda *_: together)
     monkeypatch.setattr(motion, "map_incrementally", lambda *_: after)
-    for counts, best, removed in (((50, 40), together, [2]), ((40, 50), after, [])):
-        found = dict(zip(("together", "after"), counts))
-        monkeypatch.setattr(motion, "explained", lambda model, _, found=found: found[model.name])
-        assert motion.put_together(tmp_path, 3, None) is best
-        assert best.removed == removed
+    whole = [motion.Agreement(k, k + 1, 100, 80) for k in range(4)]
+    torn = [motion.Agreement(0, 1, 300, 290), motion.Agreement(1, 2, 100, 60), motion.Agreement(2, 3, 40, 39),
+            motion.Agreement(3, 4, 500, 499), motion.Agreement(0, 4, 14, 14)]  # fmt: skip
+    assert motion.loose([7, 0, 1, 2, 3, 4], torn) == [7, 0, 1]
+    monkeypatch.setattr(motion, "agreements", lambda model, _: whole if model is together else torn[:2])
+    assert motion.put_together(tmp_path, 5, None) is together and after.reg_image_ids() == [0, 1]
     monkeypatch.setattr(motion, "map_globally", lambda *_: None)
     monkeypatch.setattr(motion, "map_incrementally", lambda *_: None)
     assert motion.put_together(tmp_path, 3, None) is None

@@ -289,6 +289,8 @@ def rows(n=9, **changes):
 
 def test_of_a_good_fit_there_is_nothing_to_say():
     assert report.fit_findings(rows(), 400, 400) == []
+    assert report.fit_findings(rows(), 400, 400, None, 0.29) == report.fit_findings(rows(), 9, 9, None, 0.9) == []
+    assert "41% of the object's light is not" in report.fit_findings(rows(), 400, 400, None, 0.41)[0]
     assert report.fit_findings(rows(psnr=29.0, iou=0.91, saturated=0.249, shift=(0.9, 0.1)), 400, 400) == []
     nothing = [
         report.PhotographPanel("a.png", 30.0, None, 0.0, None, {}),

@@ -19,8 +19,8 @@ CELL, LINE = 200, 16  # of the contact sheet: its photographs, lines of text [px
 GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # names of photographs
 RED, YELLOW, GREEN = (255, 51, 51), (255, 220, 40), (26, 255, 51)
 LEGEND = (
-    ("outlines of masks", RED), ("says nothing (unsure, or beyond the lens)", YELLOW), ("hull of all masks", GREEN),
-    ("mask agrees with the others to so much", GOOD), ("too little", DOUBTED),
+    ("mask", RED), ("unsure, or beyond the lens: not used", YELLOW), ("hull of all masks", GREEN),
+    ("share of the mask that the other masks agree to", GOOD), ("less than needed", DOUBTED),
 )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from mi_ring.version import __version__
 REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
 PICTURE = 480  # width and height of the pictures, at most [px]
 MISFIT, COVERED = 3.0, 0.9  # a PSNR this far below the others' [dB], IoU: say so
+UNTRUE, TELLING = 0.3, 60  # share of the object's light, of fits with so many iterations; good ones end at .07 to .15
 SATURATED = 0.25  # share of the object's pixels: more than mi_ring.check allows, for that is of the median photograph
 SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
 
@@ -81,7 +82,8 @@ def report_html(
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
         name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
-        settings=fit.config.settings(), findings=fit_findings(rows, fit.iteration, fit.iterations, refined),
+        settings=fit.config.settings(),
+        findings=fit_findings(rows, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
         refined=refined and calibration_panel.panel(fit.capture, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
@@ -96,10 +98,17 @@ def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
 
 
 def fit_findings(
-    rows: list[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None
-) -> list[str]:
-    """What stands out, each in one sentence that says what to do. `refined`: the fit's `summary`."""
+    rows: list[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
+    unexplained: float = 0.0,
+) -> list[str]:  # fmt: skip
+    """What stands out, each in one sentence that says what to do.
+
+    `refined`: the fit's `summary`; `unexplained`: share of the object's light that is not as predicted.
+    """
     found = []
+    if iteration == iterations >= TELLING and unexplained > UNTRUE:
+        found.append(f"{unexplained:.0%} of the object's light is not as predicted: this surface is not to be trusted. "
+                     "Cameras, masks or lights are wrong; look at the contact sheet of mi-ring check.")  # fmt: skip
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
 

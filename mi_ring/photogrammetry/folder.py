@@ -18,6 +18,7 @@ from mi_ring.system import command
 from mi_ring.system.optional import need
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+TRANSPARENT = (".png", ".tif", ".tiff")  #: what may have an alpha channel
 HEIF = (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF

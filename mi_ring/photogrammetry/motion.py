@@ -1,12 +1,14 @@
 """Structure from motion: cameras and points from photographs alone, by COLMAP's library."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
@@ -20,6 +22,8 @@ ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights an
 SMALL = 1000  #: pixels along photographs, below which they may have too few features
 TEXTURED = 300  #: features of a photograph, from which they are worth something
 EPIPOLAR = 2.5e-3  #: of a picture's width, by which a match may be off from what two cameras say
+FEWEST_MATCHES, FIRM = 15, 0.7  #: of two photographs, and the share that cameras explain, that hold each other
+NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
@@ -67,8 +71,11 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
     model = put_together(folder, len(pictures), progress)
     found = model.num_reg_images() if model else 0
     if found < max(3, len(pictures) / 2):
-        raise InputError(f"{pictures[0].path.parent}: photographs: only {found} of {len(pictures)} could be put "
-                         f"together: {why_not(pictures, folder)}")  # fmt: skip
+        placed = {model.images[k].name for k in model.reg_image_ids()} if model else set()
+        names = [picture.name for picture in pictures if file_of(picture) in placed]
+        which = f" ({', '.join(names[:NAMED])}{', …' * (found > NAMED)})" if names else ""
+        raise InputError(f"{pictures[0].path.parent}: FOLDER: only {found} of {len(pictures)} photographs could be put "
+                         f"together{which}: {why_not(pictures, folder, found)}")  # fmt: skip
     for _ in progress(adjustments(model), "bundle adjustment"):
         pass
     growing = folder / "sparse.partial"
@@ -84,14 +91,27 @@ def put_together(folder: Path, count: int, progress: Progress) -> Any:
     All cameras together ("Global Structure-from-Motion Revisited", Pan et al. 2024), and one after another. The former
     heeds all matches from the start, where the latter puts photographs from another side in by the first few points
     that fit; these may be nearly in one plane, and what is mirrored then stays so. The latter is better at
-    photographs whose matches are mostly wrong, by a pattern that repeats or shadows that move.
+    photographs whose matches are mostly wrong, by a pattern that repeats or shadows that move. Of both, parts that do
+    not hang together with the rest are left out.
     """
     models = [map_globally(folder, progress), map_incrementally(folder, count, progress)]
-    best: Any = max(filter(None, models), key=lambda model: explained(model, folder / "database.db"), default=None)
-    for k in list(best.reg_image_ids()) if best else []:
-        if best.images[k].num_points3D < FEWEST_POINTS:
-            best.deregister_frame(best.images[k].frame_id)
+    best, most = None, 0
+    for model in filter(None, models):
+        pairs = agreements(model, folder / "database.db")
+        leave_out(model, loose(model.reg_image_ids(), pairs))
+        held = set(model.reg_image_ids())
+        explained = sum(pair.explained for pair in pairs if {pair.one, pair.other} <= held)
+        if explained > most:
+            best, most = model, explained
+    if best:
+        leave_out(best, [k for k in best.reg_image_ids() if best.images[k].num_points3D < FEWEST_POINTS])
     return best
+
+
+def leave_out(model: Any, images: Iterable[int]) -> None:
+    """Take the cameras of these images from a model."""
+    for k in list(images):
+        model.deregister_frame(model.images[k].frame_id)
 
 
 def map_globally(folder: Path, progress: Progress) -> Any:
@@ -128,16 +148,39 @@ def map_incrementally(folder: Path, count: int, progress: Progress) -> Any:
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
-def explained(model: Any, database: Path) -> int:
-    """How many matches of two photographs are where the cameras of a model say that they are."""
-    placed = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
-    count = 0
+class Agreement(NamedTuple):
+    """How many matches of two images there are, and how many are where the cameras of a model say that they are."""
+
+    one: int
+    other: int
+    matches: int
+    explained: int
+
+
+def agreements(model: Any, database: Path) -> list[Agreement]:
+    """Of every two images of a model that match."""
+    placed = {model.images[k].name: k for k in model.reg_image_ids()}
+    found = []
     for one, other, first, second in matches_of(database):
         if one.name in placed and other.name in placed and len(first):
             a, b = placed[one.name], placed[other.name]
-            off = epipolar(model, a, b, first, second)
-            count += int((off < EPIPOLAR * model.cameras[a.camera_id].width).sum())
-    return count
+            off = epipolar(model, model.images[a], model.images[b], first, second)
+            near = off < EPIPOLAR * model.cameras[model.images[a].camera_id].width
+            found.append(Agreement(a, b, len(first), int(near.sum())))
+    return found
+
+
+def loose(images: Sequence[int], pairs: Sequence[Agreement]) -> list[int]:
+    """Which images do not hang together with most of the others, by pairs that explain most of their matches.
+
+    Parts that few matches join, of which many do not fit, stand anywhere, though each fits in itself.
+    """
+    place = {k: number for number, k in enumerate(images)}
+    firm = [p for p in pairs if p.matches >= FEWEST_MATCHES and p.explained > FIRM * p.matches]
+    ends = [place[p.one] for p in firm], [place[p.other] for p in firm]
+    joined = coo_array((np.ones(len(firm)), ends), (len(images), len(images)))
+    part = connected_components(joined, directed=False)[1]
+    return [k for k in images if part[place[k]] != np.bincount(part).argmax()]
 
 
 def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -216,8 +259,8 @@ def reason_of(picture: Picture, folder: Path) -> str:
     return "nothing in it fits the others: it shows something else, or there are too few photographs in between"
 
 
-def why_not(pictures: Sequence[Picture], folder: Path) -> str:
-    """Why photographs could not be put together, and what to do."""
+def why_not(pictures: Sequence[Picture], folder: Path, found: int) -> str:
+    """Why no more photographs than `found` could be put together, and what to do."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
@@ -230,6 +273,9 @@ def why_not(pictures: Sequence[Picture], folder: Path) -> str:
     if largest < SMALL:
         return (f"they have {largest} pixels along at most, which is too few for features; give them as the camera "
                 f"wrote them, {SMALL} or more")  # fmt: skip
+    if found >= count / 4:
+        return ("the others hang on matches of which many do not fit; take more photographs, also between these and "
+                "the others, 10 degrees at a time")  # fmt: skip
     if matched >= 2 * count:
         return "they fit each other but show everything from one place; walk around the object, 10 degrees at a time"
     return "they show different things, or too little of the same; photograph one object, 10 degrees at a time"
