@@ -359,15 +359,15 @@ def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_
         taken = motion.put_together(tmp_path, 3, None)
         assert taken.name == best and taken.reg_image_ids() == kept
     # What hangs on matches that do not fit is left out, and what it explains within itself does not count.
-    together, after = model("together", [90] * 5), model("after", [90] * 5)
+    together, after = model("together", [90] * 7), model("after", [90] * 7)
     monkeypatch.setattr(motion, "map_globally", lambda *_: together)
     monkeypatch.setattr(motion, "map_incrementally", lambda *_: after)
-    whole = [motion.Agreement(k, k + 1, 100, 80) for k in range(4)]
-    torn = [motion.Agreement(0, 1, 300, 290), motion.Agreement(1, 2, 100, 60), motion.Agreement(2, 3, 40, 39),
-            motion.Agreement(3, 4, 500, 499), motion.Agreement(0, 4, 14, 14)]  # fmt: skip
-    assert motion.loose([7, 0, 1, 2, 3, 4], torn) == [7, 0, 1]
-    monkeypatch.setattr(motion, "agreements", lambda model, _: whole if model is together else torn[:2])
-    assert motion.put_together(tmp_path, 5, None) is together and after.reg_image_ids() == [0, 1]
+    whole = [motion.Agreement(k, k + 1, 100, 80) for k in range(6)]
+    torn = [*(motion.Agreement(k, k + 1, 100, 90) for k in range(3)), motion.Agreement(3, 4, 100, 60),
+            *(motion.Agreement(k, k + 1, 900, 890) for k in (4, 5)), motion.Agreement(0, 6, 14, 14)]  # fmt: skip
+    assert motion.loose([9, 8, 0, 1, 2, 3, 4, 5, 6], torn) == [4, 5, 6]  # of single ones nothing can be said
+    monkeypatch.setattr(motion, "agreements", lambda model, _: whole if model is together else torn)
+    assert motion.put_together(tmp_path, 7, None) is together and after.reg_image_ids() == [0, 1, 2, 3]
     monkeypatch.setattr(motion, "map_globally", lambda *_: None)
     monkeypatch.setattr(motion, "map_incrementally", lambda *_: None)
     assert motion.put_together(tmp_path, 3, None) is None

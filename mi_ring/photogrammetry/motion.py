@@ -23,6 +23,7 @@ SMALL = 1000  #: pixels along photographs, below which they may have too few fea
 TEXTURED = 300  #: features of a photograph, from which they are worth something
 EPIPOLAR = 2.5e-3  #: of a picture's width, by which a match may be off from what two cameras say
 FEWEST_MATCHES, FIRM = 15, 0.7  #: of two photographs, and the share that cameras explain, that hold each other
+PART = 3  #: photographs at least
 NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
@@ -171,16 +172,18 @@ def agreements(model: Any, database: Path) -> list[Agreement]:
 
 
 def loose(images: Sequence[int], pairs: Sequence[Agreement]) -> list[int]:
-    """Which images do not hang together with most of the others, by pairs that explain most of their matches.
+    """Which images are of parts that do not hang together with the largest by pairs that explain most of their matches.
 
-    Parts that few matches join, of which many do not fit, stand anywhere, though each fits in itself.
+    Where many of the matches do not fit that join two parts, these stand anywhere to each other, though each fits in
+    itself. One or two images alone are no part: votes bear with them.
     """
     place = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= FEWEST_MATCHES and p.explained > FIRM * p.matches]
     ends = [place[p.one] for p in firm], [place[p.other] for p in firm]
     joined = coo_array((np.ones(len(firm)), ends), (len(images), len(images)))
     part = connected_components(joined, directed=False)[1]
-    return [k for k in images if part[place[k]] != np.bincount(part).argmax()]
+    sizes = np.bincount(part)
+    return [k for k in images if part[place[k]] != sizes.argmax() and sizes[part[place[k]]] >= PART]
 
 
 def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
