@@ -130,8 +130,8 @@ def fit_findings(
         shift, scatter = middle([by for _, by in shifts])
         scatter = np.hypot(*scatter)
         if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(shifts))):
-            found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx, cy, "
-                         "to_world) or masks seem off by as much or more. If the cameras were measured, see that the "
+            found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx and cy "
+                         "or to_world) or masks seem off by as much or more. If cameras were measured, see that the "
                          "first pixel's centre is (0.5, 0.5); else fit with --refine auto cameras.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED, 3 * scatter)
