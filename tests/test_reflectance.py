@@ -59,7 +59,8 @@ def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
     predicted, _ = bridge.draw(surface, loaded.photograph(2), spp=256)
     stock = mi.render(loaded.scene, sensor=2, integrator=mi.load_dict({"type": "direct"}), spp=256)
     assert predicted.mean() > 0.01
-    assert predicted.mean().item() == pytest.approx(float(np.array(stock)[..., :3].mean()), rel=0.01)
+    stock = np.maximum(np.array(stock)[..., :3], 0)  # a room that was found may be below 0 in places
+    assert predicted.mean().item() == pytest.approx(float(stock.mean()), rel=0.01)
 
 
 def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture, tmp_path):
