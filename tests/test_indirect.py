@@ -158,7 +158,8 @@ def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cu
     scene, photographs = diffuse_cup
     photographs = photographs.select([1, 0], (WIDTH, HEIGHT))
     coverage = torch.from_numpy(pictures(render_photographs(scene, photographs, 16, 0))[..., 3]).requires_grad_()
-    added = bridge.surroundings(SimpleNamespace(scene=scene, table=None), photographs, coverage, 5, width, 1024).interreflection
+    surface = SimpleNamespace(scene=scene, table=None)
+    added = bridge.surroundings(surface, photographs, coverage, 5, width, 1024).interreflection
     assert added.shape == (2, HEIGHT, WIDTH, 3)
     for k, expected in zip((0, 1), series(indirect.BOUNCES)[::-1]):
         even = expected * coverage[k, ..., None].detach().numpy()
