@@ -17,7 +17,6 @@ from mi_ring.photogrammetry.views import camera_of
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light
 
-SIZE = (49, 35)  # [px]
 TURNED = mi.ScalarTransform4f().translate([0.3, -0.2, -1.1]).rotate([1, 0.4, 0], 12).scale([6, 4, 1])
 ROOM = '<emitter type="room"><string name="harmonics" value="0.4 0.3 0.2 {}"/></emitter>'.format("0 " * 24)
 #: An ellipsoid that is lit from aside, above a table, red to the left, seen from below its middle.

@@ -38,7 +38,7 @@ def photograph_element(
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
     if calibrated:
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
-    add_pose(element, camera)
+    add_pose(element, camera.to_world)
     add_film(element, *camera.size)
     if light:
         element.append(emitter_element(light))
@@ -64,8 +64,7 @@ def scene_element(photographs: Iterable[Element], ground: np.ndarray | None = No
 def table_element(picture: str, square: np.ndarray) -> Element:
     """A diffuse `table` with the picture of its albedo; `square` (4, 4): its to_world."""
     element = ElementTree.Element("shape", type="table")
-    transform = ElementTree.SubElement(element, "transform", name="to_world")
-    ElementTree.SubElement(transform, "matrix", value=numbers(square))
+    add_pose(element, square)
     bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
     texture = ElementTree.SubElement(bsdf, "texture", name="reflectance", type="bitmap")
     ElementTree.SubElement(texture, "string", name="filename", value=picture)
@@ -107,15 +106,15 @@ def perspective_element(camera: Camera, points: np.ndarray) -> Element:
     }.items():  # fmt: skip
         ElementTree.SubElement(sensor, "float", name=name, value=numbers(value))
     ElementTree.SubElement(sensor, "string", name="fov_axis", value="x")
-    add_pose(sensor, camera)
+    add_pose(sensor, camera.to_world)
     add_film(sensor, width, height)
     return sensor
 
 
-def add_pose(sensor: Element, camera: Camera) -> None:
-    """Give a sensor its `to_world`."""
-    transform = ElementTree.SubElement(sensor, "transform", name="to_world")
-    ElementTree.SubElement(transform, "matrix", value=numbers(camera.to_world))
+def add_pose(element: Element, to_world: np.ndarray) -> None:
+    """Give a sensor or a shape its `to_world` (4, 4)."""
+    transform = ElementTree.SubElement(element, "transform", name="to_world")
+    ElementTree.SubElement(transform, "matrix", value=numbers(to_world))
 
 
 def add_film(sensor: Element, width: int, height: int) -> None:
