@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Union
 
 import tyro
-from tqdm import tqdm
 
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
@@ -13,6 +12,7 @@ from mi_ring.importers.formats import FORMATS
 from mi_ring.importers.frames import require_frames
 from mi_ring.importers.writer import Writer, place_frame
 from mi_ring.system import command
+from mi_ring.system.progress import progress
 
 DESCRIPTION = """Write a scene file for photographs in the format of another tool.
 
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str]) -> None:
     try:
         writer = Writer(source.scene)
         try:
-            for frame, name in zip(tqdm(frames, unit="photograph", disable=None, leave=False), names):
+            for frame, name in zip(progress(frames, unit="photograph"), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
                 files = place_frame(writer, frame, name, source.copy, encoding)
                 root.append(photograph_element(name, files.filename, frame.camera, frame.light, files.mask, encoding,

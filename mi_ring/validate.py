@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
@@ -16,6 +15,7 @@ from mi_ring.output.validation_sheet import strip, validation_sheet
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.system import command
 from mi_ring.system.files import write_file, writing
+from mi_ring.system.progress import progress
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str]) -> int:
     photographs, spp = Photographs.of(sensors), -(-config.spp // BATCHES)
     names = [sensor.filename.name for sensor in sensors]
     rows, strips = [], []
-    for k in tqdm(chosen, desc="comparing", unit="photograph"):
+    for k in progress(chosen, "comparing", unit="photograph", leave=True):
         size = sensors[k].size
         scale = -(-max(size) // config.width)
         if min(size) < scale:

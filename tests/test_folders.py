@@ -1,6 +1,7 @@
 """Folders of photographs that structure from motion puts together; some are ended on the way, some cannot be used."""
 
 import functools
+import io
 import json
 import os
 import signal
@@ -216,6 +217,17 @@ def test_a_bar_is_shown_in_a_terminal_of_no_columns(monkeypatch):
         print("end", file=terminal, flush=True)
         assert b"counting" in os.read(ours, 1000)
     os.close(ours)
+
+
+def test_a_bar_is_lines_of_a_log(monkeypatch):
+    log = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", log)
+    list(progress(range(3), "counting"))
+    assert not log.getvalue()  # it took less than QUIET
+    monkeypatch.setattr("mi_ring.system.progress.QUIET", 0.0)
+    list(progress(range(3), "counting"))
+    lines = log.getvalue().splitlines()
+    assert len(lines) >= 3 and all(line.startswith("counting") for line in lines) and "\r" not in log.getvalue()
 
 
 def save_turned(pixels, path, orientation):

@@ -8,7 +8,6 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 from scipy.interpolate import CubicSpline
-from tqdm import tqdm
 
 from mi_ring.capture.scenefile import (
     Element,
@@ -23,6 +22,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.system.progress import progress
 
 CENTER, HEIGHT = np.array([40.0, -15.0, 110.0]), 80.0  #: of the pot [mm]; y is up
 VIEWS, SIZE, FOCAL = 28, 192, 400.0  #: photographs, their pixels and focal length [px]
@@ -102,7 +102,7 @@ def write_example(folder: Path, spp: int = SPP) -> None:
         (folder / name).mkdir()
     mesh.write_ply(str(folder / "truth" / "mesh.ply"))
     elements: list[Element] = []
-    for k, camera in enumerate(tqdm(cameras(), desc="photographing", unit="photograph")):
+    for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
         position = camera.position + camera.to_world[:3, :3] @ FLASH
         light = Light("point", position, np.full(3, np.pi * BRIGHTNESS * DISTANCE**2))
         picture = photographed(mesh, vertices, camera, light, spp, k)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import is_linear, read_mask, read_photograph
@@ -17,6 +16,7 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.rooms import room_of
 from mi_ring.rendering.visibility import View
 from mi_ring.system import llvm
+from mi_ring.system.progress import progress
 
 
 def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
@@ -46,7 +46,7 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     shadows = getattr(scene.integrator(), "shadows", True)
     if not images:
         return Capture(path, scene, shapes[0], sensors, photographs, shadows)
-    reading = tqdm(sensors, desc="reading", unit="photograph", leave=False, disable=None)
+    reading = progress(sensors, "reading", unit="photograph")
     pixels = [read_photograph(s, path) for s in reading]
     linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
     given = read_once([(s, s.mask) for s in sensors], "mask", path) if masks != "none" else [None] * len(sensors)

@@ -11,6 +11,7 @@ from tqdm import tqdm
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
 from mi_ring.output import results
+from mi_ring.system.progress import progress
 
 CHECKPOINT_SECONDS = 30.0
 FIXED_WORK = 3000  #: what an iteration costs besides its vertices, in vertices: for the time left
@@ -38,8 +39,8 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
     vertices = {stage.level: len(fit.ring.domain.sample(stage.level)[0]) for stage in fit.stages}
     work = [vertices[s.level] + FIXED_WORK for s in fit.stages for _ in range(s.first, s.last)]
     saved, files = time.monotonic(), digests(fit.capture, fit.config)
-    bar = tqdm(
-        total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1,
+    bar = progress(
+        None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
     results.write_log(folder, fit.log)

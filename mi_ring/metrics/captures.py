@@ -54,6 +54,11 @@ HEADS = (
 )
 
 
+LEGEND = """distance, light: from the object to camera and light, in its radii; angle: between them [degrees]; object:
+share of the photograph; clipped, dark: shares of the object; background: brightness, by that of the object;
+brightness: for the light that the object gets, by the usual one; agreement: share of the mask that others agree to"""
+
+
 def measure(
     capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
 ) -> list[PhotographQuality]:
@@ -174,7 +179,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
 
 
 def quality_table(rows: list[PhotographQuality]) -> str:
-    """The rows as text."""
+    """The rows as text, and what the columns are."""
     typical = np.median([row.brightness for row in rows])
 
     def cells(row: PhotographQuality) -> Iterator[str]:
@@ -189,7 +194,8 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
     lines = [HEADS, *map(tuple, map(cells, rows))]
     widths = [max(map(len, column)) for column in zip(*lines)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
+    table = ["  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines]
+    return "\n".join([*table, LEGEND])
 
 
 def drop_empty(capture: Capture) -> list[str]:

@@ -8,11 +8,11 @@ import numpy as np
 import scipy.ndimage
 import torch
 import trimesh
-from tqdm import tqdm
 
 from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.ring.ring import Ring
 from mi_ring.system.optional import need
+from mi_ring.system.progress import progress
 
 CUT = 5  #: level at which surfaces are cut open, at most: the time grows with the square of the triangles
 PADDING = 4  #: between charts [texels]
@@ -146,5 +146,5 @@ def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
     """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
-        parts = [ring.brdf_net(chunk) for chunk in tqdm(chunks, "baking", leave=False, disable=len(chunks) < 3 or None)]
+        parts = [ring.brdf_net(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3)]
     return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.capture import Capture
@@ -25,6 +24,7 @@ from mi_ring.rendering.scenes import assembled, is_table, own_emitters
 from mi_ring.rendering.shading import is_flash, is_room
 from mi_ring.ring.material import MaterialOptions
 from mi_ring.ring.ring import Ring
+from mi_ring.system.progress import progress
 
 SLANT = 45.0  #: between the light and the camera in a light orbit, seen from the object [deg]
 
@@ -189,7 +189,7 @@ def render_views(
     """The pictures, (H, W, 3) linear radiance each; `room`: its light, as `Photographs` have it."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
-    for k, view in enumerate(tqdm(views, desc="rendering", unit="picture")):
+    for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
         if view.time != shown:
             surface.show(ring, s, faces, view.time)
             shown = view.time
