@@ -12,7 +12,8 @@ Writes, in the world of the sheet (mm, origin in its middle, x right, y up the p
     OUT/truth/transforms.json    cameras, lens, flash (pl_pos [mm], pl_intensity with exposure and white balance) and
                                  masks, for `mi_ring.convert transforms`: the photographs with exact calibration
     OUT/truth/settings.json      the settings, which photographs failed, exposure and white balance of each
-    OUT/exact/scene.xml          the same views without any disturbance (but the principal point), exactly calibrated
+    OUT/exact/scene.xml          the same views without any disturbance (but the principal point), exactly calibrated,
+                                 cropped as by `mi_ring.photos`
 
 Disturbances, each a switch: sheet (and table, which reflect light onto the object), ambient (light of the room),
 offset (the flash is beside the lens), cone (and does not shine alike in all directions), lens (distortion), principal
@@ -43,6 +44,7 @@ from tqdm import tqdm
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.photogrammetry.scene import windows
 from mi_ring.rendering.lights import Light
 
 DISTURBANCES = (
@@ -189,6 +191,22 @@ def write_mask(path: Path, coverage: np.ndarray) -> None:
     Image.fromarray(np.where(coverage >= 0.5, 255, 0).astype(np.uint8)).save(path)
 
 
+def write_exact(folder: Path, cameras: dict[str, Camera]) -> None:
+    """The scene of the exact photographs, by name, which are cropped to the object as `mi_ring.photos` does."""
+    files = {name: [folder / kind / f"{name}.png" for kind in ("images", "masks")] for name in cameras}
+    masks = [np.array(Image.open(mask)) for _, mask in files.values()]
+    elements = []
+    for (name, camera), window in zip(cameras.items(), windows(masks, [camera.size for camera in cameras.values()])):
+        left, top, width, height = window[:4]
+        for file in files[name]:
+            Image.open(file).crop((left, top, left + width, top + height)).save(file)
+        cut = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
+        light = Light("point", camera.position, np.full(3, intensity()))
+        elements.append(photograph_element(name, f"images/{name}.png", cut, light, f"masks/{name}.png",
+                                           calibrated=True))  # fmt: skip
+    (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+
+
 def make_capture(out: Path, settings: Settings) -> None:
     """Write a capture into a folder, whose former content is deleted."""
     photos, truth, exact = out / "photos", out / "truth", out / "exact"
@@ -201,7 +219,7 @@ def make_capture(out: Path, settings: Settings) -> None:
     alone = stage if stage.bare else Stage(settings.object, "bare", False, settings.seed)
     write_ply(stage.mesh, truth / "mesh.ply")
     suffix = ".jpg" if settings.has("jpeg") else ".png"
-    elements, frames, taken = [], [], {}
+    frames, taken, cameras = [], {}, {}
     for k, (to_world, angle) in enumerate(tqdm(list(poses(settings, stage.mesh.extents[2])), disable=None)):
         name, shot = f"{k:03}", shot_of(settings, k, to_world)
         if angle:
@@ -225,12 +243,10 @@ def make_capture(out: Path, settings: Settings) -> None:
         linear = alone.radiance(pinhole, max(settings.spp, 9), settings.seed * 10_000 + 2 * k + 1)
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
-        light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
-                                           calibrated=True))  # fmt: skip
+        cameras[name] = camera
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
-        (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+        write_exact(exact, cameras)
     (fx, fy), (cx, cy), (k1, k2) = shot.camera.focal, shot.camera.centre, shot.distortion
     lens = {"camera_model": "OPENCV", "w": settings.size[0], "h": settings.size[1], "fl_x": fx, "fl_y": fy, "cx": cx,
             "cy": cy, "k1": k1, "k2": k2}  # fmt: skip

@@ -193,7 +193,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if config.turntable:  # the object sees the room turn
         root.append(room_element("camera", np.zeros((COUNT, 3))))
     try:
-        written = in_threads(partial(write_shot, writer), taken, windows(taken))
+        cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
+        written = in_threads(partial(write_shot, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and any(shot.measured for shot in taken):
             root.extend(write_table(writer, taken, plane, found.center))

@@ -20,7 +20,7 @@ from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.matching import pairs_to_match
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, find_body
-from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, windows, write_shot
+from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
 from mi_ring.rendering.lights import Light
 
@@ -296,7 +296,7 @@ def test_a_window_about_the_object_and_back(seed):
     rows, columns = np.nonzero(cut)
     np.testing.assert_allclose([columns.mean() + 100.5, rows.mean() + 40.5], center, atol=0.4)
     assert cut.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
-    extent = Shot(None, lens, np.eye(4), back, None).extent()
+    extent = extent_of(back, lens.size)
     np.testing.assert_allclose(extent, [center - radius, center + radius], atol=scale)
 
 
@@ -443,7 +443,7 @@ def test_crops_are_of_one_size_hold_the_object_and_see_the_same(tmp_path):
         mask.ravel()[np.isfinite(t)] = OBJECT
         mask[:6, :8] = UNSURE
         shots.append(shot(tmp_path, str(k), lens, pose, mask))
-    cut = windows(shots)
+    cut = windows([one.mask for one in shots], [one.lens.size for one in shots])
     assert len({(w.width, w.height) for w in cut}) == 1
     assert cut[0].width * cut[0].height < 0.6 * 160 * 120
     writer = Writer(tmp_path / "capture/scene.xml")

@@ -37,24 +37,19 @@ class Shot:
     light: Light
     measured: bool = False  #: does the sheet tell how strong the light is?
 
-    def extent(self) -> np.ndarray | None:
-        """Of the object [px]: (2, 2), lowest and highest column and row."""
-        if self.mask is None or not (self.mask == OBJECT).any():
-            return None
-        rows, columns = np.nonzero(self.mask == OBJECT)
-        corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
-        return corners * reduction(self.mask, self.lens.size)
 
+def windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
+    """What to cut out of each photograph of such a size (width, height) with such a mask.
 
-def windows(shots: Sequence[Shot]) -> list[Window]:
-    """What to cut out of each, equally large for all photographs of a size, for one launch renders such ones."""
-    extents = [shot.extent() for shot in shots]
+    Equally much of all of a size, for one launch renders those.
+    """
+    extents = [None if mask is None else extent_of(mask, size) for mask, size in zip(masks, sizes)]
     result = []
-    for shot, extent in zip(shots, extents):
-        alike = [e for s, e in zip(shots, extents) if s.lens.size == shot.lens.size and e is not None]
-        size = np.array(shot.lens.size)
+    for own, extent in zip(sizes, extents):
+        alike = [e for size, e in zip(sizes, extents) if size == own and e is not None]
+        size = np.array(own)
         if not alike:
-            result.append(Window(0, 0, *shot.lens.size))
+            result.append(Window(0, 0, *own))
             continue
         wanted = np.max([e[1] - e[0] for e in alike], 0)
         wanted = np.minimum(np.ceil(wanted + 2 * MARGIN * wanted.max()), size).astype(int)
@@ -115,6 +110,15 @@ def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.
         return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))
     return [table_element(writer.relative(picture), ground.square)]
+
+
+def extent_of(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
+    """Of the object in a photograph of this size [px]: (2, 2), lowest and highest column and row."""
+    rows, columns = np.nonzero(mask == OBJECT)
+    if not len(rows):
+        return None
+    corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+    return corners * reduction(mask, size)
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
