@@ -18,7 +18,7 @@ from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import masks, motion, table, trial
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.matching import pairs_to_match
-from mi_ring.photogrammetry.motion import Motion
+from mi_ring.photogrammetry.motion import Motion, with_principal_points
 from mi_ring.photogrammetry.object import Hints, find_body
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
@@ -485,3 +485,27 @@ def test_a_reduced_photograph_has_a_camera_that_sees_the_same(tmp_path):
         y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
         found = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
         np.testing.assert_allclose(found, small.camera.focal * local[:2] + small.camera.centre, atol=0.1)
+
+
+@pytest.mark.parametrize(("focal", "told"), [(800.0, True), (8000.0, False)])
+def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
+    pycolmap = pytest.importorskip("pycolmap")
+    random, count, away = np.random.default_rng(0), 14, focal / 125
+    lenses = [pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=700, params=[focal, cx, cy, 0.02], camera_id=1)
+              for cx, cy in ((500, 350), (507, 346))]  # fmt: skip
+    model, points = pycolmap.Reconstruction(), random.normal(0, 1, (300, 3))
+    model.add_camera_with_trivial_rig(lenses[0])
+    for k in range(count):
+        turn = [random.normal(0, 20), 360 * k / count, random.uniform(-35, 35)]
+        pose = np.c_[Rotation.from_euler("zyx", turn, degrees=True).as_matrix(), [0, 0, away]]
+        seen = lenses[1].img_from_cam(points @ pose[:, :3].T + pose[:, 3]) + random.normal(0, 0.3, (300, 2))
+        features = pycolmap.Point2DList([pycolmap.Point2D(place) for place in seen])
+        image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k + 1, points2D=features)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    for n, point in enumerate(points):
+        track = pycolmap.Track()
+        for k in range(count):
+            track.add_element(k + 1, n)
+        model.add_point3D(point, track)
+    (lens,) = with_principal_points(model).cameras.values()
+    np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.0 if told else 0.0)

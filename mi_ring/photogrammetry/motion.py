@@ -26,6 +26,7 @@ FEWEST_MATCHES, FIRM = 15, 0.7  #: of two photographs, and the share that camera
 PART = 3  #: photographs at least
 NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
+TOLD = 1e-3  #: of a picture's longer side, standard deviation to which a principal point must be known to be taken
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
@@ -79,6 +80,7 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
                          f"together{which}: {why_not(pictures, folder, found)}")  # fmt: skip
     for _ in progress(adjustments(model), "bundle adjustment"):
         pass
+    model = with_principal_points(model)
     growing = folder / "sparse.partial"
     growing.mkdir(exist_ok=True)
     model.write(growing)
@@ -204,13 +206,7 @@ def adjustments(model: Any) -> Iterator[None]:
     alone they would bend all cameras.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.max_num_iterations = ITERATIONS
-    options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
-    config = pycolmap.BundleAdjustmentConfig()
-    for k in model.reg_image_ids():
-        config.add_image(k)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options, config = adjustment(model, ITERATIONS)
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         for _ in range(100 // ITERATIONS):
@@ -220,6 +216,44 @@ def adjustments(model: Any) -> Iterator[None]:
                 break
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
             break
+
+
+def adjustment(model: Any, iterations: int) -> tuple[Any, Any]:
+    """Options of a bundle adjustment with a robust loss, and what takes part in it: all of a model."""
+    pycolmap = need("pycolmap", "bundle adjustment")
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
+    config = pycolmap.BundleAdjustmentConfig()
+    for k in model.reg_image_ids():
+        config.add_image(k)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return options, config
+
+
+def with_principal_points(model: Any) -> Any:
+    """The model with principal points, too, adjusted; as it is where the photographs do not tell these.
+
+    A long lens tells them hardly, for a shift of the picture is nearly a turn of the camera.
+    """
+    pycolmap = need("pycolmap", "bundle adjustment")
+    adjusted = pycolmap.Reconstruction(model)
+    options, config = adjustment(adjusted, 3 * ITERATIONS)
+    options.refine_principal_point = True
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, adjusted)
+    if not interruptible(adjuster.solve).is_solution_usable():
+        return model
+    only = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
+    covariance = pycolmap.estimate_ba_covariance(only, adjusted, adjuster)
+    for k in {adjusted.images[k].camera_id for k in adjusted.reg_image_ids()}:
+        camera = adjusted.cameras[k]
+        own = covariance and covariance.get_other_params_cov(camera.params)
+        if own is None:
+            return model
+        variance = np.diag(own)[camera.principal_point_idxs()].max()
+        if variance > (TOLD * max(camera.width, camera.height)) ** 2:
+            return model
+    return adjusted
 
 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
