@@ -26,6 +26,7 @@ stand. Deterministic by seed.
 import argparse
 import json
 import shutil
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -191,20 +192,27 @@ def write_mask(path: Path, coverage: np.ndarray) -> None:
     Image.fromarray(np.where(coverage >= 0.5, 255, 0).astype(np.uint8)).save(path)
 
 
-def write_exact(folder: Path, cameras: dict[str, Camera]) -> None:
-    """The scene of the exact photographs, by name, which are cropped to the object as `mi_ring.photos` does."""
-    files = {name: [folder / kind / f"{name}.png" for kind in ("images", "masks")] for name in cameras}
-    masks = [np.array(Image.open(mask)) for _, mask in files.values()]
-    elements = []
-    for (name, camera), window in zip(cameras.items(), windows(masks, [camera.size for camera in cameras.values()])):
-        left, top, width, height = window[:4]
-        for file in files[name]:
-            Image.open(file).crop((left, top, left + width, top + height)).save(file)
-        cut = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
-        light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", cut, light, f"masks/{name}.png",
-                                           calibrated=True))  # fmt: skip
-    (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+def crop(scene: Path) -> None:
+    """Crop all that the photographs of a scene file have beside it to the object, as `mi_ring.photos` does."""
+    tree = ElementTree.parse(scene)
+    sensors = tree.getroot().findall("sensor")
+
+    def files(sensor: ElementTree.Element) -> dict[str, ElementTree.Element]:
+        return {e.get("name"): e for e in sensor.findall("string") if e.get("name") in ("filename", "mask", "valid")}
+
+    masks = [np.array(Image.open(scene.parent / files(sensor)["mask"].get("value"))) for sensor in sensors]
+    for sensor, window in zip(sensors, windows(masks, [mask.shape[::-1] for mask in masks])):
+        for kind, file in files(sensor).items():
+            path = Path(f"cropped/{kind}/{sensor.get('id')}.png")
+            (scene.parent / path).parent.mkdir(parents=True, exist_ok=True)
+            box = window.left, window.top, window.left + window.width, window.top + window.height
+            Image.open(scene.parent / file.get("value")).crop(box).save(scene.parent / path)
+            file.set("value", str(path))
+        for name, first, side in (("x", window.left, window.width), ("y", window.top, window.height)):
+            centre = sensor.find(f"float[@name='c{name}']")
+            centre.set("value", str(float(centre.get("value")) - first))
+            sensor.find(f"film/integer[@name='{'width' if name == 'x' else 'height'}']").set("value", str(side))
+    tree.write(scene)
 
 
 def make_capture(out: Path, settings: Settings) -> None:
@@ -219,7 +227,7 @@ def make_capture(out: Path, settings: Settings) -> None:
     alone = stage if stage.bare else Stage(settings.object, "bare", False, settings.seed)
     write_ply(stage.mesh, truth / "mesh.ply")
     suffix = ".jpg" if settings.has("jpeg") else ".png"
-    frames, taken, cameras = [], {}, {}
+    elements, frames, taken = [], [], {}
     for k, (to_world, angle) in enumerate(tqdm(list(poses(settings, stage.mesh.extents[2])), disable=None)):
         name, shot = f"{k:03}", shot_of(settings, k, to_world)
         if angle:
@@ -243,10 +251,13 @@ def make_capture(out: Path, settings: Settings) -> None:
         linear = alone.radiance(pinhole, max(settings.spp, 9), settings.seed * 10_000 + 2 * k + 1)
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
-        cameras[name] = camera
+        light = Light("point", camera.position, np.full(3, intensity()))
+        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
+                                           calibrated=True))  # fmt: skip
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
-        write_exact(exact, cameras)
+        (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+        crop(exact / "scene.xml")
     (fx, fy), (cx, cy), (k1, k2) = shot.camera.focal, shot.camera.centre, shot.distortion
     lens = {"camera_model": "OPENCV", "w": settings.size[0], "h": settings.size[1], "fl_x": fx, "fl_y": fy, "cx": cx,
             "cy": cy, "k1": k1, "k2": k2}  # fmt: skip

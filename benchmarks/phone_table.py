@@ -3,11 +3,10 @@
     python benchmarks/phone_table.py OUT [--objects pot2 bunny spot] [--views 24] [--size 1440x1080] [--preset default]
 
 A row for the exact capture, one for each disturbance alone, with exact calibration and masks, and one for all of them
-at three strengths of the room's light, for which `mi_ring.photos` finds calibration and masks. In each: mean error of
-the normals and of the depth where both surfaces are seen, after a similarity, how often that of the exact capture the
-former is, and where `photos` found the scale by the sheet, how much larger the object is than it should be. For a
-disturbance alone photographs have half the width, and the row of none at that width is the exact one. By `fast` errors
-of masks are hidden by those of the preset. It goes on where it stopped.
+at three strengths of the room's light, for which `mi_ring.photos` finds calibration and masks; all of them cropped to
+the object. In each: mean error of the normals and of the depth where both surfaces are seen, after a similarity, how
+often that of the exact capture the former is, and how much larger the object is than it should be. By `fast` errors of
+masks are hidden by those of the preset. It goes on where it stopped.
 """
 
 import argparse
@@ -18,21 +17,21 @@ import sys
 from pathlib import Path
 
 from accuracy import processor, product_speed, table
-from phone import DISTURBANCES
+from phone import DISTURBANCES, crop
 
 HERE = Path(__file__).parent
 USUAL, AMBIENT = 0.03, (0.03, 0.0, 0.1)  #: light of the room, by the flash's
 ALONE = [d for d in DISTURBANCES if d != "failures"]  # what fails does not belong to a calibrated capture
 
 
-def run(*arguments: object, log: Path, allowed: tuple[int, ...] = (0,)) -> str:
+def run(*arguments: object, log: Path) -> str:
     """Standard output of a Python command; what else it says goes into a log.
 
-    Raises RuntimeError with the last line of the log for another exit status than those allowed.
+    Raises RuntimeError with the last line of the log if it fails.
     """
     with log.open("a") as file:
         done = subprocess.run([sys.executable, *map(str, arguments)], stdout=subprocess.PIPE, stderr=file, text=True)
-    if done.returncode not in allowed:
+    if done.returncode:
         raise RuntimeError(log.read_text().rstrip().splitlines()[-1])
     return done.stdout
 
@@ -61,14 +60,15 @@ def measure(folder: Path, made: list[object], found: bool, preset: str) -> dict[
             numbers["exact"] = evaluated(folder / "exact/scene.xml", preset, log)
         try:
             if not (folder / "found/scene.xml").exists():
-                run("-m", "mi_ring.photos", folder / "photos", folder / "found", log=log, allowed=(0, 1))
+                run("-m", "mi_ring.photos", folder / "photos", folder / "found", log=log)
             numbers["this"] = evaluated(folder / "found/scene.xml", preset, log)
         except RuntimeError as error:
             numbers["this"] = {"failed": str(error)}
     else:
         known = folder / "known/scene.xml"
         if not known.exists():
-            run("-m", "mi_ring.convert", "transforms", folder / "truth/transforms.json", known, log=log, allowed=(0, 1))
+            run("-m", "mi_ring.convert", "transforms", folder / "truth/transforms.json", known, log=log)
+            crop(known)
         numbers["this"] = evaluated(known, preset, log)
     result.write_text(json.dumps(numbers))
     return numbers
@@ -92,21 +92,19 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     options = parser.parse_args()
     rows = {f"all, room {ambient:.0%}": ("all", ambient, True) for ambient in AMBIENT}
-    rows |= {f"{name} alone": (name, USUAL, False) for name in ("none", *ALONE)}
+    rows |= {f"{name} alone": (name, USUAL, False) for name in ALONE}
     results = {}
     for row, (disturbances, ambient, found) in rows.items():
         for name in options.objects:
-            width, height = (int(side) // (1 if found else 2) for side in options.size.split("x"))
             made = ["--object", name, "--disturbances", disturbances, "--ambient", ambient, "--views", options.views,
-                    "--size", f"{width}x{height}"]  # fmt: skip
+                    "--size", options.size]  # fmt: skip
             folder = options.out / name / row.replace(", ", "_").replace(" ", "_").rstrip("%")
             results[row, name] = measure(folder, made, found, options.preset)
             print(f"{name}, {row}: {results[row, name]}", file=sys.stderr, flush=True)
     exact = {name: results["all, room 3%", name]["exact"] for name in options.objects}
     lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]]
-    for row, (_, _, found) in rows.items():
-        by = {name: exact[name] if found else results["none alone", name]["this"] for name in options.objects}
-        lines.append([row, *(cell(results[row, name]["this"], by[name]) for name in options.objects)])
+    for row in rows:
+        lines.append([row, *(cell(results[row, name]["this"], exact[name]) for name in options.objects)])
     import torch
 
     speed = product_speed(4096, 4096, torch.float32) / 1e9
