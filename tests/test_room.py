@@ -183,6 +183,23 @@ def test_without_anything_seen_the_room_is_as_given():
     torch.testing.assert_close(room.harmonics, given)
 
 
+def test_a_room_takes_no_light_away():
+    """Photographs that are too dark in red, too bright in green, by what one room would show in both."""
+    random = torch.Generator().manual_seed(0)
+    harmonics = torch.rand(BASIS, 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
+    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), harmonics, torch.ones(1, 5, 7), torch.ones(1, 10, 14), 2)
+    truth = torch.from_numpy(some_room()).float()[:, :1].repeat(1, 3)
+    assert float(truth[0, 0]) > 0
+    truth[:, 0] *= -1
+    truth[COUNT:] = 0
+    shown = torch.einsum("jnhwc,jc->nhwc", harmonics, truth).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    room = Room(torch.zeros(BASIS, 3), 0.3)
+    room.see(around, torch.ones(1, 10, 14, 3), 1 + shown, torch.ones(1, 10, 14) > 0)
+    assert not room.harmonics[:, 0].any()
+    found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[:, 1]) for part in (room.harmonics, truth))
+    assert float((found - missing).abs().mean()) < 0.2 * float(missing.abs().mean())
+
+
 @pytest.mark.parametrize(("field", "value"), [("frame", "lamp"), ("harmonics", "0.1 0.1"), ("harmonics", "a " * 27)])
 def test_wrong_fields_are_named(field, value):
     good = {"type": "room", "harmonics": " ".join(["0.1"] * 27)}
