@@ -181,7 +181,7 @@ def test_photographs_from_one_place_are_told_after_the_first_pairs(tmp_path, spe
         return (batches.append(what) or thing for thing in things)
 
     with pytest.raises(InputError, match=r"100% of the first 60 pairs are from one place; walk around"):
-        structure_from_motion(find_pictures(tmp_path), tmp_path / "work", counting)
+        structure_from_motion(find_pictures(tmp_path), {}, tmp_path / "work", counting)
     assert batches.count("matching") == 1
     database = tmp_path / "work/database.db"  # where an interrupted one goes on there are more pairs than are asked for
     assert alike(database, [("01.png", "00.png"), ("02.png", "03.png")]) == 1

@@ -1,6 +1,7 @@
 """From photographs to a capture, piece by piece: pictures, masks, the table, crops."""
 
 import itertools
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -16,9 +17,10 @@ from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import masks, motion, table, trial
+from mi_ring.photogrammetry.board import Sighting
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.matching import pairs_to_match
-from mi_ring.photogrammetry.motion import Motion, with_principal_points
+from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, find_body
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
@@ -487,18 +489,18 @@ def test_a_reduced_photograph_has_a_camera_that_sees_the_same(tmp_path):
         np.testing.assert_allclose(found, small.camera.focal * local[:2] + small.camera.centre, atol=0.1)
 
 
-@pytest.mark.parametrize(("focal", "told"), [(800.0, True), (8000.0, False)])
-def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
+def model_of(points, noise, focal=800.0, shift=(0, 0), count=14):
+    """A `pycolmap.Reconstruction` of photographs 0.png …, whose principal point was `shift` off, and their lens."""
     pycolmap = pytest.importorskip("pycolmap")
-    random, count, away = np.random.default_rng(0), 14, focal / 125
+    random, away = np.random.default_rng(0), focal / 125
     lenses = [pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=700, params=[focal, cx, cy, 0.02], camera_id=1)
-              for cx, cy in ((500, 350), (507, 346))]  # fmt: skip
-    model, points = pycolmap.Reconstruction(), random.normal(0, 1, (300, 3))
+              for cx, cy in ((500, 350), np.array([500, 350]) + shift)]  # fmt: skip
+    model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(lenses[0])
     for k in range(count):
         turn = [random.normal(0, 20), 360 * k / count, random.uniform(-35, 35)]
         pose = np.c_[Rotation.from_euler("zyx", turn, degrees=True).as_matrix(), [0, 0, away]]
-        seen = lenses[1].img_from_cam(points @ pose[:, :3].T + pose[:, 3]) + random.normal(0, 0.3, (300, 2))
+        seen = seen_by(lenses[1], pose, points) + random.normal(0, noise, (len(points), 2))
         features = pycolmap.Point2DList([pycolmap.Point2D(place) for place in seen])
         image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k + 1, points2D=features)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
@@ -507,5 +509,38 @@ def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
         for k in range(count):
             track.add_element(k + 1, n)
         model.add_point3D(point, track)
-    (lens,) = with_principal_points(model).cameras.values()
-    np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.0 if told else 0.0)
+    return model, lenses[1]
+
+
+def seen_by(lens, pose, points):
+    """Pixels (n, 2) of points (n, 3) for a camera-from-world pose (3, 4)."""
+    return lens.img_from_cam(points @ pose[:, :3].T + pose[:, 3])
+
+
+@pytest.mark.parametrize(("focal", "told"), [(500.0, True), (8000.0, False)])
+def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
+    model, _ = model_of(np.random.default_rng(1).normal(0, 1, (300, 3)), 0.3, focal, (7, -4))
+    (lens,) = motion.with_principal_points(model).cameras.values()
+    np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.5 if told else 0.0)
+
+
+def test_corners_of_the_sheet_hold_cameras_whose_features_are_poor():
+    """Of photographs that are twice as wide as what features were looked for in."""
+    random = np.random.default_rng(2)
+    points = random.normal(0, 1, (60, 3))
+    pictures = [SimpleNamespace(name=str(k), path=Path(f"{k}.jpg"), size=(2000, 1400)) for k in range(14)]
+    grid = np.stack([*np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 5)), np.zeros((5, 6))], -1).reshape(-1, 3)
+
+    def off(with_corners):
+        model, lens = model_of(points, 2.0)
+        poses = {k: model.images[k + 1].cam_from_world().matrix() for k in range(14)}
+        seen = {str(k): 2 * (seen_by(lens, pose, grid) + random.normal(0, 0.05, (30, 2))) for k, pose in poses.items()}
+        sightings = {name: Sighting(np.arange(30), 40 * grid, pixels) for name, pixels in seen.items()}
+        corners = motion.add_corners(model, pictures, sightings if with_corners else {})
+        assert len(corners) == 30 * motion.CORNER * with_corners
+        list(motion.adjustments(model))
+        (found,) = model.cameras.values()
+        shown = [seen_by(found, model.images[k + 1].cam_from_world().matrix(), points) for k in poses]
+        return np.abs(shown - np.array([seen_by(lens, pose, points) for pose in poses.values()])).mean()
+
+    assert off(True) < 0.5 * off(False)

@@ -167,7 +167,7 @@ def align(sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, P
     InputError if fewer than six are left, or if they do not form the sheet.
     """
     seen = list(triangulate(sightings, cameras))
-    found, true = (np.array(side).reshape(-1, 3) for side in zip(*seen)) if seen else np.zeros((2, 0, 3))
+    found, true = (np.array(side).reshape(-1, 3) for side in [*zip(*seen)][1:]) if seen else np.zeros((2, 0, 3))
     if len(found) < FEWEST or not spread(true):
         raise InputError(f"sheet of markers: photographs with a camera show {len(found)} of its corners together; must "
                          f"be {FEWEST} or more, not on one line: let more of them show more of it")  # fmt: skip
@@ -185,8 +185,8 @@ def align(sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, P
 
 def triangulate(
     sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, Pose]]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each corner that two photographs or more agree on: where it is for the cameras (3,), and on the sheet (3,)."""
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Corners that two photographs or more agree on, and where they are for the cameras (3,), and on the sheet (3,)."""
     rays: dict[int, list[tuple[np.ndarray, np.ndarray, float]]] = {}  # origins, directions, what they may be off
     places: dict[int, np.ndarray] = {}
     for name in filter(cameras.__contains__, sightings):
@@ -208,7 +208,7 @@ def triangulate(
         fits = np.stack([off(point, origins, directions) < allowed for point in points])
         best = fits[fits.sum(1).argmax()]
         if best.sum() >= 2:
-            yield nearest(origins[best], directions[best]), places[corner]
+            yield corner, nearest(origins[best], directions[best]), places[corner]
 
 
 def nearest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Structure from motion: cameras and points from photographs alone, by COLMAP's library."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
+from mi_ring.photogrammetry.board import Sighting, triangulate
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.matching import MATCHED, file_of, find_features, match_features, matches_of
 from mi_ring.system.machine import interruptible
@@ -27,6 +28,7 @@ PART = 3  #: photographs at least
 NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
 TOLD = 1e-3  #: of a picture's longer side, standard deviation to which a principal point must be known to be taken
+CORNER = 12  #: features that a corner of the sheet counts like: it is found that much more precisely
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
@@ -57,8 +59,12 @@ class Motion:
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
 
-def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: Progress) -> Motion:
+def structure_from_motion(
+    pictures: Sequence[Picture], sightings: Mapping[str, Sighting], folder: Path, progress: Progress
+) -> Motion:
     """Cameras of photographs, one lens for all of a size. What is done is kept in `folder`, to go on from there.
+
+    `sightings`: of the printed sheet, by the photograph's name.
 
     Raises InputError, which says why, if fewer than half of the photographs belong together.
     """
@@ -78,9 +84,12 @@ def structure_from_motion(pictures: Sequence[Picture], folder: Path, progress: P
         which = f" ({', '.join(names[:NAMED])}{', …' * (found > NAMED)})" if names else ""
         raise InputError(f"{pictures[0].path.parent}: FOLDER: only {found} of {len(pictures)} photographs could be put "
                          f"together{which}: {why_not(pictures, folder, found)}")  # fmt: skip
+    corners = add_corners(model, pictures, sightings)
     for _ in progress(adjustments(model), "bundle adjustment"):
         pass
     model = with_principal_points(model)
+    for corner in filter(model.exists_point3D, corners):
+        model.delete_point3D(corner)
     growing = folder / "sparse.partial"
     growing.mkdir(exist_ok=True)
     model.write(growing)
@@ -199,6 +208,28 @@ def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) 
     return np.abs((y * lines).sum(1)) / np.maximum(slope, 1e-12) * lens[0].mean_focal_length()
 
 
+def add_corners(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Sighting]) -> list[int]:
+    """Put corners of the printed sheet among the points of a model, where they weigh more than others; which these are.
+
+    Where the sheet is seen at a low angle there are few features, and highlights and shadows among them.
+    """
+    pycolmap = need("pycolmap", "bundle adjustment")
+    images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
+    sizes = {picture.name: picture.size for picture in pictures}
+    files = {picture.name: file_of(picture) for picture in pictures}
+    added: list[int] = []
+    for corner, place, _ in triangulate(sightings, cameras_of(model, pictures)):
+        for _ in range(CORNER):
+            track = pycolmap.Track()
+            for name, sighting in sightings.items():
+                image, own = images.get(files[name]), sighting.pixels[sighting.ids == corner]
+                if image is not None and len(own):
+                    image.points2D.append(pycolmap.Point2D(own[0] / reduction(model, image, sizes[name])))
+                    track.add_element(image.image_id, len(image.points2D) - 1)
+            added.append(model.add_point3D(place, track))
+    return added
+
+
 def adjustments(model: Any) -> Iterator[None]:
     """Bundle adjustment with a robust loss, and points that do not fit left out, a few iterations at a time.
 
@@ -258,21 +289,33 @@ def with_principal_points(model: Any) -> Any:
 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
     """In terms of the photographs as they were taken."""
+    cameras = cameras_of(model, pictures)
+    failed = {p.name: reason_of(p, folder) for p in pictures if p.name not in cameras}
     by_file = {file_of(picture): picture for picture in pictures}
-    cameras, scales = {}, []
+    placed = [model.images[k] for k in model.reg_image_ids()]
+    scales = [reduction(model, image, by_file[image.name].size) for image in placed]
+    error = float(model.compute_mean_reprojection_error() * np.mean(scales))
+    return Motion(cameras, points_of(model), error, failed)
+
+
+def cameras_of(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
+    """By photograph, as `Motion` has them."""
+    by_file, cameras = {file_of(picture): picture for picture in pictures}, {}
     for k in model.reg_image_ids():
         image = model.images[k]
-        picture = by_file[image.name]
-        own = model.cameras[image.camera_id]
-        scale = max(picture.size) // max(own.width, own.height)
-        (f, cx, cy, radial), pose = own.params, np.eye(4)
+        picture, pose = by_file[image.name], np.eye(4)
+        scale = reduction(model, image, picture.size)
+        f, cx, cy, radial = model.cameras[image.camera_id].params
         pose[:3] = image.cam_from_world().inverse().matrix()
         lens = Lens("SIMPLE_RADIAL", picture.size, (scale * f, scale * cx, scale * cy, radial))
         cameras[picture.name] = lens, pose
-        scales.append(scale)
-    failed = {p.name: reason_of(p, folder) for p in pictures if p.name not in cameras}
-    error = float(model.compute_mean_reprojection_error() * np.mean(scales))
-    return Motion(dict(sorted(cameras.items())), points_of(model), error, failed)
+    return dict(sorted(cameras.items()))
+
+
+def reduction(model: Any, image: Any, size: tuple[int, int]) -> int:
+    """How many pixels of a photograph of this size one of its image in a model is, across."""
+    own = model.cameras[image.camera_id]
+    return max(size) // max(own.width, own.height)
 
 
 def points_of(model: Any) -> np.ndarray:

@@ -182,7 +182,7 @@ def find_cameras(
     if beside := cameras_beside(pictures):
         return beside
     try:
-        return structure_from_motion(pictures, folder, progress)
+        return structure_from_motion(pictures, sheet.sightings if sheet else {}, folder, progress)
     except InputError as error:
         if sheet is None or len(sheet.sightings) < len(pictures) / 2:
             raise
