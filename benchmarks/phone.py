@@ -193,7 +193,7 @@ def write_mask(path: Path, coverage: np.ndarray) -> None:
 
 
 def crop(scene: Path) -> None:
-    """Crop all that the photographs of a scene file have beside it to the object, as `mi_ring.photos` does."""
+    """Crop photographs and masks of a scene file to the object, as `mi_ring.photos` does."""
     tree = ElementTree.parse(scene)
     sensors = tree.getroot().findall("sensor")
 

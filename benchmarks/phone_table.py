@@ -66,9 +66,10 @@ def measure(folder: Path, made: list[object], found: bool, preset: str) -> dict[
             numbers["this"] = {"failed": str(error)}
     else:
         known = folder / "known/scene.xml"
-        if not known.exists():
+        if not (folder / "known/cropped/done").exists():
             run("-m", "mi_ring.convert", "transforms", folder / "truth/transforms.json", known, log=log)
             crop(known)
+            (folder / "known/cropped/done").touch()
         numbers["this"] = evaluated(known, preset, log)
     result.write_text(json.dumps(numbers))
     return numbers

@@ -106,8 +106,8 @@ def masks_report(found: Object, motion: Motion, source: str | Path) -> str:
     ])  # fmt: skip
 
 
-def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 0, for what is to be mended was found in a capture that is there."""
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
@@ -128,7 +128,6 @@ def main(arguments: Sequence[str]) -> int:
         signal.signal(signal.SIGTERM, before)
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
-    return 0
 
 
 def require_apart(config: PhotosConfig) -> None:

@@ -65,5 +65,5 @@ class Room(nn.Module):
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
             self.harmonics = self.given.clone()
             self.harmonics[free] += more.T
-            # No room takes light away: where it would, what is too bright is another part of the model.
+            # In the mean no room takes light away: where it would, what is too bright is another part of the model.
             self.harmonics[:, self.harmonics[0] < 0] = 0.0

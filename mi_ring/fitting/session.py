@@ -6,10 +6,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import trimesh
 from tqdm import tqdm
 
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
+from mi_ring.geometry.domain import Sphere
+from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
 from mi_ring.system.progress import progress
 
@@ -60,6 +63,14 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
     write_checkpoint(fit, files, folder)
 
 
+def start_of(fit: Fit) -> str:
+    """What a fit starts from."""
+    domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
+    if isinstance(domain, Sphere):
+        return f"a sphere of radius {float(fit.ring.radius):.4g} about {place}"
+    return f"a surface of genus {genus(trimesh.Trimesh(domain.points, domain.faces, process=False))} about {place}"
+
+
 def run_session(fit: Fit, folder: Path) -> bool:
     """Run a fit in a folder that has been prepared and write its results, whatever ends it. Was it interrupted?"""
     fitted_scene = results.fitted_scene(fit, folder)
@@ -72,6 +83,7 @@ def run_session(fit: Fit, folder: Path) -> bool:
             print(f"By the lights' intensities the object reflects {fit.albedo:.3g} times the light that it gets: how "
                   "strong they are is found by interreflection (--refine scale)")  # fmt: skip
         if not fit.iteration:
+            print(f"Start: {start_of(fit)}")
             results.write_inputs(folder / "inputs.png", fit)
         try:
             train(fit, folder, interrupted)

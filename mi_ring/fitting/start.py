@@ -73,13 +73,8 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
     if surface is not None and (choice == "hull" or genus(surface)):
-        print(f"Start: the masks' visual hull, of genus {genus(surface)}")
         return closed_domain(surface, shape.center, shape.radius)
-    center, radius = capture.sphere()
-    why = ", for the masks' visual hull has no holes" if surface is not None else ""
-    place = "({:.4g}, {:.4g}, {:.4g}) of radius {:.4g}".format(*center, radius)
-    print(f"Start: a sphere about {place}{why}")
-    return Sphere(), center, radius
+    return Sphere(), *capture.sphere()
 
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:

@@ -52,11 +52,10 @@ HEADS = (
     "brightness",
     "agreement",
 )
-
-
-LEGEND = """distance, light: from the object to camera and light, in its radii; angle: between them [degrees]; object:
-share of the photograph; clipped, dark: shares of the object; background: brightness, by that of the object;
-brightness: for the light that the object gets, by the usual one; agreement: share of the mask that others agree to"""
+LEGEND = """distance, light: how far camera and light are from the object, in its radii; angle: between the two [°];
+object: share of the photograph that is object; clipped, dark: shares of the object that are over-exposed, and black;
+background: its brightness, by that of the object; brightness: for the light that the object gets, by that of the other
+photographs; agreement: share of the mask that the other masks agree to"""
 
 
 def measure(

@@ -166,8 +166,8 @@ def align(sightings: Mapping[str, Sighting], cameras: Mapping[str, tuple[Lens, P
     Corners that two photographs or more show are put into space by their cameras; wrong ones are left out. Raises
     InputError if fewer than six are left, or if they do not form the sheet.
     """
-    seen = list(triangulate(sightings, cameras))
-    found, true = (np.array(side).reshape(-1, 3) for side in [*zip(*seen)][1:]) if seen else np.zeros((2, 0, 3))
+    seen = np.array([pair for _, *pair in triangulate(sightings, cameras)]).reshape(-1, 2, 3)
+    found, true = seen[:, 0], seen[:, 1]
     if len(found) < FEWEST or not spread(true):
         raise InputError(f"sheet of markers: photographs with a camera show {len(found)} of its corners together; must "
                          f"be {FEWEST} or more, not on one line: let more of them show more of it")  # fmt: skip

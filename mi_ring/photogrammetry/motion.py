@@ -29,6 +29,7 @@ NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
 TOLD = 1e-3  #: of a picture's longer side, standard deviation to which a principal point must be known to be taken
 CORNER = 12  #: features that a corner of the sheet counts like: it is found that much more precisely
+WORSE = 1.1  #: how much farther off features may be where the corners count
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
@@ -84,12 +85,7 @@ def structure_from_motion(
         which = f" ({', '.join(names[:NAMED])}{', …' * (found > NAMED)})" if names else ""
         raise InputError(f"{pictures[0].path.parent}: FOLDER: only {found} of {len(pictures)} photographs could be put "
                          f"together{which}: {why_not(pictures, folder, found)}")  # fmt: skip
-    corners = add_corners(model, pictures, sightings)
-    for _ in progress(adjustments(model), "bundle adjustment"):
-        pass
-    model = with_principal_points(model)
-    for corner in filter(model.exists_point3D, corners):
-        model.delete_point3D(corner)
+    model = adjusted(model, pictures, sightings, progress)
     growing = folder / "sparse.partial"
     growing.mkdir(exist_ok=True)
     model.write(growing)
@@ -208,25 +204,49 @@ def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) 
     return np.abs((y * lines).sum(1)) / np.maximum(slope, 1e-12) * lens[0].mean_focal_length()
 
 
+def adjusted(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Sighting], progress: Progress) -> Any:
+    """The model after bundle adjustments, in which the corners of the printed sheet count if the features go with them.
+
+    They do not where the object was moved on its sheet, or the sheet under it.
+    """
+    pycolmap = need("pycolmap", "bundle adjustment")
+    for _ in progress(adjustments(model), "bundle adjustment"):
+        pass
+    held = pycolmap.Reconstruction(model)
+    if not (corners := add_corners(held, pictures, sightings)):
+        return with_principal_points(model, progress)
+    for _ in progress(adjustments(held), "bundle adjustment by the sheet"):
+        pass
+    held = with_principal_points(held, progress)
+    for corner in filter(held.exists_point3D, corners):
+        held.delete_point3D(corner)
+    held.update_point_3d_errors()
+    fewer = held.compute_num_observations() / model.compute_num_observations()
+    worse = held.compute_mean_reprojection_error() / model.compute_mean_reprojection_error()
+    return held if worse < WORSE * min(1.0, fewer) else with_principal_points(model, progress)
+
+
 def add_corners(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Sighting]) -> list[int]:
     """Put corners of the printed sheet among the points of a model, where they weigh more than others; which these are.
 
     Where the sheet is seen at a low angle there are few features, and highlights and shadows among them.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
-    images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
-    sizes = {picture.name: picture.size for picture in pictures}
-    files = {picture.name: file_of(picture) for picture in pictures}
+    seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
+    by_file = {file_of(picture): picture for picture in pictures}
+    for image in [model.images[k] for k in model.reg_image_ids()]:
+        picture = by_file[image.name]
+        if sighting := sightings.get(picture.name):
+            for corner, place in zip(sighting.ids.tolist(), sighting.pixels / reduction(model, image, picture.size)):
+                seen.setdefault(corner, []).append((image, place))
     added: list[int] = []
-    for corner, place, _ in triangulate(sightings, cameras_of(model, pictures)):
+    for corner, point, _ in triangulate(sightings, cameras_of(model, pictures)):
         for _ in range(CORNER):
             track = pycolmap.Track()
-            for name, sighting in sightings.items():
-                image, own = images.get(files[name]), sighting.pixels[sighting.ids == corner]
-                if image is not None and len(own):
-                    image.points2D.append(pycolmap.Point2D(own[0] / reduction(model, image, sizes[name])))
-                    track.add_element(image.image_id, len(image.points2D) - 1)
-            added.append(model.add_point3D(place, track))
+            for image, place in seen[corner]:
+                image.points2D.append(pycolmap.Point2D(place))
+                track.add_element(image.image_id, len(image.points2D) - 1)
+            added.append(model.add_point3D(point, track))
     return added
 
 
@@ -236,24 +256,18 @@ def adjustments(model: Any) -> Iterator[None]:
     Highlights and the flash's shadows move with the camera: features on them are wrong but match, and by least squares
     alone they would bend all cameras.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
-    options, config = adjustment(model, ITERATIONS)
-    observations = pycolmap.ObservationManager(model)
+    observations = need("pycolmap", "bundle adjustment").ObservationManager(model)
     for _ in range(3):
-        for _ in range(100 // ITERATIONS):
-            yield
-            summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-            if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
-                break
+        yield from solved(model, *adjustment(model), 100 // ITERATIONS)
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
             break
 
 
-def adjustment(model: Any, iterations: int) -> tuple[Any, Any]:
+def adjustment(model: Any) -> tuple[Any, Any]:
     """Options of a bundle adjustment with a robust loss, and what takes part in it: all of a model."""
     pycolmap = need("pycolmap", "bundle adjustment")
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
     config = pycolmap.BundleAdjustmentConfig()
     for k in model.reg_image_ids():
@@ -262,29 +276,48 @@ def adjustment(model: Any, iterations: int) -> tuple[Any, Any]:
     return options, config
 
 
-def with_principal_points(model: Any) -> Any:
-    """The model with principal points, too, adjusted; as it is where the photographs do not tell these.
+def solved(model: Any, options: Any, config: Any, times: int) -> Iterator[None]:
+    """Adjust a model so many times, or until it changes no more."""
+    pycolmap = need("pycolmap", "bundle adjustment")
+    for _ in range(times):
+        yield
+        summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
+            break
 
-    A long lens tells them hardly, for a shift of the picture is nearly a turn of the camera.
+
+def with_principal_points(model: Any, progress: Progress) -> Any:
+    """The model with the principal points that the photographs tell, adjusted; those of other lenses stay.
+
+    A long lens tells it hardly, for a shift of the picture is nearly a turn of the camera.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
-    adjusted = pycolmap.Reconstruction(model)
-    options, config = adjustment(adjusted, 3 * ITERATIONS)
-    options.refine_principal_point = True
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, adjusted)
-    if not interruptible(adjuster.solve).is_solution_usable():
-        return model
-    only = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
-    covariance = pycolmap.estimate_ba_covariance(only, adjusted, adjuster)
-    for k in {adjusted.images[k].camera_id for k in adjusted.reg_image_ids()}:
-        camera = adjusted.cameras[k]
-        own = covariance and covariance.get_other_params_cov(camera.params)
-        if own is None:
-            return model
-        variance = np.diag(own)[camera.principal_point_idxs()].max()
-        if variance > (TOLD * max(camera.width, camera.height)) ** 2:
-            return model
-    return adjusted
+    lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
+    untold: set[int] = set()
+    while untold < lenses:
+        found = pycolmap.Reconstruction(model)
+        options, config = adjustment(found)
+        options.refine_principal_point = True
+        for k in untold:
+            config.set_constant_cam_intrinsics(k)
+        for _ in progress(solved(found, options, config, 3), "principal points"):
+            pass
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), found, adjuster)
+        more = {k for k in lenses - untold if not told(found.cameras[k], covariance)}
+        if not more:
+            return found
+        untold |= more
+    return model
+
+
+def told(camera: Any, covariance: Any) -> bool:
+    """Do photographs tell the principal point of a camera? By a `pycolmap.BACovariance`, None if there is none."""
+    own = covariance and covariance.get_other_params_cov(camera.params)
+    if own is None:
+        return False
+    variance = np.diag(own)[camera.principal_point_idxs()].max()
+    return bool(variance < (TOLD * max(camera.width, camera.height)) ** 2)
 
 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:

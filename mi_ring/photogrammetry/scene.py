@@ -45,15 +45,14 @@ def windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]
     """
     extents = [None if mask is None else extent_of(mask, size) for mask, size in zip(masks, sizes)]
     result = []
-    for own, extent in zip(sizes, extents):
-        alike = [e for size, e in zip(sizes, extents) if size == own and e is not None]
-        size = np.array(own)
+    for size, extent in zip(sizes, extents):
+        alike = [e for other, e in zip(sizes, extents) if other == size and e is not None]
         if not alike:
-            result.append(Window(0, 0, *own))
+            result.append(Window(0, 0, *size))
             continue
         wanted = np.max([e[1] - e[0] for e in alike], 0)
         wanted = np.minimum(np.ceil(wanted + 2 * MARGIN * wanted.max()), size).astype(int)
-        middle = size / 2 if extent is None else extent.mean(0)
+        middle = np.array(size) / 2 if extent is None else extent.mean(0)
         corner = np.clip(np.round(middle - wanted / 2), 0, size - wanted).astype(int)
         result.append(Window(*map(int, corner), *map(int, wanted)))
     return result

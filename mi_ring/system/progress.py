@@ -17,21 +17,25 @@ class Lines(io.TextIOBase):
 
     def write(self, text: str) -> int:
         """Write it, if there is anything to be seen in it."""
-        if line := text.strip():
+        if sys.stderr and (line := text.strip()):
             sys.stderr.write(f"{line}\n")
         return len(text)
 
     def flush(self) -> None:
         """Flush standard error."""
-        sys.stderr.flush()
+        if sys.stderr:
+            sys.stderr.flush()
 
 
-def progress(things: Iterable | None, what: str = "", total: float | None = None, **options: Any) -> tqdm:
+def progress(
+    things: Iterable | None, what: str = "", total: float | None = None, leave: bool = False, **options: Any
+) -> tqdm:
     """Iterates over things and shows how far it is, while it is at work; `options` are those of tqdm.
 
     In a terminal it is a bar; else a line is written twice a minute, and none of what takes less.
     """
-    if not sys.stderr.isatty():
-        options |= {"file": Lines(), "mininterval": QUIET, "maxinterval": QUIET, "delay": QUIET, "ascii": " #"}
+    if not getattr(sys.stderr, "isatty", bool)():
+        options |= {"file": Lines(), "mininterval": QUIET, "maxinterval": QUIET, "delay": QUIET, "ascii": " #",
+                    "position": 0}  # fmt: skip
     columns, rows = shutil.get_terminal_size()  # 80 x 24 where a terminal says 0 x 0: tqdm would show nothing
-    return tqdm(things, what, total, ncols=columns, nrows=rows, **{"leave": False} | options)
+    return tqdm(things, what, total, leave=leave, ncols=columns, nrows=rows, **options)
