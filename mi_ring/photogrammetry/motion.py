@@ -30,6 +30,7 @@ FEWEST_POINTS = 30  #: that a photograph must show of those in space
 TOLD = 1e-3  #: of a picture's longer side, standard deviation to which a principal point must be known to be taken
 CORNER = 12  #: features that a corner of the sheet counts like: it is found that much more precisely
 WORSE = 1.1  #: how much farther off features may be where the corners count
+SETTLED = 1e-5  #: share of the error by which an iteration of a bundle adjustment lessens it that is nearly the last
 ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
 
 
@@ -268,6 +269,7 @@ def adjustment(model: Any) -> tuple[Any, Any]:
     pycolmap = need("pycolmap", "bundle adjustment")
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
+    options.ceres.solver_options.function_tolerance = SETTLED
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
     config = pycolmap.BundleAdjustmentConfig()
     for k in model.reg_image_ids():
