@@ -96,6 +96,14 @@ def test_velocity_loss_without_laplacian_is_the_mean_square():
     )
 
 
+def test_a_mask_that_is_in_doubt_counts_less_the_more_it_differs():
+    """Geman and McClure's loss: as least squares where the difference is small, never above doubt²."""
+    mask, coverage = torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.01, 1.0]]])
+    for doubt in (0.5, 0.2):
+        wanted = (0.01**2 / (1 + (0.01 / doubt) ** 2) + 1 / (1 + 1 / doubt**2)) / 3
+        assert terms.mask_loss(coverage, mask, 0.1, doubt=doubt).item() == pytest.approx(wanted)
+
+
 def test_pixels_that_say_nothing_have_no_part_in_the_mask_loss():
     coverage, mask = torch.tensor([[[0.5, 1.0, 0.0]]]), torch.tensor([[[0.0, 0.0, 0.0]]])
     valid = torch.tensor([[[True, False, True]]])

@@ -54,11 +54,15 @@ class Iteration:
             "crossing": fit.restraint.crossing, "unexplained": fit.restraint.unexplained,
         }  # fmt: skip
 
+    def surely(self) -> Tensor:
+        """(n, H, W) bool: where pixels are wholly object, by their masks, if they have any, and as predicted."""
+        masked = self.masked.to(self.mask.device)[:, None, None]
+        return torch.minimum(torch.where(masked, self.mask, 1.0), self.coverage.detach()) > 0.99
+
     def unexplained(self) -> float:
         """How much of the object's light is not as predicted, as a share of it; NaN where no light of it is seen."""
         with torch.no_grad():
-            masked = self.masked.to(self.mask.device)[:, None, None]
-            surely = torch.minimum(torch.where(masked, self.mask, 1.0), self.coverage) > 0.99
+            surely = self.surely()
             error = (self.predicted - self.observed)[surely]
             error = torch.where(self.clipped[surely], error.clamp(max=0), error)
             return float(error.abs().sum() / self.observed[surely].sum())

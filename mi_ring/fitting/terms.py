@@ -3,6 +3,7 @@
 Small pure functions of tensors, and what a fit makes of them: `default_terms`, functions of an `Iteration`.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.images import blur
 
+DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
@@ -40,13 +42,18 @@ def rgb_loss(
     return error.square().mean() if kind == "l2" else error.abs().mean()
 
 
-def mask_loss(coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None) -> Tensor:
+def mask_loss(
+    coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None, doubt: float = math.inf
+) -> Tensor:
     """Squared difference of coverage and mask (n, H, W), blurred by a Gaussian of `sigma` [px].
 
     The blur lets an outline feel a mask that it does not touch yet. Where not `valid` (n, H, W) there is no difference.
+    Differences beyond `doubt` count less and less ("Statistical Methods for Tomographic Image Reconstruction", Geman
+    and McClure 1987): a mask is wrong there.
     """
     difference = coverage - mask if valid is None else (coverage - mask) * valid
-    return blur(difference, sigma).square().mean()
+    square = blur(difference, sigma).square()
+    return (square / (1 + square / doubt**2)).mean()
 
 
 def velocity_loss(
@@ -73,17 +80,18 @@ class Term(NamedTuple):
 def rgb(it: Iteration) -> Tensor:
     """Colours: predicted photographs against observed ones.
 
-    In a room that was not black, what is not wholly object by its mask, or by its prediction, could be anything.
+    In a room that was not black, what is not wholly object by its mask and by its prediction could be anything.
     """
-    telling = None
-    if it.fit.capture.lit_room:
-        known = it.masked.to(it.mask.device)[:, None, None]
-        telling = torch.where(known, it.mask, it.coverage.detach()) > 0.99
+    telling = it.surely() if it.fit.capture.lit_room else None
     return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss, telling)
 
 
 def mask(it: Iteration) -> Tensor | None:
-    """Silhouettes, of the photographs that have a mask."""
+    """Silhouettes, of the photographs that have a mask.
+
+    In a room that was not black masks are guesses: once the shape has settled, what most of them say outweighs one that
+    fills a handle with its shadow.
+    """
     if not it.masked.any():
         return None
     # The blur shrinks, to a pixel for the last fifth of the fit.
@@ -93,7 +101,8 @@ def mask(it: Iteration) -> Tensor | None:
         lit = torch.maximum(it.observed, it.predicted.detach()).amax(-1) > threshold
         coverage = torch.where(lit, coverage, 0)
     valid = None if it.valid is None else it.valid[it.masked]
-    return mask_loss(coverage[it.masked], it.mask[it.masked], max(1.0, sigma), valid)
+    doubt = DOUBT if it.fit.capture.lit_room and it.progress > SETTLED else math.inf
+    return mask_loss(coverage[it.masked], it.mask[it.masked], max(1.0, sigma), valid, doubt)
 
 
 def velocity(it: Iteration) -> Tensor:
