@@ -41,7 +41,7 @@ def main(arguments: Sequence[str]) -> None:
     try:
         writer = Writer(source.scene)
         try:
-            for frame, name in zip(progress(frames, "converting", unit="photograph"), names):
+            for frame, name in zip(progress(frames, "converting", unit="photograph", disable=None), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
                 files = place_frame(writer, frame, name, source.copy, encoding)
                 root.append(photograph_element(name, files.filename, frame.camera, frame.light, files.mask, encoding,

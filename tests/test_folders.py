@@ -223,10 +223,13 @@ def test_a_bar_is_lines_of_a_log(monkeypatch):
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
     list(progress(range(3), "counting"))
-    assert not log.getvalue()  # it took less than QUIET
+    assert not log.getvalue()  # it took no time
+    monkeypatch.setattr("mi_ring.system.progress.PATIENCE", 0.0)
+    list(progress(range(3), "counting", mininterval=0))
+    assert log.getvalue().count("counting") == 1 and log.getvalue().endswith("\n")
     monkeypatch.setattr("mi_ring.system.progress.QUIET", 0.0)
-    list(progress(range(3), "counting"))
-    lines = log.getvalue().splitlines()
+    list(progress(range(3), "counting", mininterval=0))
+    lines = log.getvalue().splitlines()[1:]
     assert len(lines) >= 3 and all(line.startswith("counting") for line in lines) and "\r" not in log.getvalue()
 
 

@@ -46,7 +46,7 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     shadows = getattr(scene.integrator(), "shadows", True)
     if not images:
         return Capture(path, scene, shapes[0], sensors, photographs, shadows)
-    reading = progress(sensors, "reading", unit="photograph")
+    reading = progress(sensors, "reading", unit="photograph", disable=None)
     pixels = [read_photograph(s, path) for s in reading]
     linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
     given = read_once([(s, s.mask) for s in sensors], "mask", path) if masks != "none" else [None] * len(sensors)

@@ -211,6 +211,7 @@ def adjusted(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Si
     They do not where the object was moved on its sheet, or the sheet under it.
     """
     pycolmap = need("pycolmap", "bundle adjustment")
+    model.tear_down()  # covariances are refused where some images have no pose
     for _ in progress(adjustments(model), "bundle adjustment"):
         pass
     held = pycolmap.Reconstruction(model)
