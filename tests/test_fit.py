@@ -624,6 +624,7 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
     it = SimpleNamespace(predicted=predicted, observed=observed, clipped=clipped, masked=torch.tensor([True]),
                          mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]),
                          coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))  # fmt: skip
+    it.surely = lambda: Iteration.surely(it)
     assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
     it.masked = torch.tensor([False])  # then what is predicted to be the object is
     assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05 + 9) / (0.5 + 0.25 + 0.4 + 9))
