@@ -16,7 +16,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
-from mi_ring.photogrammetry import masks, motion, table, trial
+from mi_ring.photogrammetry import bundle, masks, motion, table, trial
 from mi_ring.photogrammetry.board import Sighting
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.matching import pairs_to_match
@@ -526,7 +526,7 @@ def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
     model, _ = model_of(np.random.default_rng(1).normal(0, 1, (300, 3)), 0.3, focal, (7, -4))
     motion.leave_out(model, [3])
     pictures = [SimpleNamespace(name=str(k), path=Path(f"{k}.jpg"), size=(1000, 700)) for k in range(14)]
-    (lens,) = motion.adjusted(model, pictures, {}, quiet).cameras.values()
+    (lens,) = bundle.adjusted(model, pictures, {}, quiet).cameras.values()
     np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.5 if told else 0.0)
 
 
@@ -550,7 +550,7 @@ def adjusted_by_corners(shift):
     for k, pose in poses.items():
         seen = seen_by(lens, pose, grid + np.array([k % 2 * (shift or 0), 0, 0])) + random.normal(0, 0.05, (30, 2))
         sightings[str(k)] = Sighting(np.arange(30), 40 * grid, 2 * seen)
-    model = motion.adjusted(model, pictures, {} if shift is None else sightings, quiet)
+    model = bundle.adjusted(model, pictures, {} if shift is None else sightings, quiet)
     (found,) = model.cameras.values()
     shown = [seen_by(found, model.images[k + 1].cam_from_world().matrix(), points) for k in poses]
     return np.abs(shown - np.array([seen_by(lens, pose, points) for pose in poses.values()])).mean(), model
