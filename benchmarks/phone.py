@@ -202,16 +202,18 @@ def crop(scene: Path) -> None:
 
     masks = [np.array(Image.open(scene.parent / files(sensor)["mask"].get("value"))) for sensor in sensors]
     for sensor, window in zip(sensors, windows(masks, [mask.shape[::-1] for mask in masks])):
+        left, top, width, height = window[:4]
         for kind, file in files(sensor).items():
             path = Path(f"cropped/{kind}/{sensor.get('id')}.png")
             (scene.parent / path).parent.mkdir(parents=True, exist_ok=True)
-            box = window.left, window.top, window.left + window.width, window.top + window.height
-            Image.open(scene.parent / file.get("value")).crop(box).save(scene.parent / path)
+            picture = Image.open(scene.parent / file.get("value"))
+            picture.crop((left, top, left + width, top + height)).save(scene.parent / path)
             file.set("value", str(path))
-        for name, first, side in (("x", window.left, window.width), ("y", window.top, window.height)):
-            centre = sensor.find(f"float[@name='c{name}']")
+        for field, first in (("cx", left), ("cy", top)):
+            centre = sensor.find(f"float[@name='{field}']")
             centre.set("value", str(float(centre.get("value")) - first))
-            sensor.find(f"film/integer[@name='{'width' if name == 'x' else 'height'}']").set("value", str(side))
+        for field, side in (("width", width), ("height", height)):
+            sensor.find(f"film/integer[@name='{field}']").set("value", str(side))
     tree.write(scene)
 
 

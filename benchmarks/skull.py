@@ -38,12 +38,12 @@ def held_out(capture: Path, result: Path) -> Path:
     tree = ElementTree.parse(result / "scene.xml")
     sensors = tree.getroot().findall("sensor")
     held = sorted(sensor.get("id") for sensor in sensors)[EVERY // 2 :: EVERY]
-    width, height = uncropped(capture)
+    (width, height), (cx, cy) = uncropped(capture)
     for sensor in sensors:
         if sensor.get("id") not in held:
             tree.getroot().remove(sensor)
             continue
-        for field, value in (("cx", width / 2), ("cy", height / 2)):
+        for field, value in (("cx", cx), ("cy", cy)):
             sensor.find(f"float[@name='{field}']").set("value", str(value))
         for field, value in (("width", width), ("height", height)):
             sensor.find(f"film/integer[@name='{field}']").set("value", str(value))
@@ -55,12 +55,12 @@ def held_out(capture: Path, result: Path) -> Path:
     return path
 
 
-def uncropped(capture: Path) -> tuple[int, int]:
-    """Size of the photographs [px], whose principal point is the middle."""
+def uncropped(capture: Path) -> tuple[tuple[int, int], tuple[float, float]]:
+    """Size of the photographs and their principal point [px]."""
     import pycolmap
 
     camera = next(iter(pycolmap.Reconstruction(capture / "work/sparse").cameras.values()))
-    return camera.width, camera.height
+    return (camera.width, camera.height), (camera.principal_point_x, camera.principal_point_y)
 
 
 def cameras_off(capture: Path) -> str:

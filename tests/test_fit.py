@@ -622,7 +622,7 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
     clipped = torch.zeros(1, 1, 5, 3, dtype=torch.bool)
     clipped[..., 3, :] = True  # brighter than observed: no error
     it = SimpleNamespace(predicted=predicted, observed=observed, clipped=clipped, masked=torch.tensor([True]),
-                         mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]),
+                         mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]), valid=None,
                          coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))  # fmt: skip
     it.surely = lambda: Iteration.surely(it)
     assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))

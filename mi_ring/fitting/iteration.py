@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.capture.capture import Observation
 from mi_ring.fitting.schedule import Stage
 from mi_ring.rendering.photographs import Photographs
 
@@ -56,8 +57,8 @@ class Iteration:
 
     def surely(self) -> Tensor:
         """(n, H, W) bool: where pixels are wholly object, by their masks, if they have any, and as predicted."""
-        masked = self.masked.to(self.mask.device)[:, None, None]
-        return torch.minimum(torch.where(masked, self.mask, 1.0), self.coverage.detach()) > 0.99
+        seen = Observation(self.observed, self.clipped, self.mask, self.masked, self.valid)
+        return seen.surely(self.coverage.detach())
 
     def unexplained(self) -> float:
         """How much of the object's light is not as predicted, as a share of it; NaN where no light of it is seen."""
