@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.output.inspection import inspect
-from mi_ring.system import command
+from mi_ring.system import command, files
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"{out}: --out: must end in .png")
     if out.resolve() in {file for sensor in capture.sensors for file in sensor.files}:
         raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
+    files.require_place(out, "--out")
     inspection = inspect(capture)
     inspection.save(out, "--out")
     print(f"{inspection.text}\nContact sheet: {out}")
