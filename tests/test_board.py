@@ -237,6 +237,18 @@ def test_white_is_asked_of_white_squares_only():
         np.testing.assert_allclose(colours, np.broadcast_to([0.3, 0.6, 0.9], colours.shape), rtol=1e-6)
 
 
+def test_white_is_that_of_the_middle_of_squares():
+    """Paper whose light falls off to one side: what is brighter on one side of a square is darker on the other."""
+    sheet = np.array(page("a4"))
+    sighting = Board().detect(sheet.astype(np.uint8) * 255)
+    row, column = np.mgrid[: sheet.shape[0], : sheet.shape[1]]
+    light = 0.3 + 0.4 * column / sheet.shape[1] - 0.2 * row / sheet.shape[0]
+    places, colours = white((sheet * light)[..., None].repeat(3, 2).astype(np.float32), sighting)
+    x, y = DOTS * (places[:, :2].T + np.array([[210], [-297]]) / 2)  # from the left, and downward to the top
+    expected = 0.3 + 0.4 * x / sheet.shape[1] + 0.2 * y / sheet.shape[0]
+    np.testing.assert_allclose(colours[:, 0], expected, rtol=2e-3)
+
+
 @pytest.mark.parametrize("paper, size", [("a4", (210, 297)), ("letter", (215.9, 279.4))])
 def test_the_page_is_true_to_scale(paper, size, tmp_path, capsys):
     file = tmp_path / "new" / "sheet.pdf"

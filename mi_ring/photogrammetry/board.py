@@ -269,9 +269,9 @@ def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarra
         if inner * min(np.linalg.norm(four[1] - four[0]), np.linalg.norm(four[2] - four[0])) < 1:  # [px]: too blurred
             continue
         plane = cv2.getPerspectiveTransform(unit, four)
-        x, y = (cv2.perspectiveTransform(rims[None], plane)[0] - 0.5).astype(np.float32).T
-        seen = cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        colour = np.median(seen, 0)
+        at = (cv2.perspectiveTransform(rims[None], plane) - 0.5).astype(np.float32)  # (1, n, 2)
+        seen = cv2.remap(linear, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        colour = np.median(seen[0], 0)
         if colour.max() < CLIPPED:
             middles.append(np.mean([places[k] for k in ring], 0))
             colours.append(colour)
