@@ -6,6 +6,7 @@ Nothing in here shares code or model with what reconstructs it, but for the layo
 
 import sys
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,7 @@ PAGE = np.array([210.0, 297.0])  #: A4 [mm]
 BOARD = (9, 13, 20.0, 15.0)  #: squares across and down, their side and that of a marker [mm]
 PAPER, INK = 0.8, 0.05  #: albedos
 TABLE, THICKNESS = np.array([1400.0, 1100.0]), 0.1  #: of the table; of the sheet above it [mm]
+FINER, STRIDE = 9, 1_000_003  #: times as many paths where the object is, and between their seeds
 BACKDROP = 500.0  #: how far behind the turntable it stands [mm]
 ROOM_COLOUR = np.array([1.12, 1.0, 0.88])  #: of the light in the room; the flash is white
 
@@ -314,19 +316,36 @@ class Stage:
 
     def radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
-        window = shot.around(self.mesh.vertices) if self.bare else (0, 0, *shot.camera.size)
-        direct, everything = (self.trace(self.flashed, shot, window, spp, seed, depth) for depth in (2, 4))
-        # Rare paths that meet the flash in a highlight would be white dots.
-        indirect = [dr.clip(a - d, 0, self.brightest) for a, d in zip(everything, direct)]
-        return averaged([d + i for d, i in zip(direct, indirect)], shot, window, spp)
+
+        def flashed(window: Window, spp: int, seed: int) -> list:
+            direct, everything = (self.trace(self.flashed, shot, window, spp, seed, depth) for depth in (2, 4))
+            # Rare paths that meet the flash in a highlight would be white dots.
+            return [d + dr.clip(a - d, 0, self.brightest) for a, d in zip(everything, direct)]
+
+        return self.pictured(flashed, shot, spp, seed)
 
     def room_radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the room, whose mean radiance is 1.
 
         Apart, for an integrator that chooses between two lights is much noisier.
         """
-        window = (0, 0, *shot.camera.size)
-        return averaged(self.trace(self.lit, shot, window, spp, seed, 3), shot, window, spp)
+        return self.pictured(lambda *how: self.trace(self.lit, shot, *how, 3), shot, spp, seed)
+
+    def pictured(self, traced: Callable[[Window, int, int], list], shot: Shot, spp: int, seed: int) -> np.ndarray:
+        """Radiance (H, W, 3) of paths `traced`(window, spp, seed), many more where the object is.
+
+        What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
+        which no photograph has, and darker to all who ask for medians.
+        """
+        near, rounds = shot.around(self.mesh.vertices), 1 if self.bare else FINER
+        left, top, right, bottom = near
+        picture = 0.0 if self.bare else averaged(traced((0, 0, *shot.camera.size), spp, seed), shot,
+                                                 (0, 0, *shot.camera.size), spp)  # fmt: skip
+        fine = np.mean([averaged(traced(near, spp, seed + k * STRIDE), shot, near, spp) for k in range(rounds)], 0)
+        if self.bare:
+            return fine
+        picture[top:bottom, left:right] = fine[top:bottom, left:right]
+        return picture
 
     def trace(self, scene: mi.Scene, shot: Shot, window: Window, spp: int, seed: int, depth: int) -> list:
         """Radiance along the rays of a part of the picture: [R, G, B]."""

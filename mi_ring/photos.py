@@ -21,6 +21,7 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
+from mi_ring.photogrammetry.flash import Flash
 from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, ups, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
@@ -29,6 +30,7 @@ from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.workflow import (
     find_cameras,
     find_sheet,
+    flash_of,
     require_same_photographs,
     require_sides,
     shots,
@@ -104,6 +106,16 @@ def masks_report(found: Object, motion: Motion, source: str | Path) -> str:
         f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs",
         *(f"  without: {name}: {why}" for name in without),
     ])  # fmt: skip
+
+
+def flash_report(flash: Flash, motion: Motion, found: Object) -> str:
+    """What the sheet tells of the flash and of the room."""
+    x, y, z = flash.offset
+    away = np.median([np.linalg.norm(pose[:3, 3] - found.center) for _, pose in motion.cameras.values()])
+    where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
+    where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
+    share = (flash.room * away**2).mean()
+    return f"Flash, by the sheet: {where}; the room's light on the sheet is {share:.1%} of its light"
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -184,19 +196,25 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not sheet:
         motion, plane = upright(motion, found.center, plane, ups(pictures))
         found = found._replace(center=np.zeros(3))
-    taken = shots(pictures, motion, found, np.array(config.flash_offset), sheet)
+    offset = np.array(config.flash_offset)
+    flash = flash_of(pictures, motion, found, offset, sheet) if sheet else None
+    if flash:
+        print(flash_report(flash, motion, found))
+    taken = shots(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
     root, writer = scene_element([], ground), Writer(scene)
-    if config.turntable:  # the object sees the room turn
-        root.append(room_element("camera", np.zeros((COUNT, 3))))
+    if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
+        harmonics = np.zeros((COUNT, 3))
+        harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
+        root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
         cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
         written = in_threads(partial(write_shot, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
-        if plane and any(shot.measured for shot in taken):
-            root.extend(write_table(writer, taken, plane, found.center))
+        if plane and flash:
+            root.extend(write_table(writer, taken, plane, found.center, flash.room))
         write_file(work / "options.json", json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:

@@ -23,7 +23,7 @@ from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import box_in, kept_masks
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.views import camera_of
-from mi_ring.photogrammetry.workflow import PAPER, Sheet, cameras_beside, find_sheet, require_sides, upright
+from mi_ring.photogrammetry.workflow import cameras_beside, find_sheet, require_sides, upright
 from mi_ring.system import command
 from mi_ring.system.progress import progress
 
@@ -175,22 +175,6 @@ def test_mistakes_of_the_user(arguments, words, folder, tmp_path, capsys, monkey
         command.run("mi_ring.photos", photos.main, [a.format(folder=folder) for a in arguments])
     message = capsys.readouterr().err.splitlines()[-1]
     assert stop.value.code == 2 and words in message
-
-
-def test_the_sheet_tells_how_strong_the_flash_is():
-    """Paper of that albedo under a light of known strength is as bright as Lambert's law says, but in a shadow."""
-    pose, flash = np.eye(4), np.array([-20.0, 15.0, 4.0])
-    pose[:3, :3] = Rotation.from_euler("xyz", [170, 12, 40], degrees=True).as_matrix()
-    pose[:3, 3] = [30.0, -40.0, 300.0]
-    rgb = np.array([2e5, 1.5e5, 1e5])
-    places = np.array([[10.0, 20, 0], [70, -60, 0], [-80, 30, 0], [5, 90, 0], [-40, -90, 0]])
-    way = pose[:3, :3] @ flash + pose[:3, 3] - places
-    away = np.linalg.norm(way, axis=1)
-    radiance = PAPER / np.pi * rgb * (way[:, 2] / away**3)[:, None]
-    radiance[3] *= 0.05
-    sheet = Sheet({}, {"a": (places, radiance)})
-    motion = Motion({"a": (LENS, pose)}, np.zeros((0, 3)), None, {})
-    np.testing.assert_allclose(sheet.strengths(motion, {"a": flash})["a"], rgb)
 
 
 def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin():

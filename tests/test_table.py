@@ -120,8 +120,11 @@ def albedo(points):
     return np.stack([0.4 + 0.02 * x, 0.5 - 0.015 * y, 0.3 + 0.005 * x + 0.01 * y], -1)
 
 
-def photographs_of_a_table():
-    """A tilted plane, flashes beside the lenses, an object that hides it and casts shadows: pose, flash, sRGB, mask."""
+def photographs_of_a_table(falloff=0.0, room=0.0):
+    """A tilted plane, flashes beside the lenses, an object that hides it and casts shadows: pose, flash, sRGB, mask.
+
+    The flashes shine like a power of the cosine from where the cameras look; `room`: irradiance by their intensity.
+    """
     random = np.random.default_rng(4)
     for pose in poses(14):
         camera = camera_of(LENS, pose)
@@ -131,7 +134,8 @@ def photographs_of_a_table():
         points = camera.position + t[:, None] * rays
         way = flash.vector - points
         away = np.linalg.norm(way, axis=1, keepdims=True)
-        radiance = albedo(points) / np.pi * flash.rgb * (way @ UP)[:, None] / away**3
+        cone = ((-way / away) @ pose[:3, 2]).clip(1e-3)[:, None] ** falloff
+        radiance = albedo(points) / np.pi * flash.rgb * (cone * (way @ UP)[:, None] / away**3 + room)
         radiance[random.uniform(size=len(t)) < 0.1] *= 0.05  # shadows
         object_ = np.isfinite(hit_ellipsoid(camera)[0])
         radiance[object_] = 0.4
@@ -140,11 +144,12 @@ def photographs_of_a_table():
         yield pose, flash, srgb.reshape(*mask.shape, 3), mask
 
 
-def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows():
-    taken, flashes, pictures, hidden = zip(*photographs_of_a_table())
+@pytest.mark.parametrize(("falloff", "room"), [(0.0, 0.0), (2.5, 8e-4)])
+def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows(falloff, room):
+    taken, flashes, pictures, hidden = zip(*photographs_of_a_table(falloff, room))
     views = [view(str(k), pose, srgb) for k, (pose, srgb) in enumerate(zip(taken, pictures))]
     ground = Ground(PLANE, CENTER, 5.0, 40)
-    found = reflectance(views, flashes, hidden, ground)
+    found = reflectance(views, flashes, hidden, ground, falloff, np.full(3, room))
     near = np.linalg.norm(ground.points - CENTER, axis=1).reshape(40, 40) < 6
     assert np.median(np.abs(found - albedo(ground.points).reshape(found.shape))[near]) < 0.01
     assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground) is None
@@ -168,7 +173,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
         light = flash._replace(rgb=brightness * flash.rgb)
         shots.append(Shot(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
     writer = Writer(tmp_path / "capture/scene.xml")
-    root = scene_element(write_table(writer, shots, PLANE, CENTER))
+    root = scene_element(write_table(writer, shots, PLANE, CENTER, np.zeros(3)))
     writer.finish(scene_bytes(root))
     writer.close()
     _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False))

@@ -27,6 +27,15 @@ OFF = 0.002  #: of a photograph's longer side: a corner so far from where other 
 Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
 
 
+#: Where paper is white, in squares from the first corner of one: half way between its edge and its marker's, one side
+#: after another; and in the page's margin left, right and above.
+INNER = (1 - MARKER) / 4
+RIM = np.linspace(INNER, 1 - INNER, 9)[:, None] * [1, 0] + [0, INNER]
+RIMS = np.concatenate([RIM, RIM[:, ::-1], 1 - RIM, 1 - RIM[:, ::-1]])
+BESIDE = np.array([[-1.2, 0.5], [2.2, 0.5], [0.5, -1.2]])  # a line is printed below
+PATCH = np.stack(np.meshgrid(np.linspace(-0.08, 0.08, 5), np.linspace(-0.08, 0.08, 5)), -1).reshape(-1, 2)
+
+
 class Sighting(NamedTuple):
     """Corners of squares in a photograph. Frame: origin in the sheet's middle, x right, y up, z out of the paper."""
 
@@ -247,32 +256,47 @@ def umeyama(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.
 
 
 def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarray]:
-    """White squares of which a photograph (H, W, 3) float32 shows all four corners: middles (n, 3) and colours (n, 3).
+    """White paper that a photograph (H, W, 3) float32 shows: places (n, 3) and colours (n, 3).
 
-    But for those that are too bright for the file to tell how bright.
+    In white squares about the markers, and in the page's margin beside the outermost squares; where all four corners
+    are seen that tell where that is, and where it is not too bright for the file to tell how bright.
 
-    Middles are on the sheet, as the sighting has them; colours are linear, medians about the markers.
+    Places are on the sheet, as the sighting has them; colours are linear, medians.
     """
     pixels = dict(zip(sighting.ids.tolist(), sighting.pixels))
     places = dict(zip(sighting.ids.tolist(), sighting.points))
-    inner = (1 - MARKER) / 4  # half way between the square's edge and the marker's, in squares
-    rim = np.linspace(inner, 1 - inner, 9)[:, None] * [1, 0] + [0, inner]
-    rims = np.concatenate([rim, rim[:, ::-1], 1 - rim, 1 - rim[:, ::-1]])
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
-    middles, colours = [], []
+    found, colours = [], []
+
+    def note(place: np.ndarray, colour: np.ndarray) -> None:
+        if colour.max() < CLIPPED:
+            found.append(place)
+            colours.append(colour)
+
     for corner in pixels:
-        ring = [corner, corner + 1, corner + COLUMNS - 1, corner + COLUMNS]
         row, column = divmod(corner, COLUMNS - 1)
-        if (row + column) % 2 == 0 or column == COLUMNS - 2 or not all(k in pixels for k in ring):
+        ring = [corner, corner + 1, corner + COLUMNS - 1, corner + COLUMNS]
+        if column == COLUMNS - 2 or not all(k in pixels for k in ring):
             continue
         four = np.array([pixels[k] for k in ring], np.float32)
-        if inner * min(np.linalg.norm(four[1] - four[0]), np.linalg.norm(four[2] - four[0])) < 1:  # [px]: too blurred
+        first, right, down, _ = (places[k] for k in ring)
+        across = np.stack([right - first, down - first])
+        if INNER * min(np.linalg.norm(four[1] - four[0]), np.linalg.norm(four[2] - four[0])) < 1:  # [px]: too blurred
             continue
         plane = cv2.getPerspectiveTransform(unit, four)
-        at = (cv2.perspectiveTransform(rims[None], plane) - 0.5).astype(np.float32)  # (1, n, 2)
-        seen = cv2.remap(linear, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        colour = np.median(seen[0], 0)
-        if colour.max() < CLIPPED:
-            middles.append(np.mean([places[k] for k in ring], 0))
-            colours.append(colour)
-    return np.array(middles).reshape(-1, 3), np.array(colours).reshape(-1, 3)
+        if (row + column) % 2:
+            # Seen at a slant two opposite sides are so narrow that they mix with what is black beside them.
+            sides = np.median(sampled(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
+            note(first + [0.5, 0.5] @ across, sides[sides.sum(1).argmax()])
+        for beside, outermost in zip(BESIDE, (column == 0, column == COLUMNS - 3, row == 0)):
+            patch = sampled(linear, beside + PATCH, plane)
+            if outermost and np.isfinite(patch).all():
+                note(first + beside @ across, np.median(patch, 0))
+    return np.array(found).reshape(-1, 3), np.array(colours).reshape(-1, 3)
+
+
+def sampled(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """A photograph (H, W, 3) at points (n, 2) that a homography (3, 3) takes to pixels: (n, 3), NaN beyond."""
+    at = (cv2.perspectiveTransform(points[None], plane) - 0.5).astype(np.float32)
+    x, y = np.ascontiguousarray(np.moveaxis(at, -1, 0))  # (1, n): of one axis they mean other things to versions
+    return cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[np.nan] * 4)[0]

@@ -204,7 +204,10 @@ def axes_of(orientation: int) -> np.ndarray:
 
 
 def turned_with(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name."""
+    """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name.
+
+    Several are the columns of a matrix (3, n).
+    """
     usual, _ = Counter(picture.held for picture in pictures).most_common(1)[0]
     return {p.name: p.axes @ axes_of(usual).T @ vector for p in pictures}
 

@@ -36,6 +36,7 @@ class Shot:
     mask: np.ndarray | None  #: (h, w) uint8 of all of the undistorted photograph, perhaps reduced
     light: Light
     measured: bool = False  #: does the sheet tell how strong the light is?
+    falloff: float = 0.0  #: exponent of the flash's cone
 
 
 def windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
@@ -81,13 +82,17 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
         valid = writer.relative(writer.image(f"valid/{picture.name}", white[..., None]))
     camera = camera_of(shot.lens, shot.pose)
     camera = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
-    return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid)
+    return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid,
+                              falloff=shot.falloff)  # fmt: skip
 
 
-def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray) -> list[Element]:
+def write_table(
+    writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray, room: np.ndarray
+) -> list[Element]:  # fmt: skip
     """A `table`, for the light that it reflects onto the object at `center` (3,), and its picture.
 
-    None of it if no photograph shows it. The lights must be as strong as the shots say.
+    `room` (3,): irradiance by the room's light, by the flashes' intensity. None of it if no photograph shows the table.
+    The lights must be as strong as the shots say.
     """
 
     def seen(shot: Shot) -> tuple[View, np.ndarray, Light]:
@@ -104,7 +109,7 @@ def write_table(writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.
     views, hidden, lights = zip(*in_threads(seen, shots))
     away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     ground = Ground(plane, center, TABLE_REACH * away, TABLE_TEXELS)
-    albedo = reflectance(views, lights, hidden, ground)
+    albedo = reflectance(views, lights, hidden, ground, shots[0].falloff, room)
     if albedo is None:
         return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
+from mi_ring.photogrammetry.flash import irradiance
 from mi_ring.photogrammetry.views import View
 from mi_ring.rendering.lights import Light
 from mi_ring.system.machine import in_threads
@@ -122,21 +123,23 @@ class Ground:
 
 
 def reflectance(
-    views: Sequence[View], lights: Sequence[Light], hidden: Sequence[np.ndarray], ground: Ground
+    views: Sequence[View], lights: Sequence[Light], hidden: Sequence[np.ndarray], ground: Ground, falloff: float = 0.0,
+    room: np.ndarray | float = 0.0,
 ) -> np.ndarray | None:  # fmt: skip
     """(texels, texels, 3) diffuse albedo of the ground in views under these lights; None if they show nothing of it.
 
-    `hidden` (H, W): where something may hide it from a view. The median of the views, in few of which a place is in a
-    shadow or shines; where none shows it, the median of the rest.
+    `hidden` (H, W): where something may hide it from a view; `falloff`: exponent of the flashes' cones; `room` (3,):
+    irradiance by the room's light, by the intensity of the lights. The median of the views, in few of which a place is
+    in a shadow or shines; where none shows it, the median of the rest.
     """
     found = np.full((len(views), ground.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
         row, column, inside = view.places(ground.points)
         inside &= (mask[row, column] == 0) & (view.rgb[row, column].max(-1) < 255)
-        way = light.vector - ground.points[inside]
-        distance = np.linalg.norm(way, axis=1, keepdims=True)
-        received = light.rgb * (way @ ground.normal)[:, None] / distance**3
-        own[inside] = np.where(received > 0, np.pi * view.linear[row, column][inside] / received, np.nan)
+        way, forward = light.vector - ground.points[inside], view.camera.forward
+        direct = irradiance(way, ground.normal, forward, falloff)[:, None]
+        seen = np.pi * view.linear[row, column][inside]
+        own[inside] = np.where(direct > 0, seen / (light.rgb * np.maximum(direct + room, 1e-12)), np.nan)
     albedo = median(found)
     known = np.isfinite(albedo).all(1)
     if not known.any():

@@ -17,10 +17,11 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
+from mi_ring.photogrammetry.flash import Ball, Flash, find_flash
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, model_points, structure_from_motion
 from mi_ring.photogrammetry.object import Object
-from mi_ring.photogrammetry.scene import Shot
+from mi_ring.photogrammetry.scene import OBJECT, Shot, reduction
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.trial import DIM
 from mi_ring.rendering.lights import Light
@@ -30,7 +31,6 @@ from mi_ring.system.progress import Progress
 
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
-PAPER = 0.8  #: albedo of white paper
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -71,21 +71,6 @@ class Sheet(NamedTuple):
 
     sightings: dict[str, Sighting]  #: by the photograph's name
     white: dict[str, tuple[np.ndarray, np.ndarray]]  #: by the same, what `mi_ring.photogrammetry.board.white` says
-
-    def strengths(self, motion: Motion, flash: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Intensities (3,) of the flash that make the paper as bright as it is, by the photograph's name.
-
-        `motion` is in the frame of the sheet, `flash` (3,) in each camera's axes. They are those of the exposure and
-        the white balance, too.
-        """
-        found = {}
-        for name in self.white.keys() & motion.cameras.keys():
-            pose, (places, colours) = motion.cameras[name][1], self.white[name]
-            way = pose[:3, :3] @ flash[name] + pose[:3, 3] - places
-            falloff = way[:, 2:] / np.linalg.norm(way, axis=1, keepdims=True) ** 3
-            if len(places) and (way[:, 2] > 0).all():
-                found[name] = np.median(np.pi / PAPER * colours / falloff, 0)  # some squares are in a shadow
-        return found
 
 
 def require_read(pictures: Sequence[Picture], found: Sequence[object]) -> None:
@@ -211,21 +196,42 @@ def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
     return Motion(cameras, np.zeros((0, 3)), float(np.mean(errors)), failed, "the sheet")
 
 
-def shots(
-    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, sheet: Sheet | None
-) -> list[Shot]:
-    """The photographs of the scene, in its frame; the flash's `offset` (3,) is in the camera's axes [scene units].
+def flash_of(
+    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, sheet: Sheet
+) -> Flash | None:  # fmt: skip
+    """What the sheet tells of the flash, about so far from the lens (3,), and of the room; None if it tells nothing."""
+    poses = {name: pose for name, (_, pose) in motion.cameras.items()}
+    taken = [picture for picture in pictures if picture.name in poses]
+    exposures = dict(zip((picture.name for picture in taken), relative_exposures(taken)))
+    return find_flash(sheet.white, poses, turned_with(pictures, np.eye(3)), exposures, offset, ball_of(motion, object_))
 
-    The sheet tells how strong it is. Without one that is not known, and it is made so weak that fits see that it isn't.
+
+def ball_of(motion: Motion, object_: Object) -> Ball | None:
+    """A ball in the object's place that looks as large in the middle of the photographs; None if it has no mask."""
+    radii = []
+    for name, mask in object_.masks.items():
+        lens, pose = motion.cameras[name]
+        size = np.sqrt((mask == OBJECT).sum() / np.pi) * reduction(mask, lens.size) / lens.focal[0]
+        radii.append(size * np.linalg.norm(pose[:3, 3] - object_.center))
+    return Ball(object_.center, float(np.median(radii))) if radii else None
+
+
+def shots(
+    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, flash: Flash | None
+) -> list[Shot]:
+    """The photographs of the scene, in its frame; the `offset` (3,) of a flash is in the camera's axes [scene units].
+
+    The sheet tells where it is and how strong. Without one neither is known, and it is made so weak that fits see it.
     """
-    flash = turned_with(pictures, offset)
-    known = sheet.strengths(motion, flash) if sheet else {}
+    places = turned_with(pictures, flash.offset if flash else offset)
+    known = flash.intensities if flash else {}
     away = np.median([np.linalg.norm(pose[:3, 3] - object_.center) for _, pose in motion.cameras.values()])
     usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM * away**2)
     result, taken = [], [picture for picture in pictures if picture.name in motion.cameras]
     for picture, exposure in zip(taken, relative_exposures(taken)):
         lens, pose = motion.cameras[picture.name]
         name = picture.name
-        light = Light("point", pose[:3, :3] @ flash[name] + pose[:3, 3], known.get(name, exposure * usual))
-        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, name in known))
+        light = Light("point", pose[:3, :3] @ places[name] + pose[:3, 3], known.get(name, exposure * usual))
+        falloff = flash.falloff if flash else 0.0
+        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, name in known, falloff))
     return result
