@@ -116,7 +116,7 @@ def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkey
     assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK]) == 0
     page = (tmp_path / "run" / "report.html").read_text()
     assert "12; below are 5 of them" in page and page.count('class="photograph"') == 5
-    assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 160)
+    assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 16 + 160)  # a line says what is green
 
 
 def test_fit_finds_the_ellipsoid(finished):

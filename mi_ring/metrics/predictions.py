@@ -3,7 +3,7 @@
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
@@ -29,9 +29,7 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
         predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
         seen = capture.observe([k])
         observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))
-        telling = np.ones(predicted.shape[:2], bool) if seen.valid is None else seen.valid[0].numpy()
-        if seen.masked[0] and capture.lit_room:
-            telling = telling & (seen.mask[0].numpy() > 0.99)
+        telling = comparable(capture, seen)
         if not telling.any():
             views.append({"name": name})
             continue
@@ -41,6 +39,14 @@ def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[st
     similar = [view["ssim"] for view in views if "ssim" in view]
     totals = decibels(np.mean(squares)) if squares else {}
     return totals | ({"ssim": float(np.mean(similar))} if similar else {}), views
+
+
+def comparable(capture: Capture, seen: Observation) -> np.ndarray:
+    """(H, W) bool: which pixels of the first photograph seen can be as predicted."""
+    telling = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
+    if seen.masked[0] and capture.lit_room:
+        return telling & (seen.mask[0].numpy() > 0.99)
+    return telling
 
 
 def decibels(square: float) -> dict[str, float]:

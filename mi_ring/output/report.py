@@ -20,6 +20,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.metrics.captures import moved_far
+from mi_ring.metrics.predictions import comparable
 from mi_ring.output import calibration_panel
 from mi_ring.output.figures import svg_uri
 from mi_ring.rendering import bridge
@@ -61,11 +62,12 @@ def report_html(
         rows.append(row)
         errors.append(error)
     masked = [row.iou for row in rows if row.iou is not None]
+    pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, all pixels, 4 samples each)",
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, {pixels}, 4 samples each)",
         "Silhouettes": (
             f"{np.mean(masked):.4f} intersection over union with the masks"
             if masked
@@ -162,7 +164,7 @@ def sides(x: float, y: float) -> str:
 
 
 def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k` of the calibrated capture, and its mean squared error over all pixels as sRGB."""
+    """The row of photograph `k` of the calibrated capture; its mean squared error as sRGB, where that tells something."""
     seen = capture.observe([k])
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
@@ -189,7 +191,8 @@ def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
-    error = float(np.mean((photo[valid] - guess[valid]) ** 2))
+    telling = comparable(capture, seen)
+    error = float(np.mean((photo - guess)[telling if telling.any() else valid] ** 2))
     row = PhotographPanel(
         name=capture.names[k],
         psnr=-10 * np.log10(max(error, 1e-10)),

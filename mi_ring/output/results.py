@@ -95,8 +95,9 @@ def write_inputs(path: Path, fit: Any) -> None:
     fit.surface.show(fit.ring, s, faces)
     some = fit.capture.spread()
     columns = min(10, len(some))
-    cell = 160
-    sheet = Image.new("RGB", (columns * cell, -(-len(some) // columns) * cell))
+    cell, line = 160, 16
+    sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
+    ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for place, k in enumerate(some):
         scale = max(1, max(fit.capture.sensors[k].size) // cell)
         observed = fit.capture.observe([k], scale)[0]
@@ -105,7 +106,7 @@ def write_inputs(path: Path, fit: Any) -> None:
         picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
         picture.thumbnail((cell, cell))
         ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
-        sheet.paste(picture, (place % columns * cell, place // columns * cell))
+        sheet.paste(picture, (place % columns * cell, line + place // columns * cell))
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG")
     write_file(path, buffer.getvalue())

@@ -83,6 +83,12 @@ class Picture:
         """(3, 3): from the axes of the sensor, x right, y down, z forward, to those of `pixels`."""
         return axes_of(self.held if self.upright or self.path.suffix.lower() in HEIF else 1)
 
+    @cached_property
+    def exposure(self) -> float:
+        """By EXIF, NaN where it says nothing."""
+        found = exposure_of(exif_of(self.path).get_ifd(ExifTags.IFD.Exif)) or 0.0
+        return found if found > 0 else np.nan
+
     @property
     def encoding(self) -> str:
         """`linear` or `srgb`: what the numbers mean."""
@@ -269,8 +275,7 @@ def focal_35mm(pictures: Sequence[Picture]) -> float | None:
 
 def exposures(pictures: Sequence[Picture]) -> np.ndarray:
     """(N,) by EXIF, NaN where it says nothing."""
-    found = [exposure_of(exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)) or np.nan for picture in pictures]
-    return np.where(np.greater(found, 0), found, np.nan)
+    return np.array([picture.exposure for picture in pictures])
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
