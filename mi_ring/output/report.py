@@ -164,7 +164,7 @@ def sides(x: float, y: float) -> str:
 
 
 def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k` of the calibrated capture; its mean squared error as sRGB, where that tells something."""
+    """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
     seen = capture.observe([k])
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
