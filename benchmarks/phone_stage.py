@@ -38,7 +38,7 @@ PAGE = np.array([210.0, 297.0])  #: A4 [mm]
 BOARD = (9, 13, 20.0, 15.0)  #: squares across and down, their side and that of a marker [mm]
 PAPER, INK = 0.8, 0.05  #: albedos
 TABLE, THICKNESS = np.array([1400.0, 1100.0]), 0.1  #: of the table; of the sheet above it [mm]
-FINER, STRIDE = 9, 1_000_003  #: times as many paths where the object is, and between their seeds
+FINE, STRIDE = 36, 1_000_003  #: paths per pixel where the object is, at least; between the seeds of their rounds
 BACKDROP = 500.0  #: how far behind the turntable it stands [mm]
 ROOM_COLOUR = np.array([1.12, 1.0, 0.88])  #: of the light in the room; the flash is white
 
@@ -322,6 +322,9 @@ class Stage:
             # Rare paths that meet the flash in a highlight would be white dots.
             return [d + dr.clip(a - d, 0, self.brightest) for a, d in zip(everything, direct)]
 
+        if self.bare:
+            window = shot.around(self.mesh.vertices)
+            return averaged(flashed(window, spp, seed), shot, window, spp)
         return self.pictured(flashed, shot, spp, seed)
 
     def room_radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
@@ -337,13 +340,11 @@ class Stage:
         What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
         which no photograph has, and darker to all who ask for medians.
         """
-        near, rounds = shot.around(self.mesh.vertices), 1 if self.bare else FINER
+        whole, near = (0, 0, *shot.camera.size), shot.around(self.mesh.vertices)
+        picture = averaged(traced(whole, spp, seed), shot, whole, spp)
+        rounds = range(-(-FINE // spp))
+        fine = np.mean([averaged(traced(near, spp, seed + k * STRIDE), shot, near, spp) for k in rounds], 0)
         left, top, right, bottom = near
-        picture = 0.0 if self.bare else averaged(traced((0, 0, *shot.camera.size), spp, seed), shot,
-                                                 (0, 0, *shot.camera.size), spp)  # fmt: skip
-        fine = np.mean([averaged(traced(near, spp, seed + k * STRIDE), shot, near, spp) for k in range(rounds)], 0)
-        if self.bare:
-            return fine
         picture[top:bottom, left:right] = fine[top:bottom, left:right]
         return picture
 

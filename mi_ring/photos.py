@@ -22,7 +22,7 @@ from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
 from mi_ring.photogrammetry.flash import Flash
-from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, ups, without_exposure
+from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, unlit, ups, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
 from mi_ring.photogrammetry.scene import windows, write_shot, write_table
@@ -59,8 +59,8 @@ class PhotosConfig:
     """Folder to write: scene.xml, with what belongs to it; work/ holds what has been found so far."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the flash from the lens, in the camera's axes (x right, y down, z forward) as most photographs are shown: of
-    those held otherwise it turns with the camera [mm with a sheet; else the unit is the median distance from the
-    cameras to the object]."""
+    those held otherwise it turns with the camera [mm with a sheet, which tells it more exactly; else the unit is the
+    median distance from the cameras to the object]."""
     turntable: bool = False
     """Did the object turn, with the sheet under it, while camera and flash stood?"""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
@@ -115,7 +115,9 @@ def flash_report(flash: Flash, motion: Motion, found: Object) -> str:
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
     share = (flash.room * away**2).mean()
-    return f"Flash, by the sheet: {where}; the room's light on the sheet is {share:.1%} of its light"
+    where += f", shines like the cosine to the power of {flash.falloff:.1f}"
+    return (f"Flash, by the sheet in {len(flash.intensities)} photographs: {where}; the room's light on the sheet is "
+            f"{share:.1%} of its light at the object")  # fmt: skip
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -162,6 +164,9 @@ def made_by(out: Path) -> list[str] | None:
 def make(config: PhotosConfig, scene: Path) -> None:
     """The capture, from what has been found so far."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
+    if dark := unlit(pictures):
+        print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
+        pictures = [picture for picture in pictures if picture.path.name not in dark]
     if isinstance(config.masks, Path):  # before all the work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):

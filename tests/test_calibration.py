@@ -310,6 +310,26 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
     np.testing.assert_allclose(falloff, 2 * widths["falloff"], rtol=1e-5)
 
 
+def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_capture, tmp_path):
+    """Their axes are turned against the camera's, as `photos` turns them: what moves the flash moves all of it alike."""
+    quarters = iter([0, 1, 0, 0, 3, 2] + [0] * 6)
+
+    def turn(element):
+        matrix = element.find(".//matrix")
+        pose = np.array(matrix.get("value").split(), float).reshape(4, 4)
+        pose[:3, :3] @= Rotation.from_euler("z", 90 * next(quarters), degrees=True).as_matrix()
+        matrix.set("value", " ".join(map(repr, pose.ravel().tolist())))
+
+    captures = [mi_ring.load_capture(path) for path in (small_capture, edited(small_capture, tmp_path / "held", turn))]
+    both = [Calibration(capture, ("light", "falloff"), CENTER, 0.3) for capture in captures]
+    for calibration in both:
+        assert calibration.flash is not None
+        with torch.no_grad():
+            calibration.light[0] = tensor([0.5, -0.3, 0.2])
+    upright, held = (calibration().places.detach().numpy() for calibration in both)
+    np.testing.assert_allclose(held, upright, rtol=1e-5, atol=1e-4)
+
+
 def test_prior_expects_one_half_of_each_unknown(small_capture):
     calibration = Calibration(mi_ring.load_capture(small_capture), ("cameras",), CENTER, 0.3)
     with torch.no_grad():

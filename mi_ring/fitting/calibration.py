@@ -69,6 +69,17 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     return tuple(name for name in UNKNOWNS if name in names)
 
 
+def quarter_turns(places: Tensor, near: float) -> Tensor:
+    """(P, 3, 3) turns about the optical axis that take the first of places (P, 3) next to each.
+
+    None where they are `near` each other already.
+    """
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
+    turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
+    away = (turns @ places[0] - places[:, None]).norm(dim=-1)  # (P, 4)
+    return turns[torch.where(away[:, 0] < near, 0, away.argmin(1))]
+
+
 def overall(refined: Sequence[str], albedo: float) -> float:
     """The factor of the lights' power that `scale` begins with: 1, or what makes an impossible albedo a usual one."""
     return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0
@@ -108,8 +119,11 @@ class Calibration(nn.Module):
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
         self.distance = float(np.median(np.linalg.norm(to_world[:, :, 3] - center, axis=1)))
         inside = torch.einsum("pji,pj->pi", self.base.cameras[:, :, :3], self.base.places - self.base.cameras[:, :, 3])
+        #: (P, 3, 3) turns of the cameras' axes, of photographs that are held on their side
+        self.held = quarter_turns(inside, RIGID * self.distance)
+        level = (self.held.mT @ inside[..., None])[..., 0]
         #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
-        spread = float((inside.amax(0) - inside.amin(0)).max())
+        spread = float((level.amax(0) - level.amin(0)).max())
         self.flash = inside if self.finite.all() and spread < RIGID * self.distance else None
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
@@ -152,7 +166,8 @@ class Calibration(nn.Module):
             intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
         offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
-            places = cameras[:, :, 3] + (cameras[:, :, :3] @ (self.flash + offset * self.distance)[..., None])[..., 0]
+            moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
+            places = cameras[:, :, 3] + (cameras[:, :, :3] @ moved)[..., 0]
         else:
             moved = places + offset * torch.where(self.finite, self.distance, 1.0)
             places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))

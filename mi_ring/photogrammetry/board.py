@@ -22,18 +22,16 @@ FEWEST = 6  #: corners that are worth something
 STRAY = 0.25  #: of a square: a corner that is so far from where the others want it is something else
 FIT = 0.02  #: of the width that is seen: how well corners of a true sheet lie where they should
 CLIPPED = 0.95  #: of full scale, linear: a colour above may be brighter than a file can say
-OFF = 0.002  #: of a photograph's longer side: a corner so far from where other photographs see it is wrong
-
-Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
-
-
-#: Where paper is white, in squares from the first corner of one: half way between its edge and its marker's, one side
-#: after another; and in the page's margin left, right and above.
+#: Where paper is white, in squares from the first corner of a square: half way between its edge and its marker's, one
+#: side after another; and in the page's margin left, right and above, if that square is the outermost but one.
 INNER = (1 - MARKER) / 4
 RIM = np.linspace(INNER, 1 - INNER, 9)[:, None] * [1, 0] + [0, INNER]
 RIMS = np.concatenate([RIM, RIM[:, ::-1], 1 - RIM, 1 - RIM[:, ::-1]])
 BESIDE = np.array([[-1.2, 0.5], [2.2, 0.5], [0.5, -1.2]])  # a line is printed below
 PATCH = np.stack(np.meshgrid(np.linspace(-0.08, 0.08, 5), np.linspace(-0.08, 0.08, 5)), -1).reshape(-1, 2)
+OFF = 0.002  #: of a photograph's longer side: a corner so far from where other photographs see it is wrong
+
+Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
 
 
 class Sighting(NamedTuple):
@@ -255,24 +253,24 @@ def umeyama(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.
     return scale, matrix[:3, :3] / scale, matrix[:3, 3]
 
 
-def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarray]:
-    """White paper that a photograph (H, W, 3) float32 shows: places (n, 3) and colours (n, 3).
+class White(NamedTuple):
+    """White paper that a photograph shows."""
 
-    In white squares about the markers, and in the page's margin beside the outermost squares; where all four corners
-    are seen that tell where that is, and where it is not too bright for the file to tell how bright.
+    places: np.ndarray  #: (n, 3) on the sheet, as the sighting has them
+    colours: np.ndarray  #: (n, 3) linear
+    beside: np.ndarray  #: (n,) bool: in the margin? If that was cut off it is whatever the sheet lies on
 
-    Places are on the sheet, as the sighting has them; colours are linear, medians.
+
+def white(linear: np.ndarray, sighting: Sighting) -> White:
+    """White paper that a photograph (H, W, 3) float32 shows: white squares about the markers, and the page's margin.
+
+    Where all four corners are seen that tell where that is, and where it is not too bright for the file to tell how
+    bright. Colours are medians.
     """
     pixels = dict(zip(sighting.ids.tolist(), sighting.pixels))
     places = dict(zip(sighting.ids.tolist(), sighting.points))
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
-    found, colours = [], []
-
-    def note(place: np.ndarray, colour: np.ndarray) -> None:
-        if colour.max() < CLIPPED:
-            found.append(place)
-            colours.append(colour)
-
+    found: list[tuple[np.ndarray, np.ndarray, bool]] = []
     for corner in pixels:
         row, column = divmod(corner, COLUMNS - 1)
         ring = [corner, corner + 1, corner + COLUMNS - 1, corner + COLUMNS]
@@ -287,12 +285,14 @@ def white(linear: np.ndarray, sighting: Sighting) -> tuple[np.ndarray, np.ndarra
         if (row + column) % 2:
             # Seen at a slant two opposite sides are so narrow that they mix with what is black beside them.
             sides = np.median(sampled(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
-            note(first + [0.5, 0.5] @ across, sides[sides.sum(1).argmax()])
+            found.append((first + [0.5, 0.5] @ across, sides[sides.sum(1).argmax()], False))
         for beside, outermost in zip(BESIDE, (column == 0, column == COLUMNS - 3, row == 0)):
-            patch = sampled(linear, beside + PATCH, plane)
-            if outermost and np.isfinite(patch).all():
-                note(first + beside @ across, np.median(patch, 0))
-    return np.array(found).reshape(-1, 3), np.array(colours).reshape(-1, 3)
+            if outermost:
+                colour = np.median(sampled(linear, beside + PATCH, plane), 0)  # NaN if some of it is not seen
+                found.append((first + beside @ across, colour, True))
+    found = [(place, colour, beside) for place, colour, beside in found if colour.max() < CLIPPED]
+    where, colours, margin = zip(*found) if found else ((), (), ())
+    return White(np.reshape(where, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(margin, bool))
 
 
 def sampled(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:

@@ -284,11 +284,18 @@ def without_exposure(pictures: Sequence[Picture]) -> list[str]:
     return [] if missing.all() else [picture.path.name for picture, lacks in zip(pictures, missing) if lacks]
 
 
-def relative_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """(N,) by EXIF, 1 for the one in the middle, and where nothing is said."""
+def relative_exposures(pictures: Sequence[Picture], untold: float = 1.0) -> np.ndarray:
+    """(N,) by EXIF, 1 for the one in the middle, and `untold` where nothing is said."""
     found = exposures(pictures)
     known = np.isfinite(found)
-    return np.where(known, found / np.median(found[known]), 1.0) if known.any() else np.ones(len(found))
+    return np.where(known, found / np.median(found[known]) if known.any() else 1.0, untold)
+
+
+def unlit(pictures: Sequence[Picture]) -> list[str]:
+    """In which photographs the flash did not fire, by EXIF, where it fired in most; else in none: it may be a torch."""
+    fired = [exif_of(picture.path).get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.Flash) for picture in pictures]
+    off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
+    return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
 def exif_of(path: Path) -> Image.Exif:

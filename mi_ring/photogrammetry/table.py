@@ -139,7 +139,8 @@ def reflectance(
         way, forward = light.vector - ground.points[inside], view.camera.forward
         direct = irradiance(way, ground.normal, forward, falloff)[:, None]
         seen = np.pi * view.linear[row, column][inside]
-        own[inside] = np.where(direct > 0, seen / (light.rgb * np.maximum(direct + room, 1e-12)), np.nan)
+        with np.errstate(divide="ignore", invalid="ignore"):  # where nothing is lit
+            own[inside] = np.where(direct > 0, seen / (light.rgb * (direct + room)), np.nan)
     albedo = median(found)
     known = np.isfinite(albedo).all(1)
     if not known.any():

@@ -16,7 +16,7 @@ from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.photogrammetry.board import Board, Sighting, calibrate, white
+from mi_ring.photogrammetry.board import Board, Sighting, White, calibrate, white
 from mi_ring.photogrammetry.flash import Ball, Flash, find_flash
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
 from mi_ring.photogrammetry.motion import Motion, model_points, structure_from_motion
@@ -70,7 +70,7 @@ class Sheet(NamedTuple):
     """What photographs show of the printed sheet."""
 
     sightings: dict[str, Sighting]  #: by the photograph's name
-    white: dict[str, tuple[np.ndarray, np.ndarray]]  #: by the same, what `mi_ring.photogrammetry.board.white` says
+    white: dict[str, White]  #: by the same
 
 
 def require_read(pictures: Sequence[Picture], found: Sequence[object]) -> None:
@@ -108,10 +108,13 @@ def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progres
         require_read(pictures, found)
         known = {picture.name: values for picture, values in zip(pictures, found) if values}
         write_file(kept, json.dumps(known))
-    sightings = {n: Sighting(np.array(i), square * np.array(q), np.array(p)) for n, (i, q, p, *_) in known.items()}
+    sightings, papers = {}, {}
+    for name, (ids, points, pixels, places, colours, beside) in known.items():
+        sightings[name] = Sighting(np.array(ids), square * np.array(points), np.array(pixels))
+        papers[name] = White(square * np.reshape(places, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(beside, bool))
     if len(sightings) < FEWEST_SIGHTINGS:
         return None
-    return Sheet(sightings, {n: (square * np.array(m), np.array(c)) for n, (*_, m, c) in known.items() if m})
+    return Sheet(sightings, papers)
 
 
 def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
@@ -202,7 +205,7 @@ def flash_of(
     """What the sheet tells of the flash, about so far from the lens (3,), and of the room; None if it tells nothing."""
     poses = {name: pose for name, (_, pose) in motion.cameras.items()}
     taken = [picture for picture in pictures if picture.name in poses]
-    exposures = dict(zip((picture.name for picture in taken), relative_exposures(taken)))
+    exposures = dict(zip((picture.name for picture in taken), relative_exposures(taken, np.nan)))
     return find_flash(sheet.white, poses, turned_with(pictures, np.eye(3)), exposures, offset, ball_of(motion, object_))
 
 
@@ -221,12 +224,13 @@ def shots(
 ) -> list[Shot]:
     """The photographs of the scene, in its frame; the `offset` (3,) of a flash is in the camera's axes [scene units].
 
-    The sheet tells where it is and how strong. Without one neither is known, and it is made so weak that fits see it.
+    The sheet tells where it is and how strong. Without one it is where the offset says, and how strong is not known: it
+    is made so weak that fits see that.
     """
     places = turned_with(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
     away = np.median([np.linalg.norm(pose[:3, 3] - object_.center) for _, pose in motion.cameras.values()])
-    usual = np.median(list(known.values()), 0) if known else np.full(3, np.pi * object_.level / DIM * away**2)
+    usual = flash.power if flash else np.full(3, np.pi * object_.level / DIM * away**2)
     result, taken = [], [picture for picture in pictures if picture.name in motion.cameras]
     for picture, exposure in zip(taken, relative_exposures(taken)):
         lens, pose = motion.cameras[picture.name]
