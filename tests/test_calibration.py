@@ -311,7 +311,7 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
 
 
 def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_capture, tmp_path):
-    """Their axes are turned against the camera's, as `photos` turns them: what moves the flash moves all of it alike."""
+    """Their axes are turned against the camera's, as `photos` turns them: what moves the flash moves all alike."""
     quarters = iter([0, 1, 0, 0, 3, 2] + [0] * 6)
 
     def turn(element):

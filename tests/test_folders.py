@@ -22,11 +22,13 @@ from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
-from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with, ups
+from mi_ring.photogrammetry.flash import Flash
+from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with, unlit, ups
 from mi_ring.photogrammetry.matching import alike
-from mi_ring.photogrammetry.motion import structure_from_motion
+from mi_ring.photogrammetry.motion import Motion, structure_from_motion
+from mi_ring.photogrammetry.object import Object
 from mi_ring.photogrammetry.views import camera_of
-from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs
+from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs, shots
 from mi_ring.system.progress import progress
 
 pty = pytest.importorskip("pty")  # not on Windows
@@ -273,6 +275,48 @@ def test_the_flash_turns_with_the_camera(tmp_path):
     pictures = [Picture(tmp_path / f"{k}.jpg") for k in range(3)]
     found = turned_with(pictures, np.array([10.0, 0, 1]))
     np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
+
+
+def test_lights_are_those_that_the_sheet_tells(tmp_path):
+    """Also of a photograph that was held on its side, and of one that shows nothing of the sheet, by its exposure."""
+    for k, (orientation, seconds) in enumerate(((1, 0.01), (1, 0.02), (8, 0.02), (1, 0.04))):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        exif.get_ifd(ExifTags.IFD.Exif).update({0x829A: seconds, 0x829D: 2.0, 0x8827: 100})
+        Image.new("RGB", (6, 4)).save(tmp_path / f"{k}.jpg", exif=exif)
+    pictures = [Picture(tmp_path / f"{k}.jpg") for k in range(4)]
+    poses = {}
+    for k, picture in enumerate(pictures):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("zyx", [20 * k, 7, 150], degrees=True).as_matrix()
+        pose[:3, 3] = 10 * k, -5, 300
+        poses[picture.name] = (pose, np.array(picture.axes))
+    motion = Motion({name: (LENS, pose) for name, (pose, _) in poses.items()}, np.zeros((0, 3)), None, {})
+    flash = Flash(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), np.array([9.0, 8, 7]),
+                  {"0": np.array([4.0, 4, 4]), "1": np.array([9.0, 8, 8]), "2": np.array([9.0, 9, 9])})  # fmt: skip
+    taken = shots(pictures, motion, Object({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
+    for one, (pose, axes) in zip(taken, poses.values()):
+        np.testing.assert_allclose(one.light.vector, pose[:3, :3] @ axes @ flash.offset + pose[:3, 3])
+        assert one.falloff == 1.5
+    assert [one.measured for one in taken] == [True, True, True, False]
+    np.testing.assert_allclose(taken[2].light.rgb, 9)
+    np.testing.assert_allclose(taken[3].light.rgb, 2 * flash.power)  # 0.02 s are usual
+    alone = shots(pictures, motion, Object({}, np.zeros(3), 0.2, None), np.array([3.0, 0, 0]), None)
+    np.testing.assert_allclose(alone[0].light.vector, poses["0"][0][:3, 0] * 3 + poses["0"][0][:3, 3])
+    assert not any(one.measured for one in alone) and alone[0].falloff == 0
+
+
+def test_photographs_without_flash_are_told_among_those_with(tmp_path):
+    def write(name, fired):
+        exif = Image.Exif()
+        if fired is not None:
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.Flash] = fired
+        Image.new("RGB", (6, 4)).save(tmp_path / name, exif=exif)
+        return Picture(tmp_path / name)
+
+    pictures = [write(f"{k}.jpg", fired) for k, fired in enumerate((9, 16, 25, 9, None, 1))]
+    assert unlit(pictures) == ["1.jpg"]
+    assert unlit([pictures[1]] * 3 + [pictures[0]]) == []  # a torch does not fire
 
 
 def test_the_flash_and_up_are_as_photographs_are_shown_though_their_pixels_are_not_turned(tmp_path):
