@@ -116,8 +116,9 @@ def flash_report(flash: Flash, motion: Motion, found: Object) -> str:
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
     share = (flash.room * away**2).mean()
     where += f", shines like the cosine to the power of {flash.falloff:.1f}"
+    curve = f"; the camera's curve has the exponent {flash.gamma:.2f}" if flash.gamma != 1 else ""
     return (f"Flash, by the sheet in {len(flash.intensities)} photographs: {where}; the room's light on the sheet is "
-            f"{share:.1%} of its light at the object")  # fmt: skip
+            f"{share:.1%} of its light at the object{curve}")  # fmt: skip
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -219,7 +220,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         written = in_threads(partial(write_shot, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
-            root.extend(write_table(writer, taken, plane, found.center, flash.room))
+            root.extend(write_table(writer, taken, plane, found.center, flash))
         write_file(work / "options.json", json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:

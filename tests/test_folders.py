@@ -292,12 +292,12 @@ def test_lights_are_those_that_the_sheet_tells(tmp_path):
         pose[:3, 3] = 10 * k, -5, 300
         poses[picture.name] = (pose, np.array(picture.axes))
     motion = Motion({name: (LENS, pose) for name, (pose, _) in poses.items()}, np.zeros((0, 3)), None, {})
-    flash = Flash(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), np.array([9.0, 8, 7]),
+    flash = Flash(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), 1.2, np.array([9.0, 8, 7]),
                   {"0": np.array([4.0, 4, 4]), "1": np.array([9.0, 8, 8]), "2": np.array([9.0, 9, 9])})  # fmt: skip
     taken = shots(pictures, motion, Object({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
     for one, (pose, axes) in zip(taken, poses.values()):
         np.testing.assert_allclose(one.light.vector, pose[:3, :3] @ axes @ flash.offset + pose[:3, 3])
-        assert one.falloff == 1.5
+        assert (one.falloff, one.gamma) == (1.5, 1.2)
     assert [one.measured for one in taken] == [True, True, True, False]
     np.testing.assert_allclose(taken[2].light.rgb, 9)
     np.testing.assert_allclose(taken[3].light.rgb, 2 * flash.power)  # 0.02 s are usual

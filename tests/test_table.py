@@ -10,6 +10,7 @@ from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
+from mi_ring.photogrammetry.flash import Flash
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.scene import OBJECT, Shot, write_table
 from mi_ring.photogrammetry.table import Ground, Plane, reflectance
@@ -120,10 +121,15 @@ def albedo(points):
     return np.stack([0.4 + 0.02 * x, 0.5 - 0.015 * y, 0.3 + 0.005 * x + 0.01 * y], -1)
 
 
-def photographs_of_a_table(falloff=0.0, room=0.0):
+def flash_of(falloff=0.0, room=0.0, gamma=1.0):
+    return Flash(np.zeros(3), falloff, np.full(3, room), gamma, np.ones(3), {})
+
+
+def photographs_of_a_table(falloff=0.0, room=0.0, gamma=1.0):
     """A tilted plane, flashes beside the lenses, an object that hides it and casts shadows: pose, flash, sRGB, mask.
 
-    The flashes shine like a power of the cosine from where the cameras look; `room`: irradiance by their intensity.
+    The flashes shine like a power of the cosine from where the cameras look; `room`: irradiance by their intensity;
+    `gamma`: of the camera.
     """
     random = np.random.default_rng(4)
     for pose in poses(14):
@@ -139,20 +145,20 @@ def photographs_of_a_table(falloff=0.0, room=0.0):
         radiance[random.uniform(size=len(t)) < 0.1] *= 0.05  # shadows
         object_ = np.isfinite(hit_ellipsoid(camera)[0])
         radiance[object_] = 0.4
-        srgb = (255 * linear_to_srgb(radiance.clip(0, 1).astype(np.float32))).round().astype(np.uint8)
+        srgb = (255 * linear_to_srgb((radiance**gamma).clip(0, 1).astype(np.float32))).round().astype(np.uint8)
         mask = object_.reshape(LENS.size[::-1]).astype(np.uint8)
         yield pose, flash, srgb.reshape(*mask.shape, 3), mask
 
 
-@pytest.mark.parametrize(("falloff", "room"), [(0.0, 0.0), (2.5, 8e-4)])
-def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows(falloff, room):
-    taken, flashes, pictures, hidden = zip(*photographs_of_a_table(falloff, room))
+@pytest.mark.parametrize(("falloff", "room", "gamma"), [(0.0, 0.0, 1.0), (2.5, 8e-4, 1.2)])
+def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows(falloff, room, gamma):
+    taken, flashes, pictures, hidden = zip(*photographs_of_a_table(falloff, room, gamma))
     views = [view(str(k), pose, srgb) for k, (pose, srgb) in enumerate(zip(taken, pictures))]
     ground = Ground(PLANE, CENTER, 5.0, 40)
-    found = reflectance(views, flashes, hidden, ground, falloff, np.full(3, room))
+    found = reflectance(views, flashes, hidden, ground, flash_of(falloff, room, gamma))
     near = np.linalg.norm(ground.points - CENTER, axis=1).reshape(40, 40) < 6
     assert np.median(np.abs(found - albedo(ground.points).reshape(found.shape))[near]) < 0.01
-    assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground) is None
+    assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground, flash_of()) is None
 
 
 class Raw(Picture):
@@ -173,7 +179,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
         light = flash._replace(rgb=brightness * flash.rgb)
         shots.append(Shot(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
     writer = Writer(tmp_path / "capture/scene.xml")
-    root = scene_element(write_table(writer, shots, PLANE, CENTER, np.zeros(3)))
+    root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))
     writer.close()
     _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False))

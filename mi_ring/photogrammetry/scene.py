@@ -13,6 +13,7 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window, undistort
 from mi_ring.importers.writer import Writer
+from mi_ring.photogrammetry.flash import Flash
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.table import Ground, Plane, reflectance
 from mi_ring.photogrammetry.views import View, camera_of, reduced, whole_of
@@ -37,6 +38,7 @@ class Shot:
     light: Light
     measured: bool = False  #: does the sheet tell how strong the light is?
     falloff: float = 0.0  #: exponent of the flash's cone
+    gamma: float = 1.0  #: exponent of the camera's curve
 
 
 def windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
@@ -83,16 +85,15 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
     camera = camera_of(shot.lens, shot.pose)
     camera = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
     return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid,
-                              falloff=shot.falloff)  # fmt: skip
+                              gamma=shot.gamma, falloff=shot.falloff)  # fmt: skip
 
 
 def write_table(
-    writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray, room: np.ndarray
+    writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray, flash: Flash
 ) -> list[Element]:  # fmt: skip
     """A `table`, for the light that it reflects onto the object at `center` (3,), and its picture.
 
-    `room` (3,): irradiance by the room's light, by the flashes' intensity. None of it if no photograph shows the table.
-    The lights must be as strong as the shots say.
+    `flash`: what the lights of the shots have in common. None of it if no photograph shows the table.
     """
 
     def seen(shot: Shot) -> tuple[View, np.ndarray, Light]:
@@ -109,7 +110,7 @@ def write_table(
     views, hidden, lights = zip(*in_threads(seen, shots))
     away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     ground = Ground(plane, center, TABLE_REACH * away, TABLE_TEXELS)
-    albedo = reflectance(views, lights, hidden, ground, shots[0].falloff, room)
+    albedo = reflectance(views, lights, hidden, ground, flash)
     if albedo is None:
         return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from mi_ring.capture.outlines import disk, grown
 from mi_ring.images import srgb_to_linear
-from mi_ring.photogrammetry.flash import irradiance
+from mi_ring.photogrammetry.flash import Flash, irradiance
 from mi_ring.photogrammetry.views import View
 from mi_ring.rendering.lights import Light
 from mi_ring.system.machine import in_threads
@@ -123,24 +123,23 @@ class Ground:
 
 
 def reflectance(
-    views: Sequence[View], lights: Sequence[Light], hidden: Sequence[np.ndarray], ground: Ground, falloff: float = 0.0,
-    room: np.ndarray | float = 0.0,
+    views: Sequence[View], lights: Sequence[Light], hidden: Sequence[np.ndarray], ground: Ground, flash: Flash
 ) -> np.ndarray | None:  # fmt: skip
     """(texels, texels, 3) diffuse albedo of the ground in views under these lights; None if they show nothing of it.
 
-    `hidden` (H, W): where something may hide it from a view; `falloff`: exponent of the flashes' cones; `room` (3,):
-    irradiance by the room's light, by the intensity of the lights. The median of the views, in few of which a place is
-    in a shadow or shines; where none shows it, the median of the rest.
+    `hidden` (H, W): where something may hide it from a view; `flash`: what lights have in common. The median of the
+    views, in few of which a place is in a shadow or shines; where none shows it, the median of the rest. Light that the
+    object sends to the ground or keeps from it is not part of it.
     """
     found = np.full((len(views), ground.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
         row, column, inside = view.places(ground.points)
         inside &= (mask[row, column] == 0) & (view.rgb[row, column].max(-1) < 255)
         way, forward = light.vector - ground.points[inside], view.camera.forward
-        direct = irradiance(way, ground.normal, forward, falloff)[:, None]
-        seen = np.pi * view.linear[row, column][inside]
+        direct = irradiance(way, ground.normal, forward, flash.falloff)[:, None]
+        seen = np.pi * view.linear[row, column][inside] ** (1 / flash.gamma)
         with np.errstate(divide="ignore", invalid="ignore"):  # where nothing is lit
-            own[inside] = np.where(direct > 0, seen / (light.rgb * (direct + room)), np.nan)
+            own[inside] = np.where(direct > 0, seen / (light.rgb * (direct + flash.room)), np.nan)
     albedo = median(found)
     known = np.isfinite(albedo).all(1)
     if not known.any():

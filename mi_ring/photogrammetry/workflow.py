@@ -206,7 +206,9 @@ def flash_of(
     poses = {name: pose for name, (_, pose) in motion.cameras.items()}
     taken = [picture for picture in pictures if picture.name in poses]
     exposures = dict(zip((picture.name for picture in taken), relative_exposures(taken, np.nan)))
-    return find_flash(sheet.white, poses, turned_with(pictures, np.eye(3)), exposures, offset, ball_of(motion, object_))
+    raw = any(picture.encoding == "linear" for picture in taken)  # has no curve
+    return find_flash(sheet.white, poses, turned_with(pictures, np.eye(3)), exposures, offset, ball_of(motion, object_),
+                      curved=not raw)  # fmt: skip
 
 
 def ball_of(motion: Motion, object_: Object) -> Ball | None:
@@ -236,6 +238,6 @@ def shots(
         lens, pose = motion.cameras[picture.name]
         name = picture.name
         light = Light("point", pose[:3, :3] @ places[name] + pose[:3, 3], known.get(name, exposure * usual))
-        falloff = flash.falloff if flash else 0.0
-        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, name in known, falloff))
+        told = (name in known, flash.falloff, flash.gamma) if flash else ()
+        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, *told))
     return result
