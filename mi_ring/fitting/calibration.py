@@ -70,9 +70,9 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
 
 
 def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """(P, 3, 3) turns about the optical axis that take the first of places (P, 3) next to each.
+    """(P, 3, 3) quarter turns about the optical axis that take the first of places (P, 3) next to each.
 
-    None where they are `near` each other already.
+    The identity where they are `near` each other already.
     """
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
     turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])

@@ -238,6 +238,8 @@ def shots(
         lens, pose = motion.cameras[picture.name]
         name = picture.name
         light = Light("point", pose[:3, :3] @ places[name] + pose[:3, 3], known.get(name, exposure * usual))
-        told = (name in known, flash.falloff, flash.gamma) if flash else ()
-        result.append(Shot(picture, lens, pose, object_.masks.get(name), light, *told))
+        shot = Shot(picture, lens, pose, object_.masks.get(name), light)
+        if flash:
+            shot = replace(shot, measured=name in known, falloff=flash.falloff, gamma=flash.gamma)
+        result.append(shot)
     return result
