@@ -50,6 +50,7 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
 
 @pytest.mark.parametrize("amx", [True, False])
 def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, monkeypatch):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
     for precision, expected in (("auto", amx), ("bfloat16", True), ("float32", False)):
         with machine.autocast(precision, torch.device("cpu"))():
