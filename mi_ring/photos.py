@@ -137,7 +137,7 @@ def main(arguments: Sequence[str]) -> None:
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt:
         sys.stdout.flush()
-        print("mi_ring.photos: interrupted; the same command goes on", file=sys.stderr, flush=True)
+        print("interrupted; the same command goes on", file=sys.stderr, flush=True)
         os._exit(130)  # native threads do not let themselves be ended; what they write is whole or not at all
     finally:
         signal.signal(signal.SIGTERM, before)

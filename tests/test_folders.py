@@ -151,7 +151,7 @@ def test_an_interrupt_ends_native_work_in_one_line(number, photographs, tmp_path
     listener.join()
     os.close(ours)
     last = text.decode().replace("\r", "\n").split("\n")
-    assert [line for line in last if line.strip()][-1] == "mi_ring.photos: interrupted; the same command goes on"
+    assert [line for line in last if line.strip()][-1] == "interrupted; the same command goes on"
     assert b"Traceback" not in text and (tmp_path / "capture/work/sheet.json").exists()
 
 
@@ -208,6 +208,9 @@ def test_a_broken_photograph_may_be_replaced(tmp_path):
     require_same_photographs(find_pictures(tmp_path), work)
     Image.fromarray(np.full((24, 8, 3), 7, np.uint8)).save(tmp_path / "3.jpg")
     with pytest.raises(InputError, match="work: is of other photographs"):
+        require_same_photographs(find_pictures(tmp_path), work)
+    (work / "photographs.json").write_text(json.dumps({"00.png": [123, 1]}))  # as it was once
+    with pytest.raises(InputError, match="work: was begun by another version"):
         require_same_photographs(find_pictures(tmp_path), work)
 
 

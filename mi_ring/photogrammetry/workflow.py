@@ -31,17 +31,23 @@ from mi_ring.system.progress import Progress
 
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
+FORMAT = 2  #: of what is kept; more whenever it changes
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if what a folder holds was found in other photographs, or in these turned otherwise."""
+    """Raise InputError if what a folder holds was found in other photographs, in these turned otherwise, or long ago."""
     folder.mkdir(parents=True, exist_ok=True)
-    known, listed = folder / "photographs.json", {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
-    first = folder / "sheet.json"  # before it is there, nothing was found in them
-    if first.exists() and known.exists() and json.loads(known.read_text("utf-8")) != listed:
-        raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, or "
-                         "give another DIR")  # fmt: skip
-    write_file(known, json.dumps(listed))
+    kept, first = folder / "photographs.json", folder / "sheet.json"  # before this is there, nothing was found in them
+    photographs = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
+    if first.exists() and kept.exists():
+        known = json.loads(kept.read_text("utf-8"))
+        if known.get("format") != FORMAT:
+            raise InputError(f"{folder}: was begun by another version of mi_ring, which kept other things; remove it, "
+                             "or give another DIR")  # fmt: skip
+        if known["photographs"] != photographs:
+            raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, "
+                             "or give another DIR")  # fmt: skip
+    write_file(kept, json.dumps({"format": FORMAT, "photographs": photographs}))
 
 
 def upright(
