@@ -22,7 +22,7 @@ from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
 from mi_ring.photogrammetry.board import SQUARE, align
 from mi_ring.photogrammetry.flash import Flash
-from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, unlit, ups, without_exposure
+from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, models, unlit, ups, without_exposure
 from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
 from mi_ring.photogrammetry.scene import windows, write_shot, write_table
@@ -168,6 +168,10 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if dark := unlit(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
         pictures = [picture for picture in pictures if picture.path.name not in dark]
+    if len(cameras := models(pictures)) > 1:
+        kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
+        print(f"Cameras: of several models, by EXIF data ({kinds}), but all of one size are taken to share a lens, and "
+              "all to have their flash in one place beside it; better give photographs of one")  # fmt: skip
     if isinstance(config.masks, Path):  # before all the work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):

@@ -23,7 +23,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.photogrammetry.flash import Flash
-from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, turned_with, unlit, ups
+from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, models, turned_with, unlit, ups
 from mi_ring.photogrammetry.matching import alike
 from mi_ring.photogrammetry.motion import Motion, structure_from_motion
 from mi_ring.photogrammetry.object import Object
@@ -320,6 +320,15 @@ def test_photographs_without_flash_are_told_among_those_with(tmp_path):
     pictures = [write(f"{k}.jpg", fired) for k, fired in enumerate((9, 16, 25, 9, None, 1))]
     assert unlit(pictures) == ["1.jpg"]
     assert unlit([pictures[1]] * 3 + [pictures[0]]) == []  # a torch does not fire
+
+
+def test_models_of_cameras_are_told_apart(tmp_path):
+    for k, model in enumerate(("One", "Other", "One", None)):
+        exif = Image.Exif()
+        if model:
+            exif[ExifTags.Base.Model] = model
+        Image.new("RGB", (8, 6)).save(tmp_path / f"{k}.jpg", exif=exif)
+    assert models([Picture(tmp_path / f"{k}.jpg") for k in range(4)]) == {"One": 2, "Other": 1}
 
 
 def test_the_flash_and_up_are_as_photographs_are_shown_though_their_pixels_are_not_turned(tmp_path):

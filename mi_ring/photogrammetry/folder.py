@@ -75,7 +75,7 @@ class Picture:
                 return image.info.get("original_orientation") or 1
         if suffix in RAW:
             return FLIPS.get(read_as(self.path, "raw photograph", flip), 1)
-        value = exif_of(self.path).get(ExifTags.Base.Orientation)
+        value = self.exif.get(ExifTags.Base.Orientation)
         return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
     @property
@@ -84,9 +84,21 @@ class Picture:
         return axes_of(self.held if self.upright or self.path.suffix.lower() in HEIF else 1)
 
     @cached_property
+    def exif(self) -> Image.Exif:
+        """EXIF data, empty where there are none."""
+        try:
+            let_open(self.path)
+            with Image.open(self.path) as image:
+                exif = image.getexif()
+                exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+                return exif
+        except (OSError, SyntaxError):  # damaged, or a raw format that Pillow does not know
+            return Image.Exif()
+
+    @cached_property
     def exposure(self) -> float:
         """By EXIF, NaN where it says nothing."""
-        found = exposure_of(exif_of(self.path).get_ifd(ExifTags.IFD.Exif)) or 0.0
+        found = exposure_of(self.exif.get_ifd(ExifTags.IFD.Exif)) or 0.0
         return found if found > 0 else np.nan
 
     @property
@@ -266,8 +278,7 @@ def require_different(files: Sequence[Path]) -> None:
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
     """The focal length by EXIF, as of a frame 36 mm wide, of the first photograph that says; None if none does."""
     for picture in pictures:
-        exif = exif_of(picture.path).get_ifd(ExifTags.IFD.Exif)
-        value = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
+        value = picture.exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
         if isinstance(value, int | float) and value > 0:
             return float(value)
     return None
@@ -293,18 +304,11 @@ def relative_exposures(pictures: Sequence[Picture], untold: float = 1.0) -> np.n
 
 def unlit(pictures: Sequence[Picture]) -> list[str]:
     """In which photographs the flash did not fire, by EXIF, where it fired in most; else in none: it may be a torch."""
-    fired = [exif_of(picture.path).get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.Flash) for picture in pictures]
+    fired = [picture.exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
-def exif_of(path: Path) -> Image.Exif:
-    """EXIF data, empty where there are none."""
-    try:
-        let_open(path)
-        with Image.open(path) as image:
-            exif = image.getexif()
-            exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
-            return exif
-    except (OSError, SyntaxError):  # damaged, or a raw format that Pillow does not know
-        return Image.Exif()
+def models(pictures: Sequence[Picture]) -> dict[str, int]:
+    """With which models of camera, by EXIF, how many photographs were taken."""
+    return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

@@ -35,7 +35,7 @@ FORMAT = 2  #: of what is kept; more whenever it changes
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if what a folder holds was found in other photographs, in these turned otherwise, or long ago."""
+    """Raise InputError if what a folder holds was found in other photographs, or by another version."""
     folder.mkdir(parents=True, exist_ok=True)
     kept, first = folder / "photographs.json", folder / "sheet.json"  # before this is there, nothing was found in them
     photographs = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
