@@ -1,14 +1,15 @@
 """Captures whose calibration is wrong by a known amount: what refinement finds, and what it is worth.
 
-    python benchmarks/perturbed.py CAPTURE [MORE …] --wrong cameras|light|power [--by 0.5] [--seeds 0 1 2]
-        [--preset default] [--out out/perturbed]
+    python benchmarks/perturbed.py CAPTURE [MORE …] --wrong cameras|light|power|curve|contrast [--by 0.5]
+        [--seeds 0 1 2] [--fits exact wrong refined …] [--preset default] [--out out/perturbed]
 
 cameras: each turned about each of its axes by a normal angle of so many degrees, and moved along each by a normal share
 of so many per cent of its distance from the object. light: all flashes by so many per cent of that distance, in one
-random direction of the cameras' axes. power: each photograph's light by a lognormal factor of so many per cent. For
-each seed four fits: exact calibration as it is and refined, wrong calibration as it is and refined; in a table the
-normals' mean error after rigid alignment, and what is left of the perturbation. A capture is a folder with scene.xml
-and truth/mesh.ply.
+random direction of the cameras' axes. power: each photograph's light by a lognormal factor of so many per cent. curve,
+contrast: the exponent of the camera's curve, and how steep its S is, by a factor of 1 + so many per cent. For each
+seed up to four fits: exact calibration as it is and refined (`again`), wrong calibration as it is and refined; in a
+table the normals' mean error and the PSNR of novel views after rigid alignment, and what is left of the perturbation.
+A capture is a folder with scene.xml, truth/mesh.ply and truth/scene.xml. It goes on where it stopped.
 """
 
 import argparse
@@ -28,7 +29,9 @@ from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.lights import Lights
 
-REFINED = {"cameras": ["cameras"], "light": ["light"], "power": ["power"]}
+REFINED = "cameras", "light", "power", "curve", "contrast"
+#: Fits: is calibration wrong, and is it refined?
+FITS = {"exact": (False, False), "again": (False, True), "wrong": (True, False), "refined": (True, True)}
 
 
 def perturbed(capture, wrong: str, by: float, seed: int):
@@ -38,6 +41,8 @@ def perturbed(capture, wrong: str, by: float, seed: int):
     cameras, lights = [sensor.camera for sensor in capture.sensors], list(Lights.of(capture.sensors))
     direction = random.normal(size=3)
     direction /= np.linalg.norm(direction)
+    if wrong in ("curve", "contrast"):
+        return with_calibration(capture, cameras, lights, **{{"curve": "gamma"}.get(wrong, wrong): 1 + by / 100})
     for k, (camera, light) in enumerate(zip(cameras, lights)):
         distance = np.linalg.norm(camera.position - center)
         if wrong == "cameras":
@@ -72,19 +77,23 @@ def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list
         module = [sys.executable, "-m"]
         fit = [*module, "mi_ring.fit", scene, "--out", out, "--refine", *refine, *options]
         subprocess.run([str(a) for a in fit], check=True, stdout=sys.stderr)
-        evaluate = [*module, "mi_ring.evaluate", out, "--mesh", truth / "mesh.ply", "--align", "rigid", "--spp", 4]
+        evaluate = [*module, "mi_ring.evaluate", out, "--mesh", truth / "mesh.ply", "--novel", truth / "scene.xml",
+                    "--align", "rigid", "--spp", 4]  # fmt: skip
         done = subprocess.run([str(a) for a in evaluate], check=True, stdout=subprocess.PIPE)
         result.write_bytes(done.stdout)
     return json.loads(result.read_text())
 
 
 def left(true, found, wrong: str) -> float:
-    """What is left of the perturbation: [°] of cameras, [% of the distance] of lights, [%] of powers."""
+    """What is left of the perturbation: [°] of cameras, [% of the distance] of lights, [%] of powers and curves."""
     center, _ = true.sphere()
     a, b = ([sensor.camera for sensor in capture.sensors] for capture in (true, found))
     if wrong == "cameras":  # as a whole they may have turned
         turns = Rotation.from_matrix([x.to_world[:3, :3] @ y.to_world[:3, :3].T for x, y in zip(a, b)])
         return float(np.degrees(np.sqrt(np.mean((turns * turns.mean().inv()).magnitude() ** 2))))
+    if wrong in ("curve", "contrast"):
+        name = {"curve": "gamma"}.get(wrong, wrong)
+        return float(100 * (getattr(found.sensors[0], name) / getattr(true.sensors[0], name) - 1))
     lights = [Lights.of(capture.sensors) for capture in (true, found)]
     if wrong == "light":
         own = [
@@ -101,9 +110,10 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("captures", nargs="+", type=scene_file)
-    parser.add_argument("--wrong", choices=tuple(REFINED), required=True)
+    parser.add_argument("--wrong", choices=REFINED, required=True)
     parser.add_argument("--by", type=float, default=0.5)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--fits", nargs="+", choices=tuple(FITS), default=list(FITS))
     parser.add_argument("--out", type=Path, default=Path("out/perturbed"))
     options, rest = parser.parse_known_args()
     rows = []
@@ -115,13 +125,17 @@ def main() -> None:
             wrong = perturbed(true, options.wrong, options.by, seed)
             write(true, folder / "exact.xml")
             write(wrong, folder / "wrong.xml")
-            cells = [f"{name}, seed {seed}"]
-            for kind in ("exact", "wrong"):
-                for refine in (["none"], REFINED[options.wrong]):
-                    out = folder / f"{kind}_{refine[0]}"
-                    numbers = fitted(folder / f"{kind}.xml", out, truth, refine, [*rest, "--seed", str(seed)])
-                    cells.append(f"{numbers['normal_mean']:.2f}°, {numbers.get('psnr_input', np.nan):.1f} dB")
-            found = mi_ring.load_capture(out / "scene.xml", images=False)
+            cells, found = [f"{name}, seed {seed}"], wrong
+            for fit in options.fits:
+                is_wrong, is_refined = FITS[fit]
+                # Of exact calibration there is one fit, whatever else is wrong.
+                out = folder / fit if fit != "exact" else options.out / f"{name}_exact_{seed}"
+                scene = folder / ("wrong.xml" if is_wrong else "exact.xml")
+                refine = [options.wrong] if is_refined else ["none"]
+                numbers = fitted(scene, out, truth, refine, [*rest, "--seed", str(seed)])
+                cells.append(f"{numbers['normal_mean']:.2f}°, {numbers['psnr_novel']:.1f} dB")
+                if fit == "refined":
+                    found = mi_ring.load_capture(out / "scene.xml", images=False)
             cells.append(f"{left(true, wrong, options.wrong):.3f} → {left(true, found, options.wrong):.3f}")
             rows.append(cells)
             print(cells, file=sys.stderr, flush=True)
@@ -130,8 +144,7 @@ def main() -> None:
     speed = product_speed(4096, 4096, torch.float32) / 1e9
     print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.wrong} wrong by {options.by}; "
           f"mi_ring.fit {' '.join(rest)}\n")  # fmt: skip
-    heads = ["normals, photographs", "exact", "exact, refined", "wrong", "wrong, refined", "wrong by, before → after"]
-    print(table(heads, rows))
+    print(table(["normals, novel views", *options.fits, "wrong by, before → after"], rows))
 
 
 if __name__ == "__main__":

@@ -8,14 +8,16 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
+from scipy.spatial.transform import Rotation
 from trimesh.creation import box, icosphere, torus
 
 from mi_ring import evaluate, render
-from mi_ring.capture import loading, scenefile
+from mi_ring.capture import calibrated, loading, scenefile
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import predictions, surfaces
 from mi_ring.output import ply
 from mi_ring.rendering import crossings, plain_mesh
+from mi_ring.rendering.lights import Lights
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import run
@@ -83,6 +85,24 @@ def test_alignment_finds_the_motion_between_two_samplings_of_one_surface():
         found = surfaces.alignment(coarse, fine.copy().apply_transform(true), similarity)
         off = trimesh.transform_points(fine.vertices, found) - trimesh.transform_points(fine.vertices, true)
         assert np.linalg.norm(off, axis=1).max() < 0.15  # of 80; it was 2 off
+
+
+def test_photographs_move_with_the_truth(small_capture):
+    """A point is where it was in each, and as brightly lit."""
+    matrix, point = np.eye(4), np.array([[0.3, -0.2, 0.5]]) + CENTER
+    matrix[:3] = np.c_[1.3 * Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), [5.0, -7, 2]]
+    capture = loading.load_capture(small_capture)
+    there = calibrated.moved(capture, matrix)
+    for one, other in zip(capture.sensors, there.sensors):
+        places = [
+            sensor.camera.project(p) for sensor, p in ((one, point), (other, trimesh.transform_points(point, matrix)))
+        ]
+        np.testing.assert_allclose(places[0][0], places[1][0], atol=1e-3)
+        np.testing.assert_allclose(1.3 * places[0][1], places[1][1], rtol=1e-5)
+    before, after = Lights.of(capture.sensors), Lights.of(there.sensors)
+    distances = [np.linalg.norm(lights.positions() - p, axis=1, keepdims=True)
+                 for lights, p in ((before, point), (after, trimesh.transform_points(point, matrix)))]  # fmt: skip
+    np.testing.assert_allclose(before.rgb() / distances[0] ** 2, after.rgb() / distances[1] ** 2, rtol=1e-4)
 
 
 def self_intersections(mesh):

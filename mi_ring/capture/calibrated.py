@@ -8,7 +8,7 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import load_element, photograph_element
 from mi_ring.geometry.camera import Camera
-from mi_ring.rendering.lights import Light
+from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import Photographs
 
 
@@ -33,3 +33,23 @@ def with_calibration(
         )  # fmt: skip
         sensors.append(load_element(element))
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))
+
+
+def moved(capture: Capture, matrix: np.ndarray) -> Capture:
+    """The same photographs, with the cameras and lights of a scene that a similarity (4, 4) has moved.
+
+    A room that is fixed in the world stays as it is: for small motions.
+    """
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    rotation = matrix[:3, :3] / scale
+    cameras, lights, before = [], [], Lights.of(capture.sensors)
+    for k, sensor in enumerate(capture.sensors):
+        light = before[k]
+        to_world = matrix @ sensor.camera.to_world
+        to_world[:3, :3] /= scale
+        cameras.append(sensor.camera._replace(to_world=to_world))
+        if light.kind == "point":  # as bright as before from scaled distances
+            lights.append(Light("point", matrix[:3, :3] @ light.vector + matrix[:3, 3], scale**2 * light.rgb))
+        else:
+            lights.append(light._replace(vector=rotation @ light.vector))
+    return with_calibration(capture, cameras, lights, room=capture.photographs.room)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mi_ring.capture.calibrated import moved
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.predictions import SPP, compare_photographs
@@ -30,15 +31,15 @@ def evaluate_fit(
     """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
 
     `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
-    genus of a surface that is not closed, for instance. `align`: move the truth onto the result first, "rigid" or also
-    scaled ("similarity"); by how much is under `aligned_*`.
+    genus of a surface that is not closed, for instance. `align`: move the truth, and the cameras and lights of `novel`,
+    onto the result first, "rigid" or also scaled ("similarity"); by how much is under `aligned_*`.
     """
     ring = load_fit(run)
     capture = load_capture(run / "scene.xml")
     unseen = novel and load_capture(novel)
     truth_mesh, truth = load_true_mesh(mesh)
     guess_mesh, guess = load_true_mesh(run / "mesh.ply")
-    diagonal, moved = float(np.linalg.norm(truth_mesh.extents)), {}
+    diagonal, motion = float(np.linalg.norm(truth_mesh.extents)), {}
     if align:
         matrix = alignment(truth_mesh, guess_mesh, align == "similarity")
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
@@ -46,11 +47,12 @@ def evaluate_fit(
         before = truth_mesh.bounds.mean(0)
         truth_mesh.apply_transform(matrix)
         shift = np.linalg.norm(matrix[:3, :3] @ before + matrix[:3, 3] - before)
-        moved = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
+        motion = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
                  "aligned_scale": scale}  # fmt: skip
         truth, diagonal = scene_of(truth_mesh.vertices, truth_mesh.faces), diagonal * scale
+        unseen = unseen and moved(unseen, matrix)
     numbers, views = compare_surfaces(capture, guess, truth, diagonal)
-    numbers |= moved
+    numbers |= motion
     numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None)
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:
