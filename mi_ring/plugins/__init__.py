@@ -7,7 +7,7 @@ import importlib
 import sys
 
 #: In the order in which they need each other.
-PLUGINS = ("photograph", "flash", "room", "cooktorrance", "shapenet", "table", "photometric")
+PLUGINS = ("photograph", "flash", "room", "cooktorrance", "merl", "shapenet", "table", "photometric")
 
 
 def register() -> None:

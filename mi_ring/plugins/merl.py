@@ -1,0 +1,121 @@
+"""The `merl` BSDF: measured materials (Mitsuba plugin)."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.plugins.properties import beside_scene
+from mi_ring.rendering.measured import Network, Table
+
+NODES = 180  #: at which the density of half vectors is known, by the square root of their angle
+TYPICAL = np.radians(30)  #: θd for which it is
+STEEPEST = 1e-3  #: sine and root of an angle, below which a half vector is the normal
+
+
+class Merl(mi.BSDF):
+    """A measured, isotropic material: a table of the MERL database, or a network that was fitted to one.
+
+    ============ ========= =====================================================================
+    Parameter    Type      Description
+    ============ ========= =====================================================================
+    ``filename`` string    a ``.binary`` of the MERL database, or an ``.npz`` of such networks
+    ``material`` string    which of the networks, by its name; none of a table
+    ============ ========= =====================================================================
+
+    Values are those of the file, interpolated between the cells of a table in the coordinates of Rusinkiewicz 1998 (A
+    New Change of Variables for Efficient BRDF Representation), in which it is reciprocal. Where nothing was measured
+    the cells around say what there is, and where these have nothing either the material is black. The networks, of the
+    arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3``, take (sin θh, 0, cos θh) and the
+    difference vector; beyond θh = 80° or θd = 65° they are held as they are there.
+
+    Directions are drawn from a mixture of the cosine and of half vectors as bright as the material is at θd = 30°.
+
+    What it does not do: the files hold no energy balance, and none is enforced. Nothing of it is differentiable.
+
+    Raises ValueError for a file that is neither, for one that is cut off, and for an unknown material.
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <bsdf type="merl">
+                <string name="filename" value="gold-paint.binary"/>
+            </bsdf>
+
+        .. code-block:: python
+
+            {"type": "merl", "filename": "networks.npz", "material": "gold-paint"}
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.path, self.material = beside_scene(str(props.get("filename", ""))), str(props.get("material", ""))
+        if not self.path.is_file():
+            raise ValueError(f'merl "{props.id()}": filename is "{self.path}", which is no file')
+        if self.path.suffix == ".npz":
+            self.measured = Network(self.path, self.material)
+        elif self.material:
+            raise ValueError(f'merl "{props.id()}": material is "{self.material}", but a table holds one alone')
+        else:
+            self.measured = Table(self.path)
+        root = np.linspace(0, 1, NODES)
+        theta = mi.Float(root**2 * np.pi / 2)
+        typical = mi.Vector3f(float(np.sin(TYPICAL)), 0, float(np.cos(TYPICAL)))
+        bright = dr.mean(self.measured.value(theta, typical)).numpy()
+        # Of half vectors by their root t, θh = t² π/2: f times the projected solid angle of a ring.
+        density = (bright + 1e-3 * bright.max() + 1e-9) * np.sin(2 * theta.numpy()).clip(0) * root
+        self.half = mi.ContinuousDistribution(mi.ScalarVector2f(0, 1), mi.Float(density))
+        self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
+        self.m_flags = self.m_components[0]
+
+    def reflected(self, si, wo, active):
+        """f (n·i) [1/sr]."""
+        h = dr.normalize(si.wi + wo)
+        sin = dr.sqrt(h.x * h.x + h.y * h.y)
+        across = sin > 1e-7
+        cos_phi, sin_phi = dr.select(across, h.x / sin, 1), dr.select(across, h.y / sin, 0)
+        d = mi.Vector3f(
+            h.z * (cos_phi * si.wi.x + sin_phi * si.wi.y) - sin * si.wi.z,
+            cos_phi * si.wi.y - sin_phi * si.wi.x,
+            dr.dot(si.wi, h),
+        )
+        value = self.measured.value(dr.atan2(sin, h.z), d) * wo.z
+        return dr.select(active & (si.wi.z > 0) & (wo.z > 0), value, 0)
+
+    def density(self, si, wo, active):
+        """Density [1/sr] of directions as `sample` draws them."""
+        h = dr.normalize(si.wi + wo)
+        sin = dr.maximum(dr.sqrt(h.x * h.x + h.y * h.y), STEEPEST**2)
+        root = dr.sqrt(dr.minimum(dr.atan2(sin, h.z) / (dr.pi / 2), 1))
+        ring = self.half.eval_pdf_normalized(root) / (dr.pi * dr.maximum(root, STEEPEST)) / (dr.two_pi * sin)
+        mixed = 0.5 * mi.warp.square_to_cosine_hemisphere_pdf(wo) + 0.5 * ring / (4 * dr.abs(dr.dot(si.wi, h)))
+        return dr.select(active & (si.wi.z > 0) & (wo.z > 0), mixed, 0)
+
+    def eval(self, ctx, si, wo, active=True):
+        return self.reflected(si, wo, active & ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))
+
+    def pdf(self, ctx, si, wo, active=True):
+        return self.density(si, wo, active & ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))
+
+    def eval_pdf(self, ctx, si, wo, active=True):
+        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+    def sample(self, ctx, si, sample1, sample2, active=True):
+        active = active & ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
+        theta = self.half.sample(sample2.x) ** 2 * (dr.pi / 2)
+        (sin, cos), (sin_phi, cos_phi) = dr.sincos(theta), dr.sincos(dr.two_pi * sample2.y)
+        mirrored = mi.reflect(si.wi, mi.Normal3f(sin * cos_phi, sin * sin_phi, cos))
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = dr.select(sample1 < 0.5, mirrored, mi.warp.square_to_cosine_hemisphere(sample2))
+        bs.pdf = self.density(si, bs.wo, active)
+        bs.eta = 1.0
+        bs.sampled_component = mi.UInt32(0)
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        active &= bs.pdf > 0
+        return bs, self.reflected(si, bs.wo, active) / dr.select(active, bs.pdf, 1)
+
+    def to_string(self):
+        return f"Merl[filename={self.path}, material={self.material}]"
+
+
+mi.register_bsdf("merl", Merl)

@@ -1,0 +1,80 @@
+"""Reflectance as it was measured: tables of the MERL database, and networks that were fitted to them."""
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import drjit as dr
+import drjit.nn as nn
+import mitsuba as mi
+import numpy as np
+
+CELLS = 90, 90, 180  #: of a table: θh, θd, φd
+SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its planes, red, green, blue
+#: How far the networks are trusted, θh and θd [radians]: beyond, they were fitted to little and grow without bounds.
+TRUSTED = np.radians([80.0, 65.0])
+LAYERS = ("w1", "b1", "w2", "b2", "w3", "b3")
+
+
+class Table:
+    """A ``.binary`` of the MERL database (Matusik et al. 2003), between whose cells values are interpolated.
+
+    Cell i of θh is the angle (i / 90)² · 90°, those of θd and φd are a degree each; by reciprocity φd and φd + π are
+    one. Negative values say that nothing was measured: the cells around speak for them.
+    """
+
+    def __init__(self, path: Path):
+        with path.open("rb") as file:
+            sizes = np.fromfile(file, "<i4", 3)
+            if tuple(sizes) != CELLS:
+                raise ValueError(f"{path}: is no table of MERL: begins with {sizes.tolist()}, must be {list(CELLS)}")
+            values = np.fromfile(file, "<f8")
+        if values.size != 3 * np.prod(CELLS):
+            raise ValueError(f"{path}: has {values.size} numbers, must have {3 * np.prod(CELLS)}; it was cut off")
+        planes = values.reshape(3, *CELLS)
+        measured = np.isfinite(planes) & (planes >= 0)
+        planes = np.where(measured, planes * SCALES[:, None, None, None], 0)
+        weights = np.concatenate([planes, measured.all(0)[None]]).transpose(1, 2, 3, 0)
+        weights = np.concatenate([weights, weights[:, :, :1]], 2)  # after the last φd comes the first
+        tensor = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
+        self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
+
+    def value(self, theta, d):
+        """f (3) [1/sr] of half vectors at an angle `theta` from the normal and difference vectors `d`."""
+        half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
+        difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
+        turn = dr.atan2(d.y, d.x) / dr.pi
+        turn = (turn - dr.floor(turn)) * CELLS[2]
+        place = [(turn + 0.5) / (CELLS[2] + 1), (difference + 0.5) / CELLS[1], (half + 0.5) / CELLS[0]]
+        red, green, blue, weight = self.texture.eval(mi.Point3f(place))
+        return mi.Color3f(red, green, blue) / dr.maximum(weight, 1e-6)
+
+
+class Network:
+    """A network of 6-21-21-3 neurons that was fitted to such a table ("Neural BRDF Representation", Sztrajman 2021)."""
+
+    def __init__(self, path: Path, material: str):
+        try:
+            with np.load(path) as file:
+                missing = [name for name in ("names", *LAYERS) if name not in file]
+                if missing:
+                    raise ValueError(f"{path}: has no array {missing[0]}; is it one of networks fitted to MERL?")
+                names = [str(name) for name in file["names"]]
+                if material not in names:
+                    raise ValueError(f'{path}: has no material "{material}"; must be one of {", ".join(names)}')
+                arrays = [file[name][names.index(material)].astype(np.float32) for name in LAYERS]
+        except (BadZipFile, OSError) as error:
+            raise ValueError(f"{path}: cannot be read: {error}") from None
+        tensors = [mi.TensorXf(np.ascontiguousarray(a.T)) if a.ndim == 2 else mi.Float(a) for a in arrays]
+        self.layers = list(nn.pack(*tensors, layout="inference"))
+
+    def value(self, theta, d):
+        """As `Table.value`."""
+        theta = dr.minimum(theta, float(TRUSTED[0]))
+        sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
+        narrowed = dr.minimum(sin, float(np.sin(TRUSTED[1])))
+        share = narrowed / dr.maximum(sin, 1e-9)
+        x = [dr.sin(theta), mi.Float(0), dr.cos(theta), d.x * share, d.y * share, dr.sqrt(1 - narrowed * narrowed)]
+        w1, b1, w2, b2, w3, b3 = self.layers
+        y = dr.maximum(nn.matvec(w1, nn.CoopVec(*x), b1), 0)
+        y = dr.maximum(nn.matvec(w2, y, b2), 0)
+        return dr.maximum(dr.exp(mi.Color3f(*nn.matvec(w3, y, b3))) - 1, 0)
