@@ -58,6 +58,7 @@ PLUGINS = {
     "shapenet": "mi_ring.plugins.shapenet.ShapeNetMesh",
     "table": "mi_ring.plugins.table.Table",
     "cooktorrance": "mi_ring.plugins.cooktorrance.CookTorrance",
+    "merl": "mi_ring.plugins.merl.Merl",
     "photometric": "mi_ring.plugins.photometric.Photometric",
 }
 
