@@ -16,7 +16,7 @@ NPM_CI = cd mi_ring/output/viewer && npm ci --ignore-scripts --no-audit --no-fun
 
 help:
 	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
-	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE)'
+	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE); ARGS=--resume goes on after an interrupt'
 	@echo 'make test [ARGS=...]         run pytest'
 	@echo 'make tools                   install what some tests need: Chromium (as root), the validator of glTF (with npm)'
 	@echo 'make viewer                  bundle the viewer of the report anew (needs Node.js)'
@@ -31,6 +31,7 @@ $(VENV)/.setup-done: pyproject.toml Makefile mi_ring/system/llvm.py | $(PIP)
 	$(RUN) pip install $(TORCH)
 	$(RUN) pip install -e '.[test]'
 	@touch $@
+	@echo 'Installed. Now: source $(BIN)/activate; mi-ring doctor'
 
 # Debian and Ubuntu keep ensurepip in the package python3-venv. Without it, the wheel in python3-pip-whl is pip enough to
 # install pip; it looks for certificates where a slim container has none, so give it those it came with.

@@ -273,7 +273,8 @@ class Stage:
     `sheet`: board, random, white, none, or bare: no table either. `turntable`: a plain backdrop stands behind.
     """
 
-    brightest = 0.3  #: of what one path brings by way of other surfaces
+    #: Of what one path brings by way of other surfaces. What a bright surface gets from white paper is as much as 0.5.
+    brightest = 4.0
 
     def __init__(self, name: str, sheet: str, turntable: bool, seed: int) -> None:
         rng = np.random.default_rng([seed, 1])

@@ -1,6 +1,7 @@
 """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
 
 import ast
+import difflib
 import importlib
 import sys
 from collections.abc import Sequence
@@ -51,7 +52,8 @@ def main() -> None:
         print(__version__ if name == "--version" else overview())
         sys.exit(0)
     if name not in COMMANDS:
-        what = f"is {name}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
+        alike = "".join(f"; perhaps you meant {other}" for other in difflib.get_close_matches(name, COMMANDS, 1))
+        what = f"is {name}{alike}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
         print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
         sys.exit(2)
     run(f"mi-ring {name}", partial(run_command, name), sys.argv[2:])

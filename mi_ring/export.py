@@ -33,7 +33,8 @@ class ExportConfig(MaterialOptions):
     .ply: the mesh with the parameters of its BSDF as vertex attributes, and whether any photograph shows the vertex.
     .glb: with a normal map and the material as glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files.
     .xml: a scene for Mitsuba, with bitmap textures and a stock BSDF, that needs no mi_ring. Positions are in the
-    scene's units and frame.
+    scene's units and frame; a GLB has a node that makes metres of the units and puts the object upright, where the
+    capture says both.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -47,7 +48,8 @@ class ExportConfig(MaterialOptions):
     time: float = 1.0
     """Of the flow: 0 is where it starts, 1 the object."""
     metres: float | None = None
-    """Length of a scene unit, which scales the GLB to glTF's metres. Default: it is not known."""
+    """Length of a scene unit, which scales the GLB to glTF's metres. Default: as the capture says; one with the printed
+    sheet is in millimetres."""
 
 
 def require_options(config: ExportConfig) -> None:
@@ -102,8 +104,11 @@ def main(arguments: Sequence[str]) -> None:
         write_mesh(ring, level, config.file, config.time, views)
         files = [config.file]
     elif kind == ".glb":
-        write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, config.metres, views))
+        metres = config.metres or ring.metres
+        write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, metres, views, ring.up))
         files = [config.file]
+        if metres is None:
+            print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres")
     else:
         print("Cutting the surface open and baking its material", flush=True)
         atlas = unwrap(ring, level, config.resolution, config.time)

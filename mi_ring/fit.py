@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from mi_ring.capture.loading import load_capture
-from mi_ring.errors import InputError, require_file
+from mi_ring.capture.loading import load_capture, require_scene
+from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import read_checkpoint, require_same_files
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
@@ -69,7 +69,7 @@ class FitConfig(Config, Task):
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
     config = parse_options(arguments)
-    require_file(config.scene, "the XML file of a scene")
+    require_scene(config.scene)
     variant: Any = set_variant(config.variant)
     config = dataclasses.replace(config, variant=variant)
     folder = config.folder

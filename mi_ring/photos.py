@@ -38,10 +38,12 @@ from mi_ring.photogrammetry.workflow import (
 )
 from mi_ring.rendering.rooms import COUNT
 from mi_ring.system import command
-from mi_ring.system.files import locked, write_file, writing
+from mi_ring.system.files import locked, write_file
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
+
+METRES = 1e-3  #: of a unit of the scene, if there is a sheet
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,8 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
+    if config.out.is_file():
+        raise InputError(f"{config.out}: DIR: is a file; give a folder, which is made if it is not there")
     if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
@@ -176,8 +180,6 @@ def make(config: PhotosConfig, scene: Path) -> None:
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
-    with writing(config.out):
-        config.out.mkdir(parents=True, exist_ok=True)
     for left in config.out.glob(".scene.*/"):  # by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
@@ -213,8 +215,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     taken = shots(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
-    ground = plane and np.stack([plane.offset * plane.normal, plane.normal])
-    root, writer = scene_element([], ground), Writer(scene)
+    ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0, 1]) if plane is None else plane.normal
+    root, writer = scene_element([], ground, up, METRES if sheet else None), Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
         harmonics = np.zeros((COUNT, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0

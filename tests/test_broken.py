@@ -87,6 +87,9 @@ SPHERE = '<point name="center" x="400" y="-150" z="90"/><float name="radius" val
 BROKEN = {
     "no scene": (lambda path: path.unlink(), [], ["small.xml", "no such file"]),
     "a folder instead": (lambda path: (path.unlink(), path.mkdir()), [], ["small.xml", "is a folder"]),
+    "a folder with a scene": (lambda path: (path.rename(path.with_name("scene.xml")), path.mkdir(),
+                                            path.with_name("scene.xml").rename(path / "scene.xml")), [],
+                              ["small.xml: is a folder; give ", "scene.xml"]),
     "no XML": (xml("<shape.*", "<shape"), [], ["small.xml: ", "XML"]),
     "an empty file": (content("small.xml", b""), [], ["small.xml: ", "XML"]),
     "a picture as scene": (lambda path: mi.Bitmap(IMAGE).write(str(path), mi.Bitmap.FileFormat.PNG), [],

@@ -298,7 +298,9 @@ def test_the_program_says_what_each_command_does(capsys, monkeypatch):
         assert re.search(rf"^  mi-ring {name}( [A-Z]\S+.*)?\n      \S+ \S+", text, re.M), name
 
 
-@pytest.mark.parametrize("arguments, wrong", [([], "is missing"), (["fitt"], "is fitt; must be one of example, ")])
+@pytest.mark.parametrize(
+    "arguments, wrong", [([], "is missing"), (["fitt"], "is fitt; perhaps you meant fit; must be one of")]
+)
 def test_a_command_that_there_is_not_is_one_line(arguments, wrong, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["mi-ring", *arguments])
     with pytest.raises(SystemExit) as stop:

@@ -68,6 +68,21 @@ def glb_file(run, tmp_path_factory):
     return file
 
 
+def test_a_glb_is_in_metres_and_upright_where_the_capture_says_so(run, ring, tmp_path, capsys):
+    """Up is -x and a unit is a centimetre: as glTF has it, with y up, in metres."""
+    state = ring_state(ring)
+    torch.save(state | {"up": [-1.0, 0.0, 0.0], "metres": 0.01}, tmp_path / "ring.pt")
+    sizes = []
+    for source, name in ((run, "plain.glb"), (tmp_path / "ring.pt", "upright.glb")):
+        export.main([str(source), str(tmp_path / name), "--subdivisions", "3", "--resolution", "64"])
+        sizes.append(trimesh.load(tmp_path / name).bounds)  # with the node's transform
+    told = capsys.readouterr().out
+    plain, upright = sizes
+    np.testing.assert_allclose(upright[:, 1], -0.01 * plain[::-1, 0], rtol=1e-4)
+    np.testing.assert_allclose(upright[:, 2], 0.01 * plain[:, 2], rtol=1e-4)
+    assert told.count("The length of a scene unit is not known") == 1
+
+
 def complaint(*arguments) -> str:
     with pytest.raises(InputError) as error:
         export.main([str(a) for a in arguments])

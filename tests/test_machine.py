@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
@@ -102,6 +103,12 @@ def test_workers_are_kept_and_their_one_thread_does_not_spread():
     thread.start()
     thread.join()
     assert seen == [2] and torch.get_num_threads() == 2
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a place where nobody may write, root neither")
+def test_where_nothing_can_be_written_nobody_else_is_blamed():
+    with pytest.raises(InputError, match="cannot be written"), files.locked(Path("/proc/capture")):
+        pass
 
 
 def test_a_second_fit_into_a_folder_is_refused_while_the_first_writes(tmp_path):

@@ -210,7 +210,9 @@ def test_saved_fit_of_another_domain_loads(torus, tmp_path):
         ({"to_world": "there"}, "to_world is there, must be a <transform>"),
         ({"radius": -2.0}, "radius is -2"),
         ({"weights": "ring.pt", "ground": CENTER}, "weights carry their own ground"),
-        ({"ground": CENTER, "up": [0.0, 0.0, 0.0]}, "must be a <point> and a <vector> that is not 0"),
+        ({"ground": CENTER, "up": [0.0, 0.0, 0.0]}, "up is .* must be a <vector> that is not 0"),
+        ({"metres": -1.0}, "metres is -1.0, must be a positive number"),
+        ({"weights": "ring.pt", "metres": 1.0}, "weights carry their own metres"),
     ],
     ids=lambda value: None if isinstance(value, str) else "-".join(f"{k}={v}" for k, v in value.items()),
 )

@@ -567,3 +567,13 @@ def test_corners_of_the_sheet_hold_cameras_whose_features_are_poor(by_features):
 
 def test_a_sheet_that_was_moved_under_the_object_bends_no_camera():
     assert adjusted_by_corners(0.05)[0] < 0.3
+
+
+def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_path):
+    random = np.random.default_rng(0)
+    sharp = cv2.resize(random.integers(0, 255, (60, 80), np.uint8), (320, 240), interpolation=cv2.INTER_NEAREST)
+    for name, picture in (("sharp", sharp), ("blurred", cv2.blur(sharp, (31, 3)))):
+        noisy = picture + random.normal(0, 3, sharp.shape)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), noisy.clip(0, 255).astype(np.uint8))
+    sharp, blurred = (motion.detail_of(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
+    assert blurred < motion.PLAIN * sharp and motion.detail_of(tmp_path / "none.png") == 0

@@ -67,9 +67,19 @@ def read_once(files: list, field: str, scene: Path) -> list:
     return [read[file, sensor.size, file == sensor.filename] for sensor, file in files]
 
 
+def require_scene(path: Path) -> None:
+    """Raise InputError, which says what to give, if a path is not that of a file, or of a photograph."""
+    photographs = path.is_dir() or path.suffix.lower() in (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".dng")
+    usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
+    inside = path / "scene.xml"
+    require_file(path, f"{inside}" if inside.is_file() else usual)
+    if photographs:
+        raise InputError(f"{path}: is a photograph; give {usual}")
+
+
 def open_scene(path: Path) -> tuple[mi.Scene, list]:
     """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
-    require_file(path, "the XML file of a scene")
+    require_scene(path)
     try:
         path.read_text("utf-8")
         scene = mi.load_file(str(path), optimize=False, parallel=False)

@@ -45,17 +45,24 @@ def photograph_element(
     return element
 
 
-def scene_element(photographs: Iterable[Element], ground: np.ndarray | None = None) -> Element:
+def scene_element(
+    photographs: Iterable[Element], ground: np.ndarray | None = None, up: np.ndarray | None = None,
+    metres: float | None = None,
+) -> Element:  # fmt: skip
     """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`.
 
-    `ground` (2, 3): a point on the table that the object stands on, and the table's normal.
+    `ground` (3,): a point on the table that the object stands on; `up` (3,): the table's normal, or what else is up;
+    `metres`: the length of a scene unit. None where it is not known.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
     shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
-    if ground is not None:
-        for tag, name, (x, y, z) in zip(("point", "vector"), ("ground", "up"), ground):
-            ElementTree.SubElement(shape, tag, name=name, x=numbers(x), y=numbers(y), z=numbers(z))
+    for tag, name, value in (("point", "ground", ground), ("vector", "up", up)):
+        if value is not None:
+            x, y, z = map(numbers, value)
+            ElementTree.SubElement(shape, tag, name=name, x=x, y=y, z=z)
+    if metres is not None:
+        ElementTree.SubElement(shape, "float", name="metres", value=numbers(metres))
     ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
     root.extend(photographs)
     return root

@@ -24,7 +24,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         if state["settings"].get(name) != value:
             before = state["settings"].get(name)
             raise InputError(f"{path}: --{name.replace('_', '-')}: was {before} before, is {value} now; give the same "
-                             "settings to resume, or start anew without --resume")  # fmt: skip
+                             "settings, --preset among them, or start anew without --resume")  # fmt: skip
     return state
 
 

@@ -51,7 +51,7 @@ def starting_ring(
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
         networks[1].set_parameters(parameters, scale)
     ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                networks, capture.shape.ground)  # fmt: skip
+                networks, capture.shape.ground, capture.shape.up, capture.shape.metres)  # fmt: skip
     require_networks(ring)
     return ring
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pygltflib
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes
@@ -105,11 +106,12 @@ def png(image: np.ndarray) -> bytes:
 
 def glb(
     ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
-    views: Sequence[View] | None = None,
+    views: Sequence[View] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """The object as a GLB file with textures of `resolution` texels a side, in the scene's frame.
+    """The object as a GLB file with textures of `resolution` texels a side.
 
-    Positions are in scene units; with `metres`, the length of one, a node scales them to glTF's. The parameters of the
+    Positions are in scene units and in the scene's frame; with `metres`, the length of one, a node scales them to
+    glTF's, and with `up` (3,) it turns them so that this is its y. The parameters of the
     BSDF are also there as they are, as vertex attributes (_DIFFUSE, …) and, what they mean, in the material's extras.
     With `views` there is also _SEEN: 1 where one of them shows the object, 0 where none does.
     """
@@ -122,12 +124,12 @@ def glb(
         s = np.zeros((atlas.whole.max() + 1, 3), np.float32)
         s[atlas.whole] = atlas.s
         seen = seen_of(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
-    return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen)
+    return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen, up)
 
 
 def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
-    metres: float | None = None, seen: np.ndarray | None = None,
+    metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The GLB file of a mesh, its `textures` and its exact parameters at the vertices; `seen` (V,) bool."""
     file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
@@ -191,7 +193,9 @@ def assemble_glb(
         pygltflib.Primitive(attributes=attributes, indices=indices, material=0)
     ]))  # fmt: skip
     extras = {"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"}
-    file.nodes.append(pygltflib.Node(name="object", mesh=0, scale=[metres] * 3 if metres else None, extras=extras))
+    turn = None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist()
+    scale = [metres] * 3 if metres else None
+    file.nodes.append(pygltflib.Node(name="object", mesh=0, scale=scale, rotation=turn, extras=extras))
     file.scenes.append(pygltflib.Scene(nodes=[0]))
     file.scene = 0
     file.buffers.append(pygltflib.Buffer(byteLength=len(blob)))

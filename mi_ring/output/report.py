@@ -88,7 +88,7 @@ def report_html(
         findings=fit_findings(rows, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
         refined=refined and calibration_panel.panel(fit.capture, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
-        viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
+        saturated=SATURATED, viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
 
 

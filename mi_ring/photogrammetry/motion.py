@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -27,6 +28,7 @@ FEWEST_MATCHES, FIRM = 15, 0.7  #: of two photographs, and the share that camera
 PART = 3  #: photographs at least
 NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
+PLAIN = 0.25  #: of the detail of those with a camera: a photograph that has less is blurred, or shows something plain
 
 
 @dataclass
@@ -203,7 +205,9 @@ def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
     """In terms of the photographs as they were taken."""
     cameras = cameras_of(model, pictures)
-    failed = {p.name: reason_of(p, folder) for p in pictures if p.name not in cameras}
+    detail = {p.name: detail_of(folder / "grey" / file_of(p)) for p in pictures}
+    usual = float(np.median([detail[name] for name in cameras]))
+    failed = {p.name: reason_of(p, folder, detail[p.name] < PLAIN * usual) for p in pictures if p.name not in cameras}
     by_file = {file_of(picture): picture for picture in pictures}
     placed = [model.images[k] for k in model.reg_image_ids()]
     scales = [reduction(model, image, by_file[image.name].size) for image in placed]
@@ -221,14 +225,22 @@ def model_points(folder: Path) -> np.ndarray:
     return points_of(need("pycolmap", f"{folder}").Reconstruction(folder))
 
 
-def reason_of(picture: Picture, folder: Path) -> str:
-    """Why a photograph has got no camera."""
+def detail_of(file: Path) -> float:
+    """How much a photograph varies from pixel to pixel, but for noise."""
+    grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    return 0.0 if grey is None else float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
+
+
+def reason_of(picture: Picture, folder: Path, plain: bool) -> str:
+    """Why a photograph has got no camera; `plain`: it has far less detail than others."""
     pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(folder / "database.db") as opened:
         image = opened.read_image_with_name(file_of(picture))
         features = opened.num_keypoints_for_image(image.image_id)
     if features < TEXTURED:
         return f"{features} features only: out of focus, blurred or too dark"
+    if plain:
+        return "far less detail than in the others: blurred, out of focus, or it shows something else"
     return "nothing in it fits the others: it shows something else, or there are too few photographs in between"
 
 

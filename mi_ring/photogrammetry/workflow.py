@@ -25,7 +25,7 @@ from mi_ring.photogrammetry.scene import OBJECT, Shot, reduction
 from mi_ring.photogrammetry.table import Plane
 from mi_ring.photogrammetry.trial import DIM
 from mi_ring.rendering.lights import Light
-from mi_ring.system.files import write_file
+from mi_ring.system.files import write_file, writing
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
@@ -36,7 +36,8 @@ FORMAT = 2  #: of what is kept; more whenever it changes
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
     """Raise InputError if what a folder holds was found in other photographs, or by another version."""
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(f"{folder.parent}: DIR"):
+        folder.mkdir(parents=True, exist_ok=True)
     kept, first = folder / "photographs.json", folder / "sheet.json"  # before this is there, nothing was found in them
     photographs = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
     if first.exists() and kept.exists():

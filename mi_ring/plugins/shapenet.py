@@ -7,7 +7,14 @@ from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 
-FOR_FITS = "center", "radius", "domain", "ground", "up"  #: what says where a fit starts; finished ones have it in them
+FOR_FITS = (
+    "center",
+    "radius",
+    "domain",
+    "ground",
+    "up",
+    "metres",
+)  #: what says where a fit starts; finished ones have it in them
 
 
 class ShapeNetMesh(mi.Mesh):
@@ -30,7 +37,9 @@ class ShapeNetMesh(mi.Mesh):
     ``ground``       point     on the table that the object stands on [scene units]: the surface does
                                not go below, where no photograph shows it. Not together with
                                ``weights``. Default: none
-    ``up``           vector    normal of the table. Default: z
+    ``up``           vector    normal of the table, or what else is up, for exports. Default: z, unknown
+                               to exports
+    ``metres``       float     length of a scene unit, for exports. Default: not known
     ``to_world``     transform applied on top of everything. Default: none
     ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
                                to false to place a fit into a scene of your own. Default: true
@@ -101,12 +110,17 @@ class ShapeNetMesh(mi.Mesh):
             raise ValueError(f'shapenet "{props.id()}": center is {given["center"]}, must be a <point>')
         #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
         self.ground = None
+        up = np.array(given.get("up", [0.0, 0.0, 1.0])).ravel()
+        unit = up / max(np.linalg.norm(up), 1e-30)
+        if not (np.isfinite(up).all() and up.any()):
+            raise ValueError(f'shapenet "{props.id()}": up is {up.tolist()}, must be a <vector> that is not 0')
         if "ground" in given:
-            up = np.array(given.get("up", [0.0, 0.0, 1.0])).ravel()
-            self.ground = np.stack([np.array(given["ground"]).ravel(), up / max(np.linalg.norm(up), 1e-30)])
-            if not (np.isfinite(self.ground).all() and up.any()):
-                raise ValueError(f'shapenet "{props.id()}": ground is {given["ground"]} and up {up.tolist()}, must be '
-                                 "a <point> and a <vector> that is not 0")  # fmt: skip
+            self.ground = np.stack([np.array(given["ground"]).ravel(), unit])
+            if not np.isfinite(self.ground).all():
+                raise ValueError(f'shapenet "{props.id()}": ground is {given["ground"]}, must be a <point>')
+        #: (3,) what is up, and the length of a scene unit, for exports; None where it says nothing.
+        self.up = unit.tolist() if "up" in given else None
+        self.metres = number(props, "metres", positive=True) if "metres" in given else None
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain, self.domain_file = None, None
         if "domain" in given:

@@ -23,6 +23,7 @@ def ring_state(ring: Ring, config: dict | None = None) -> dict:
         "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
         "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
         "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
+        "up": ring.up, "metres": ring.metres,
     }  # fmt: skip
 
 
@@ -32,7 +33,7 @@ def ring_of(state: dict) -> Ring:
     ring = Ring(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
         subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
-        ground=state["networks"].get("ground"),
+        ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     return ring
@@ -56,7 +57,9 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     except Exception as error:  # what torch makes of other bytes is of any kind
-        why = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error).split())
+        # torch's advice, to load files that may run anything, is not ours.
+        why = "not written by PyTorch" if "weights_only" in text else text or type(error).__name__
         raise InputError(f"{path}: not {kind} ({why[:200]}); {advice}") from error
     if not isinstance(state, dict):
         raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")

@@ -49,20 +49,35 @@ def require_utf8(name: str) -> None:
 def complaint_in(box: str) -> str:
     """The complaint, in one line, of the box that tyro draws: a title, the complaint, rules and advice between them.
 
-    Of the advice, which options are spelled alike is kept.
+    Of the advice, which options are spelled alike is kept. Where the output is not UTF-8 the box has no sides.
     """
+    lines = [line.strip() for line in box.splitlines() if line.strip()]
+    if any(line.startswith("│") for line in lines):
+        lines = [line.strip("│ ") for line in lines if line.startswith("│")]
+    else:
+        lines = lines[2:]  # after the title and its rule
     parts: list[list[str]] = [[]]
-    for line in (line.strip("│ ") for line in box.splitlines() if line.startswith("│")):
-        if set(line) == {"─"}:
+    for line in lines:
+        if set(line) in ({"─"}, {"-"}):
             parts.append([])
         else:
             parts[-1].append(line)
     alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
     complaint = " ".join(parts[0]) or " ".join(box.split())
+    if complaint.startswith("Missing from "):  # then come names and help of all that is
+        names = re.findall(r"(?:: |\(required\) )(--\S+|[A-Z]+)(?= )", complaint)
+        if names:
+            return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
     if union:  # of kinds of values; why each is not meant is of no interest
         kinds = re.sub("[{}]", "", union[2].replace("{None}|", "")).replace(",", "|")
         complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), kinds)
+    choice = re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint)
+    if choice:
+        complaint = f"{choice[2]}: is {choice[1]}; must be one of {choice[3]}".replace("'", "")
+    count = re.match(r"Missing value for argument '(--\S+)'\. Expected (\d+) values", complaint)
+    if count:
+        complaint = f"{count[1]}: must be {count[2]} value{'s' * (count[2] != '1')}"
     for kind, error in (
         ("whole number", r"invalid literal for int\(\) .*"),
         ("number", "could not convert string to float"),

@@ -72,6 +72,7 @@ def locked(folder: Path, field: str = "--out") -> Iterator[None]:
     file = place.with_name(f".{place.name}.lock")
     with writing(f"{folder}: {field}"):
         place.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=place.parent).close()  # else filelock tells of another process
         lock = filelock.FileLock(file, timeout=0)
         try:
             lock.acquire()
