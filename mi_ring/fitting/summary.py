@@ -67,7 +67,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     if "scale" in now:
         add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
     if "ambient" in calibration.refined:
-        what = "light of the room on the object, by the flash's; 0 at least"
+        what = "light of the room on the object, as shares of the flash's: red, green, blue"
         unknowns["ambient"] = {"what": what, "after": share, "harmonics": calibration.room.harmonics.tolist()}
 
     center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
