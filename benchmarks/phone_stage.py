@@ -273,7 +273,8 @@ class Stage:
     `sheet`: board, random, white, none, or bare: no table either. `turntable`: a plain backdrop stands behind.
     """
 
-    #: Of what one path brings by way of other surfaces. What a bright surface gets from white paper is as much as 0.5.
+    #: Of what one path brings by way of other surfaces: white dots are brighter, and what a bright surface gets from
+    #: white paper, 0.5 and more, is not.
     brightest = 4.0
 
     def __init__(self, name: str, sheet: str, turntable: bool, seed: int) -> None:

@@ -4,11 +4,11 @@
         [options of mi_ring.fit]
 
 all: every disturbance at once, at two strengths of the room's light, with calibration and masks that
-`mi_ring.photos` finds, and the exact capture of the same views. alone: a row without any disturbance and one for each
-that calibration and masks do not undo, with exact ones: what it costs where nothing models it. All are cropped to the
-object. In each cell: mean error of the normals and of the depth where both surfaces are seen, after a similarity, how
-often that of the exact capture the former is, and how much larger the object is than it should be. By the preset
-`fast` errors of masks are hidden by those of the preset. It goes on where it stopped.
+`mi_ring.photos` finds, and the exact capture of the same views. alone: a row without any disturbance, one of all that
+exact calibration undoes, and one for each other, with exact calibration and masks: what it costs where nothing models
+it. All are cropped to the object. In each cell: mean error of the normals and of the depth where both surfaces are
+seen, after a similarity, how often that of the exact capture the former is, and how much larger the object is than it
+should be. By the preset `fast` errors of masks are hidden by those of the preset. It goes on where it stopped.
 """
 
 import argparse
@@ -103,18 +103,22 @@ def main() -> None:
             made = ["--object", name, "--disturbances", disturbances, "--ambient", ambient, "--views", options.views,
                     "--size", options.size]  # fmt: skip
             folder = options.out / name / row.replace(", ", "_").replace(" ", "_").rstrip("%")
-            kept = folder / "result.json"
-            if not kept.exists():
+            kept, words = folder / "result.json", " ".join(map(str, [*made, *fit]))
+            known_before = json.loads(kept.read_text()) if kept.exists() else {}
+            if known_before.get("made") != words:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
-                first = ambient == USUAL  # the exact one is the same whatever the room
-                numbers = found(folder, made, fit, first) if options.rows == "all" else known(folder, made, fit)
-                kept.write_text(json.dumps(numbers))
-            results[row, name] = json.loads(kept.read_text())
+                exact = ambient == USUAL  # it is the same whatever the room
+                numbers = found(folder, made, fit, exact) if options.rows == "all" else known(folder, made, fit)
+                if "failed" not in numbers["this"]:
+                    kept.write_text(json.dumps(numbers | {"made": words}))
+            else:
+                numbers = known_before
+            results[row, name] = numbers
             print(f"{name}, {row}: {results[row, name]}", file=sys.stderr, flush=True)
-    first = results[next(iter(rows)), options.objects[0]]
-    exact = {name: results[next(iter(rows)), name]["exact" if "exact" in first else "this"] for name in options.objects}
-    lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]] if "exact" in first else []
+    reference = "exact" if options.rows == "all" else "this"  # of the first row
+    exact = {name: results[next(iter(rows)), name][reference] for name in options.objects}
+    lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]] if options.rows == "all" else []
     for row in rows:
         lines.append([row, *(cell(results[row, name]["this"], exact[name]) for name in options.objects)])
     import torch

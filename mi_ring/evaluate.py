@@ -36,8 +36,8 @@ class EvaluateConfig:
     """Leave out of Chamfer distance and F-score what no photograph of the fit shows, of both surfaces."""
     align: Literal["rigid", "similarity"] | None = None
     """Move the true surface, and photographs of --novel, onto the fitted one first, rigidly or scaled as well: refined
-    cameras do not say where the object as a whole is. All figures but those of its own photographs are then after
-    alignment."""
+    cameras do not say where the object as a whole is. All figures but those of the fit's own photographs are
+    then after alignment."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs."""
     out: Path | None = None

@@ -33,8 +33,8 @@ class ExportConfig(MaterialOptions):
     .ply: the mesh with the parameters of its BSDF as vertex attributes, and whether any photograph shows the vertex.
     .glb: with a normal map and the material as glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files.
     .xml: a scene for Mitsuba, with bitmap textures and a stock BSDF, that needs no mi_ring. Positions are in the
-    scene's units and frame; a GLB has a node that makes metres of the units and puts the object upright, where the
-    capture says both.
+    scene's units and frame; a GLB has a node that makes metres of the units and puts the object upright, as far as the
+    capture says them.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -108,7 +108,8 @@ def main(arguments: Sequence[str]) -> None:
         write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, metres, views, ring.up))
         files = [config.file]
         if metres is None:
-            print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres")
+            print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
+                  file=sys.stderr)  # fmt: skip
     else:
         print("Cutting the surface open and baking its material", flush=True)
         atlas = unwrap(ring, level, config.resolution, config.time)

@@ -15,6 +15,10 @@ from torch.nn import functional as F
 
 from mi_ring.system.files import write_file
 
+#: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
+PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1, on numpy arrays."""

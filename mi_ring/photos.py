@@ -128,8 +128,6 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
-    if config.out.is_file():
-        raise InputError(f"{config.out}: DIR: is a file; give a folder, which is made if it is not there")
     if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
@@ -205,8 +203,9 @@ def make(config: PhotosConfig, scene: Path) -> None:
         print("Table: none found; if the object stands on one, see in the contact sheet that it is not in the masks")
     if config.masks == "auto":  # what shows a table and no mask would be taken for the object
         motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
+    has_up = True
     if not sheet:
-        motion, plane = upright(motion, found.center, plane, ups(pictures))
+        motion, plane, has_up = upright(motion, found.center, plane, ups(pictures))
         found = found._replace(center=np.zeros(3))
     offset = np.array(config.flash_offset)
     flash = flash_of(pictures, motion, found, offset, sheet) if sheet else None
@@ -215,7 +214,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     taken = shots(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
-    ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0, 1]) if plane is None else plane.normal
+    ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     root, writer = scene_element([], ground, up, METRES if sheet else None), Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
         harmonics = np.zeros((COUNT, 3))

@@ -87,6 +87,8 @@ SPHERE = '<point name="center" x="400" y="-150" z="90"/><float name="radius" val
 BROKEN = {
     "no scene": (lambda path: path.unlink(), [], ["small.xml", "no such file"]),
     "a folder instead": (lambda path: (path.unlink(), path.mkdir()), [], ["small.xml", "is a folder"]),
+    "a photograph": (lambda path: path.rename(path.with_name("small.jpg")) and path.with_name("small.xml").mkdir(), [],
+                     ["small.xml", "mi-ring photos makes one"]),
     "a folder with a scene": (lambda path: (path.rename(path.with_name("scene.xml")), path.mkdir(),
                                             path.with_name("scene.xml").rename(path / "scene.xml")), [],
                               ["small.xml: is a folder; give ", "scene.xml"]),

@@ -250,14 +250,19 @@ def test_sphere_of_the_xml_wins(broken_capture):
 def test_a_fit_keeps_the_ground_of_the_xml(broken_capture, tmp_path):
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"/><point name="ground" x="1" y="2" z="-3"/>'
-         '<vector name="up" x="0" y="3" z="4"/>')  # fmt: skip
+         '<vector name="up" x="0" y="3" z="4"/><float name="metres" value="0.001"/>')  # fmt: skip
     capture = loading.load_capture(path)
     np.testing.assert_allclose(capture.shape.ground, [[1, 2, -3], [0, 0.6, 0.8]], atol=1e-6)
     ring = Fit(capture, Config(iterations=2, levels=(1,), widths=(32,), shares=(1.0,))).ring
     write_state(ring_state(ring), tmp_path / "ring.pt")
-    np.testing.assert_allclose(load_fit(tmp_path).ground, capture.shape.ground, atol=1e-6)
+    saved = load_fit(tmp_path)
+    np.testing.assert_allclose(saved.ground, capture.shape.ground, atol=1e-6)
+    np.testing.assert_allclose(saved.up, [0, 0.6, 0.8], atol=1e-6)
+    assert saved.metres == pytest.approx(0.001)
     text = fitted_scene_xml(path, tmp_path, 3, ring.bsdf).decode()
-    assert "ring.pt" in text and "ground" not in text and '"up"' not in text
+    assert "ring.pt" in text and "ground" not in text and '"up"' not in text and "metres" not in text
+    again = mi.load_dict({"type": "scene", "object": {"type": "shapenet", "weights": str(tmp_path / "ring.pt")}})
+    assert (again.shapes()[0].up, again.shapes()[0].metres) == (saved.up, saved.metres)
 
 
 def test_exposure_and_reflectance_follow_the_lamp(small_capture):

@@ -17,7 +17,7 @@ from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import predictions, surfaces
 from mi_ring.output import ply
 from mi_ring.rendering import crossings, plain_mesh
-from mi_ring.rendering.lights import Lights
+from mi_ring.rendering.lights import Light, Lights
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import run
@@ -99,6 +99,11 @@ def test_photographs_move_with_the_truth(small_capture):
         ]
         np.testing.assert_allclose(places[0][0], places[1][0], atol=1e-3)
         np.testing.assert_allclose(1.3 * places[0][1], places[1][1], rtol=1e-5)
+    sun = Light("directional", np.array([0.6, 0.0, -0.8]), np.array([3.0, 2, 1]))
+    lit = calibrated.with_calibration(capture, [s.camera for s in capture.sensors], [sun] * len(capture))
+    turned = Lights.of(calibrated.moved(lit, matrix).sensors)[0]
+    np.testing.assert_allclose(turned.vector, Rotation.from_rotvec([0.1, -0.2, 0.3]).apply(sun.vector), atol=1e-6)
+    np.testing.assert_allclose(turned.rgb, sun.rgb)
     before, after = Lights.of(capture.sensors), Lights.of(there.sensors)
     distances = [np.linalg.norm(lights.positions() - p, axis=1, keepdims=True)
                  for lights, p in ((before, point), (after, trimesh.transform_points(point, matrix)))]  # fmt: skip

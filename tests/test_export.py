@@ -76,7 +76,7 @@ def test_a_glb_is_in_metres_and_upright_where_the_capture_says_so(run, ring, tmp
     for source, name in ((run, "plain.glb"), (tmp_path / "ring.pt", "upright.glb")):
         export.main([str(source), str(tmp_path / name), "--subdivisions", "3", "--resolution", "64"])
         sizes.append(trimesh.load(tmp_path / name).bounds)  # with the node's transform
-    told = capsys.readouterr().out
+    told = capsys.readouterr().err
     plain, upright = sizes
     np.testing.assert_allclose(upright[:, 1], -0.01 * plain[::-1, 0], rtol=1e-4)
     np.testing.assert_allclose(upright[:, 2], 0.01 * plain[:, 2], rtol=1e-4)

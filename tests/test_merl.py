@@ -94,17 +94,43 @@ def test_it_is_reciprocal(table):
 def test_what_was_not_measured_is_what_is_around_it(table, tmp_path):
     values = closed_form(*nodes())
     values[::3, ::2, ::2] = np.nan  # never a whole corner of eight
+    values[20:23, 30:60, :, 0] = np.nan  # of one colour alone, all around: no colour of these cells is known
     values[80:] = np.nan
     write(tmp_path / "holes.binary", values)
     wi, wo = directions(300, 5, 50.0), directions(300, 6, 50.0)
     whole, holes = (evaluate(mi.load_dict({"type": "merl", "filename": str(path)}), wi, wo)
                     for path in (table, tmp_path / "holes.binary"))  # fmt: skip
-    np.testing.assert_allclose(whole, holes, rtol=0.05)
+    angles = np.array([rusinkiewicz(a, b)[:2] for a, b in zip(wi, wo)])
+    cell = 90 * np.sqrt(angles[:, 0] / (np.pi / 2))
+    known = ~((abs(cell - 21) < 2.1) & (abs(np.degrees(angles[:, 1]) - 44.5) < 16))
+    np.testing.assert_allclose(whole[known], holes[known], rtol=0.05)
+    assert (holes[~known] <= 1.2 * whole[~known]).all()
     grazing = evaluate(mi.load_dict({"type": "merl", "filename": str(tmp_path / "holes.binary")}),
                        directions(1, 7), np.array([[0.9999, 0, 0.014]]))  # fmt: skip
     assert np.isfinite(grazing).all() and (grazing >= 0).all()
     flat = np.array([[1.0, 0, 0.02]]), np.array([[0.98, 0.2, 0.02]])
     assert (evaluate(mi.load_dict({"type": "merl", "filename": str(tmp_path / "holes.binary")}), *flat) == 0).all()
+
+
+def test_it_says_what_it_needs(table):
+    with pytest.raises(RuntimeError, match="filename is missing"):
+        mi.load_dict({"type": "merl"})
+    before = mi.variant()
+    try:
+        mi.set_variant("scalar_rgb")
+        with pytest.raises(RuntimeError, match=r"needs a variant llvm_\*_rgb or cuda_\*_rgb, not scalar_rgb"):
+            mi.load_dict({"type": "merl", "filename": str(table)})
+    finally:
+        mi.set_variant(before)
+
+
+def test_seen_from_the_light_it_is_the_cell_of_its_angle(table):
+    """Camera and light at one place: θd = 0."""
+    wi = directions(50, 11)
+    found = evaluate(mi.load_dict({"type": "merl", "filename": str(table)}), wi, wi)
+    theta = np.arccos(wi[:, 2])
+    expected = closed_form(theta, 0 * theta, 0 * theta) * wi[:, 2:]  # φd says nothing, but a table has a value for each
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=0.01)
 
 
 @pytest.mark.parametrize("viewer", [(0, 0), (40, -37), (75, 110)])
@@ -114,6 +140,14 @@ def test_directions_are_drawn_by_the_density(table, viewer):
     sample, pdf = mi.chi2.BSDFAdapter("merl", f'<string name="filename" value="{table}"/>', wi=list(map(float, wi)))
     test = mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, ires=16)
     assert test.run(significance_level=0.01, test_count=3, quiet=True), test.messages
+
+
+def test_directions_are_drawn_by_the_density_of_a_network(tmp_path):
+    networks(tmp_path / "nets.npz")
+    values = f'<string name="filename" value="{tmp_path}/nets.npz"/><string name="material" value="one"/>'
+    sample, pdf = mi.chi2.BSDFAdapter("merl", values, wi=[0.6, 0.0, 0.8])
+    test = mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, ires=16)
+    assert test.run(significance_level=0.01, test_count=1, quiet=True), test.messages
 
 
 def test_drawn_directions_give_the_albedo(table):
@@ -158,7 +192,7 @@ def test_a_network_is_what_numpy_makes_of_it(tmp_path):
 
 
 def test_networks_are_near_what_was_measured(shared):
-    """At θd = 0, where camera and light are at one place: the median over materials and angles, stated with them."""
+    """At θd = 0, where camera and light are at one place: to 9.5 % in the median, by what the data say."""
     nets, measured = shared / "data/brdf/nbrdf_merl_weights.npz", np.load(shared / "data/brdf/merl_colocated_slice.npz")
     theta = measured["theta_h_rad"][:60]
     wi = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], 1)
@@ -177,12 +211,15 @@ def test_what_is_no_material_is_one_clear_error(table, tmp_path):
     (tmp_path / "other.binary").write_bytes(bytes(100))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     np.savez(tmp_path / "empty.npz", names=["one"])
+    layers = {"w1": (21, 6), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3), "b3": (3,)}
+    np.savez(tmp_path / "turned.npz", names=["one"], **{name: np.zeros((1, *shape)) for name, shape in layers.items()})
     for file, material, message in (
-        ("cut.binary", "", "must have 4374000; it was cut off"),
+        ("cut.binary", "", "must have 4374000"),
         ("other.binary", "", r"begins with \[0, 0, 0\], must be \[90, 90, 180\]"),
         ("none.binary", "", "which is no file"),
         ("nets.npz", "gold", 'no material "gold"; must be one of one, other'),
-        ("broken.npz", "one", "cannot be read"),
+        ("broken.npz", "one", "is no .npz, or was cut off"),
+        ("turned.npz", "one", r"w1 is of shape \[1, 21, 6\], must be \[1, 6, 21\]"),
         ("empty.npz", "one", "has no array w1"),
         (str(table), "gold", "a table holds one alone"),
     ):

@@ -211,6 +211,8 @@ def test_saved_fit_of_another_domain_loads(torus, tmp_path):
         ({"radius": -2.0}, "radius is -2"),
         ({"weights": "ring.pt", "ground": CENTER}, "weights carry their own ground"),
         ({"ground": CENTER, "up": [0.0, 0.0, 0.0]}, "up is .* must be a <vector> that is not 0"),
+        ({"up": 1.0}, "up is 1.0, must be a <vector>"),
+        ({"ground": "there"}, "ground is there, must be a <point>"),
         ({"metres": -1.0}, "metres is -1.0, must be a positive number"),
         ({"weights": "ring.pt", "metres": 1.0}, "weights carry their own metres"),
     ],

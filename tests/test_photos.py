@@ -189,14 +189,16 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
         cameras[str(k)] = LENS, turned
     motion = Motion(cameras, (turn @ CENTER)[None], None, {})
     ups = dict.fromkeys(cameras, np.array([0.0, -1, 0]))
-    moved, none = upright(motion, turn @ CENTER, None, ups)
+    moved, none, known = upright(motion, turn @ CENTER, None, ups)
     np.testing.assert_allclose(moved.points, 0, atol=1e-9)
     heights = [pose[2, 3] for _, pose in moved.cameras.values()]
     distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
     assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
-    assert none is None
+    assert none is None and known
+    ways = {name: Rotation.from_euler("z", 30 * k, degrees=True).apply([0, -1, 0]) for k, name in enumerate(cameras)}
+    assert not upright(motion, turn @ CENTER, None, ways)[2]  # held in every way
     low = Plane(turn[:, 2], float(turn[:, 2] @ turn @ (CENTER - [0, 0, 3])))  # 3 below the object's middle
-    exact, plane = upright(motion, turn @ CENTER, low, ups)
+    exact, plane, _ = upright(motion, turn @ CENTER, low, ups)
     np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-9)
     assert plane.offset * 18 == pytest.approx(-3, rel=0.1)  # the cameras are 18 away, now 1
     for (_, pose), before in zip(exact.cameras.values(), poses(12)):

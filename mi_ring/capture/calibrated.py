@@ -38,7 +38,7 @@ def with_calibration(
 def moved(capture: Capture, matrix: np.ndarray) -> Capture:
     """The same photographs, with the cameras and lights of a scene that a similarity (4, 4) has moved.
 
-    A room that is fixed in the world stays as it is: for small motions.
+    What else the scene holds (a room, a table, lamps) stays as it is: for small motions.
     """
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     rotation = matrix[:3, :3] / scale

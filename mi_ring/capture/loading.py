@@ -9,6 +9,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import is_linear, read_mask, read_photograph
 from mi_ring.capture.masks import find_masks
 from mi_ring.errors import InputError, SceneError, require_file
+from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
@@ -68,11 +69,11 @@ def read_once(files: list, field: str, scene: Path) -> list:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError, which says what to give, if a path is not that of a file, or of a photograph."""
-    photographs = path.is_dir() or path.suffix.lower() in (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".dng")
+    """Raise InputError, which says what to give, if a path is no file, or is a photograph."""
+    photographs = path.is_dir() or path.suffix.lower() in PLAIN + HEIF + RAW
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
-    require_file(path, f"{inside}" if inside.is_file() else usual)
+    require_file(path, str(inside) if inside.is_file() else usual)
     if photographs:
         raise InputError(f"{path}: is a photograph; give {usual}")
 

@@ -62,7 +62,6 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     else:
         masks = f"{given} of {len(rows)} photographs" + ("" if given else "; the start will be a guess")
     mend = [f"To mend: {line}" for line in found] or ["Nothing to mend found."]
-    place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g} [{}]".format(
-        *center, radius, "mm" if capture.shape.metres == 1e-3 else "scene units"
-    )
+    unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
+    place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
     return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *mend]), found, page)

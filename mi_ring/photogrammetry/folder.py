@@ -11,16 +11,13 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
-PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 TRANSPARENT = (".png", ".tif", ".tiff")  #: what may have an alpha channel
-HEIF = (".heic", ".heif")
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF
 FEWEST = 8  #: photographs that a reconstruction needs at least
 

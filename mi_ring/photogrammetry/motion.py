@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -205,9 +206,7 @@ def epipolar(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) 
 def motion_of(model: Any, pictures: Sequence[Picture], folder: Path) -> Motion:
     """In terms of the photographs as they were taken."""
     cameras = cameras_of(model, pictures)
-    detail = {p.name: detail_of(folder / "grey" / file_of(p)) for p in pictures}
-    usual = float(np.median([detail[name] for name in cameras]))
-    failed = {p.name: reason_of(p, folder, detail[p.name] < PLAIN * usual) for p in pictures if p.name not in cameras}
+    failed = reasons([p for p in pictures if p.name not in cameras], [p for p in pictures if p.name in cameras], folder)
     by_file = {file_of(picture): picture for picture in pictures}
     placed = [model.images[k] for k in model.reg_image_ids()]
     scales = [reduction(model, image, by_file[image.name].size) for image in placed]
@@ -225,10 +224,19 @@ def model_points(folder: Path) -> np.ndarray:
     return points_of(need("pycolmap", f"{folder}").Reconstruction(folder))
 
 
+def reasons(failed: Sequence[Picture], others: Sequence[Picture], folder: Path) -> dict[str, str]:
+    """Why each of some photographs has got no camera, by its name; the others have."""
+    if not failed:
+        return {}
+    detail = {p.name: detail_of(folder / "grey" / file_of(p)) for p in (*failed, *others)}
+    usual = float(np.median([detail[p.name] for p in others]))
+    return {p.name: reason_of(p, folder, detail[p.name] < PLAIN * usual) for p in failed}
+
+
 def detail_of(file: Path) -> float:
     """How much a photograph varies from pixel to pixel, but for noise."""
-    grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    return 0.0 if grey is None else float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
+    grey = np.array(Image.open(file).convert("L"))
+    return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def reason_of(picture: Picture, folder: Path, plain: bool) -> str:

@@ -31,7 +31,7 @@ from mi_ring.system.progress import Progress
 
 FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
 FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
-FORMAT = 2  #: of what is kept; more whenever it changes
+FORMAT = 2  #: of what is kept; to be raised whenever that changes
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -53,19 +53,21 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 
 def upright(
     motion: Motion, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
-) -> tuple[Motion, Plane | None]:
+) -> tuple[Motion, Plane | None, bool]:
     """Moved so that the object's `center` (3,) is the origin, and z the table's normal or the photographs' mean up.
 
     `ups` (3,): where that is in the axes of each camera.
 
-    The unit is the median distance from the cameras to the object.
+    The unit is the median distance from the cameras to the object. Also: is there an up? Not if photographs without a
+    table were held in every way.
     """
     poses = np.stack([pose for _, pose in motion.cameras.values()])
     scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in motion.cameras.items()], 0)
-    rotation = rotation_to_z(up / np.linalg.norm(up)) if np.linalg.norm(up) > 0.1 else np.eye(3)
+    known = bool(np.linalg.norm(up) > 0.1)
+    rotation = rotation_to_z(up / np.linalg.norm(up)) if known else np.eye(3)
     table = plane and Plane(rotation @ plane.normal, scale * (plane.offset - float(center @ plane.normal)))
-    return motion.moved(scale, rotation, -scale * rotation @ center), table
+    return motion.moved(scale, rotation, -scale * rotation @ center), table, known
 
 
 def rotation_to_z(direction: np.ndarray) -> np.ndarray:

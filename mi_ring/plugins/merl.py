@@ -22,15 +22,17 @@ class Merl(mi.BSDF):
     ``material`` string    which of the networks, by its name; none of a table
     ============ ========= =====================================================================
 
-    Values are those of the file, interpolated between the cells of a table in the coordinates of Rusinkiewicz 1998 (A
-    New Change of Variables for Efficient BRDF Representation), in which it is reciprocal. Where nothing was measured
-    the cells around say what there is, and where these have nothing either the material is black. The networks, of the
+    Values are those of the file, in the coordinates of Rusinkiewicz 1998 (A New Change of Variables for Efficient BRDF
+    Representation). Those of a table are interpolated between its cells, and reciprocal; where nothing was measured the
+    cells around say what there is, and where these have nothing either the material is black. The networks, of the
     arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3``, take (sin θh, 0, cos θh) and the
-    difference vector; beyond θh = 80° or θd = 65° they are held as they are there.
+    difference vector, and are reciprocal as far as they fit; beyond θh = 80° or θd = 65° they are held as they are
+    there.
 
     Directions are drawn from a mixture of the cosine and of half vectors as bright as the material is at θd = 30°.
 
-    What it does not do: the files hold no energy balance, and none is enforced. Nothing of it is differentiable.
+    What it does not do: it has no differentiable parameters, no second side, and no colours but RGB; the files hold no
+    energy balance, and none is enforced. It needs one of Mitsuba's variants ``llvm_*_rgb`` or ``cuda_*_rgb``.
 
     Raises ValueError for a file that is neither, for one that is cut off, and for an unknown material.
 
@@ -49,7 +51,11 @@ class Merl(mi.BSDF):
 
     def __init__(self, props):
         super().__init__(props)
-        self.path, self.material = beside_scene(str(props.get("filename", ""))), str(props.get("material", ""))
+        if not mi.is_rgb or dr.size_v(mi.Float) == 1:
+            raise ValueError(f'merl "{props.id()}": needs a variant llvm_*_rgb or cuda_*_rgb, not {mi.variant()}')
+        if "filename" not in props:
+            raise ValueError(f'merl "{props.id()}": filename is missing; give a .binary of MERL or an .npz of networks')
+        self.path, self.material = beside_scene(str(props["filename"])), str(props.get("material", ""))
         if not self.path.is_file():
             raise ValueError(f'merl "{props.id()}": filename is "{self.path}", which is no file')
         if self.path.suffix == ".npz":

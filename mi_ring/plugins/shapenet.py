@@ -7,14 +7,8 @@ from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 
-FOR_FITS = (
-    "center",
-    "radius",
-    "domain",
-    "ground",
-    "up",
-    "metres",
-)  #: what says where a fit starts; finished ones have it in them
+#: What says where a fit starts and what its result is to other programs; finished ones have it in them.
+FOR_FITS = "center", "radius", "domain", "ground", "up", "metres"
 
 
 class ShapeNetMesh(mi.Mesh):
@@ -37,9 +31,10 @@ class ShapeNetMesh(mi.Mesh):
     ``ground``       point     on the table that the object stands on [scene units]: the surface does
                                not go below, where no photograph shows it. Not together with
                                ``weights``. Default: none
-    ``up``           vector    normal of the table, or what else is up, for exports. Default: z, unknown
-                               to exports
-    ``metres``       float     length of a scene unit, for exports. Default: not known
+    ``up``           vector    normal of the table, or what else is up, for exports. Not together with
+                               ``weights``. Default: z for ``ground``; exports leave the object as it is
+    ``metres``       float     length of a scene unit, for exports. Not together with ``weights``.
+                               Default: not known
     ``to_world``     transform applied on top of everything. Default: none
     ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
                                to false to place a fit into a scene of your own. Default: true
@@ -103,24 +98,27 @@ class ShapeNetMesh(mi.Mesh):
             # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
+        def three(key, kind):
+            found = np.array(given[key]).ravel() if key in given else None
+            if found is not None and not (found.shape == (3,) and found.dtype.kind == "f" and np.isfinite(found).all()):
+                raise ValueError(f'shapenet "{props.id()}": {key} is {given[key]}, must be a <{kind}>')
+            return found
+
         #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
-        self.center = np.array(given["center"]).ravel() if "center" in given else None
+        self.center = three("center", "point")
         self.radius = number(props, "radius", positive=True) if "radius" in given else None
-        if self.center is not None and not (self.center.dtype.kind == "f" and np.isfinite(self.center).all()):
-            raise ValueError(f'shapenet "{props.id()}": center is {given["center"]}, must be a <point>')
-        #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
-        self.ground = None
-        up = np.array(given.get("up", [0.0, 0.0, 1.0])).ravel()
-        unit = up / max(np.linalg.norm(up), 1e-30)
-        if not (np.isfinite(up).all() and up.any()):
-            raise ValueError(f'shapenet "{props.id()}": up is {up.tolist()}, must be a <vector> that is not 0')
-        if "ground" in given:
-            self.ground = np.stack([np.array(given["ground"]).ravel(), unit])
-            if not np.isfinite(self.ground).all():
-                raise ValueError(f'shapenet "{props.id()}": ground is {given["ground"]}, must be a <point>')
         #: (3,) what is up, and the length of a scene unit, for exports; None where it says nothing.
-        self.up = unit.tolist() if "up" in given else None
-        self.metres = number(props, "metres", positive=True) if "metres" in given else None
+        self.up, self.metres = three("up", "vector"), None
+        if self.up is not None:
+            if not self.up.any():
+                raise ValueError(f'shapenet "{props.id()}": up is {given["up"]}, must be a <vector> that is not 0')
+            self.up = self.up / np.linalg.norm(self.up)
+        if "metres" in given:
+            self.metres = number(props, "metres", positive=True)
+        #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
+        self.ground = three("ground", "point")
+        if self.ground is not None:
+            self.ground = np.stack([self.ground, [0.0, 0.0, 1.0] if self.up is None else self.up])
         #: The domain that it names, with its own normalising sphere, or None.
         self.domain, self.domain_file = None, None
         if "domain" in given:
@@ -129,6 +127,8 @@ class ShapeNetMesh(mi.Mesh):
         sphere = Sphere(), np.zeros(3) if self.center is None else self.center, self.radius or 1.0
         domain, center, radius = self.domain or sphere
         self.ring = load_fit(beside_scene(given["weights"])) if "weights" in given else None
+        if self.ring is not None:
+            self.up, self.metres = self.ring.up, self.ring.metres
 
         material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
                     "roughness": torch.tensor(0.5)}  # fmt: skip

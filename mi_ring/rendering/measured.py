@@ -1,18 +1,16 @@
 """Reflectance as it was measured: tables of the MERL database, and networks that were fitted to them."""
 
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import is_zipfile
 
 import drjit as dr
-import drjit.nn as nn
 import mitsuba as mi
 import numpy as np
 
 CELLS = 90, 90, 180  #: of a table: θh, θd, φd
 SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its planes, red, green, blue
-#: How far the networks are trusted, θh and θd [radians]: beyond, they were fitted to little and grow without bounds.
-TRUSTED = np.radians([80.0, 65.0])
-LAYERS = ("w1", "b1", "w2", "b2", "w3", "b3")
+TRUSTED = np.radians([80.0, 65.0])  #: θh and θd, beyond which the networks were fitted to little
+LAYERS = {"w1": (6, 21), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3), "b3": (3,)}  #: of each network
 
 
 class Table:
@@ -29,11 +27,11 @@ class Table:
                 raise ValueError(f"{path}: is no table of MERL: begins with {sizes.tolist()}, must be {list(CELLS)}")
             values = np.fromfile(file, "<f8")
         if values.size != 3 * np.prod(CELLS):
-            raise ValueError(f"{path}: has {values.size} numbers, must have {3 * np.prod(CELLS)}; it was cut off")
+            raise ValueError(f"{path}: has {values.size} numbers, must have {3 * np.prod(CELLS)}")
         planes = values.reshape(3, *CELLS)
-        measured = np.isfinite(planes) & (planes >= 0)
+        measured = (np.isfinite(planes) & (planes >= 0)).all(0)
         planes = np.where(measured, planes * SCALES[:, None, None, None], 0)
-        weights = np.concatenate([planes, measured.all(0)[None]]).transpose(1, 2, 3, 0)
+        weights = np.concatenate([planes, measured[None]]).transpose(1, 2, 3, 0)
         weights = np.concatenate([weights, weights[:, :, :1]], 2)  # after the last φd comes the first
         tensor = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
@@ -53,19 +51,20 @@ class Network:
     """A network of 6-21-21-3 neurons that was fitted to such a table ("Neural BRDF Representation", Sztrajman 2021)."""
 
     def __init__(self, path: Path, material: str):
-        try:
-            with np.load(path) as file:
-                missing = [name for name in ("names", *LAYERS) if name not in file]
-                if missing:
-                    raise ValueError(f"{path}: has no array {missing[0]}; is it one of networks fitted to MERL?")
-                names = [str(name) for name in file["names"]]
-                if material not in names:
-                    raise ValueError(f'{path}: has no material "{material}"; must be one of {", ".join(names)}')
-                arrays = [file[name][names.index(material)].astype(np.float32) for name in LAYERS]
-        except (BadZipFile, OSError) as error:
-            raise ValueError(f"{path}: cannot be read: {error}") from None
-        tensors = [mi.TensorXf(np.ascontiguousarray(a.T)) if a.ndim == 2 else mi.Float(a) for a in arrays]
-        self.layers = list(nn.pack(*tensors, layout="inference"))
+        if not is_zipfile(path):
+            raise ValueError(f"{path}: is no .npz, or was cut off")
+        with np.load(path) as file:
+            for name in ("names", *LAYERS):
+                if name not in file:
+                    raise ValueError(f"{path}: has no array {name}; is it one of networks fitted to MERL?")
+            names = [str(name) for name in file["names"]]
+            for name, shape in LAYERS.items():
+                if file[name].shape != (len(names), *shape):
+                    found, wanted = list(file[name].shape), [len(names), *shape]
+                    raise ValueError(f"{path}: {name} is of shape {found}, must be {wanted}")
+            if material not in names:
+                raise ValueError(f'{path}: has no material "{material}"; must be one of {", ".join(names)}')
+            self.layers = [file[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
         """As `Table.value`."""
@@ -75,6 +74,14 @@ class Network:
         share = narrowed / dr.maximum(sin, 1e-9)
         x = [dr.sin(theta), mi.Float(0), dr.cos(theta), d.x * share, d.y * share, dr.sqrt(1 - narrowed * narrowed)]
         w1, b1, w2, b2, w3, b3 = self.layers
-        y = dr.maximum(nn.matvec(w1, nn.CoopVec(*x), b1), 0)
-        y = dr.maximum(nn.matvec(w2, y, b2), 0)
-        return dr.maximum(dr.exp(mi.Color3f(*nn.matvec(w3, y, b3))) - 1, 0)
+        y = [dr.maximum(sum_, 0) for sum_ in layer(x, w1, b1)]
+        y = [dr.maximum(sum_, 0) for sum_ in layer(y, w2, b2)]
+        return dr.maximum(dr.exp(mi.Color3f(*layer(y, w3, b3))) - 1, 0)
+
+
+def layer(x: list, weights: list, biases: list) -> list:
+    """Weighted sums of x (n) by weights (n, m), and biases (m). Dr.Jit's own layers need half precision on a GPU."""
+    sums = [mi.Float(bias) for bias in biases]
+    for value, row in zip(x, weights):
+        sums = [dr.fma(value, weight, sum_) for weight, sum_ in zip(row, sums)]
+    return sums

@@ -20,7 +20,7 @@ class Ring(nn.Module):
     paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shapenet.Flow` and
     `mi_ring.nets.brdfnet.ReflectanceMap` say. `ground` (2, 3): a point on the table that the object stands on, and the
     table's unit normal; below it nothing is seen, and what the flow has there lies flat on it. `up` (3,) and `metres`,
-    the length of a scene unit, are for programs that ask; None where they are not known.
+    the length of a scene unit, are for exports; None where they are not known.
     """
 
     shape_net: Flow
@@ -34,7 +34,7 @@ class Ring(nn.Module):
         domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE,
         bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
         networks: tuple[Flow, ReflectanceMap] | None = None, ground: np.ndarray | Tensor | None = None,
-        up: Sequence[float] | None = None, metres: float | None = None,
+        up: Sequence[float] | np.ndarray | None = None, metres: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
@@ -43,7 +43,8 @@ class Ring(nn.Module):
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.register_buffer("ground", None if ground is None else torch.as_tensor(ground, dtype=torch.float32))
         self.domain = domain or Sphere()
-        self.up, self.metres = up, metres
+        self.up = None if up is None else [float(x) for x in up]
+        self.metres = None if metres is None else float(metres)
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
         """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""

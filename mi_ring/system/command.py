@@ -65,7 +65,7 @@ def complaint_in(box: str) -> str:
     alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
     complaint = " ".join(parts[0]) or " ".join(box.split())
     if complaint.startswith("Missing from "):  # then come names and help of all that is
-        names = re.findall(r"(?:: |\(required\) )(--\S+|[A-Z]+)(?= )", complaint)
+        names = re.findall(r"(?:: |\(required\) )(--\S+|[A-Z]{2}\S*)(?= )", complaint)
         if names:
             return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
@@ -77,7 +77,7 @@ def complaint_in(box: str) -> str:
         complaint = f"{choice[2]}: is {choice[1]}; must be one of {choice[3]}".replace("'", "")
     count = re.match(r"Missing value for argument '(--\S+)'\. Expected (\d+) values", complaint)
     if count:
-        complaint = f"{count[1]}: must be {count[2]} value{'s' * (count[2] != '1')}"
+        complaint = f"{count[1]}: " + ("has no value" if count[2] == "1" else f"must be {count[2]} values")
     for kind, error in (
         ("whole number", r"invalid literal for int\(\) .*"),
         ("number", "could not convert string to float"),

@@ -70,9 +70,10 @@ def locked(folder: Path, field: str = "--out") -> Iterator[None]:
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
+    if place.is_file():
+        raise InputError(f"{folder}: {field}: is a file; give a folder, which is made if it is not there")
+    require_place(place, field)  # else filelock tells of another process
     with writing(f"{folder}: {field}"):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=place.parent).close()  # else filelock tells of another process
         lock = filelock.FileLock(file, timeout=0)
         try:
             lock.acquire()
