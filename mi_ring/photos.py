@@ -215,7 +215,8 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
-    root, writer = scene_element([], ground, up, METRES if sheet else None), Writer(scene)
+    # Only where the flash's power is known is the reflectance, too, of which Fresnel's depends.
+    root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
         harmonics = np.zeros((COUNT, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0

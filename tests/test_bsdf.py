@@ -39,13 +39,13 @@ every_viewer = pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
 every_distribution = pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 
 
-def cooktorrance(diffuse, specular, roughness, distribution="ggx"):
+def cooktorrance(diffuse, specular, roughness, distribution="ggx", **more):
     return mi.load_dict({
         "type": "cooktorrance",
         "diffuse": {"type": "rgb", "value": list(diffuse)},
         "specular": float(specular),
         "roughness": float(roughness),
-        "distribution": distribution,
+        "distribution": distribution, **more,
     })  # fmt: skip
 
 
@@ -190,6 +190,39 @@ def test_is_reciprocal_and_not_negative(material, distribution):
     there, back = evaluate(bsdf, i, o), evaluate(bsdf, o, i)
     np.testing.assert_allclose(there / i[:, 2:], back / o[:, 2:], rtol=1e-5, atol=1e-7)
     assert (there >= 0).all()
+
+
+def test_with_fresnel_it_is_as_glossy_as_glass_from_all_sides():
+    """Of F₀ = 0.04, a refractive index of 1.5: by Fresnel's own formula, which Schlick's is near."""
+    i, o = directions(400, 5), directions(400, 6)
+    h = (i + o) / np.linalg.norm(i + o, axis=1, keepdims=True)
+    exact = np.array(mi.fresnel(mi.Float((h * o).sum(1).astype(np.float32)), 1.5)[0])
+    lobe = twin(i, o, [0, 0, 0], 0.25, 0.4)  # of a mirror
+    found = evaluate(cooktorrance([0, 0, 0], 0.01, 0.4, fresnel=True), i, o)
+    np.testing.assert_allclose(found / lobe, exact[:, None] * np.ones(3), atol=0.035)
+    schlick = 0.04 + 0.96 * (1 - (h * o).sum(1)) ** 5
+    np.testing.assert_allclose(found / lobe, schlick[:, None] * np.ones(3), rtol=1e-4)
+    toward = evaluate(cooktorrance([0.1, 0.1, 0.1], 0.01, 0.4, fresnel=True), o, o)
+    np.testing.assert_allclose(toward, evaluate(cooktorrance([0.1, 0.1, 0.1], 0.01, 0.4), o, o), rtol=1e-5)
+    # More than a mirror, as where the lamp's power is not known, stays as it is.
+    bright = evaluate(cooktorrance([0, 0, 0], 0.5, 0.4, fresnel=True), i, o)
+    np.testing.assert_allclose(bright, evaluate(cooktorrance([0, 0, 0], 0.5, 0.4), i, o), rtol=1e-5)
+
+
+@every_viewer
+def test_with_fresnel_samples_follow_the_density(viewer):
+    xml = ('<rgb name="diffuse" value="0.2,0.1,0.1"/><float name="specular" value="0.01"/>'
+           '<float name="roughness" value="0.3"/><boolean name="fresnel" value="true"/>')  # fmt: skip
+    sample, pdf = mi.chi2.BSDFAdapter("cooktorrance", xml, wi=viewer.tolist())
+    test = mi.chi2.ChiSquareTest(
+        mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=1_000_000, res=201, ires=16
+    )
+    assert test.run(significance_level=0.01, test_count=len(VIEWERS), quiet=True), test.messages
+
+
+def test_fresnel_is_true_or_false():
+    with pytest.raises(RuntimeError, match="fresnel is yes, must be true or false"):
+        cooktorrance([0, 0, 0], 0.1, 0.3, fresnel="yes")
 
 
 def test_is_lambert_without_specular():

@@ -47,12 +47,12 @@ def photograph_element(
 
 def scene_element(
     photographs: Iterable[Element], ground: np.ndarray | None = None, up: np.ndarray | None = None,
-    metres: float | None = None,
+    metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
     """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`.
 
     `ground` (3,): a point on the table that the object stands on; `up` (3,): the table's normal, or what else is up;
-    `metres`: the length of a scene unit. None where it is not known.
+    `metres`: the length of a scene unit. None where it is not known. `fresnel`: of `cooktorrance`.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
@@ -63,7 +63,9 @@ def scene_element(
             ElementTree.SubElement(shape, tag, name=name, x=x, y=y, z=z)
     if metres is not None:
         ElementTree.SubElement(shape, "float", name="metres", value=numbers(metres))
-    ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
+    bsdf = ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
+    if fresnel:
+        ElementTree.SubElement(bsdf, "boolean", name="fresnel", value="true")
     root.extend(photographs)
     return root
 

@@ -21,9 +21,9 @@ from mi_ring.rendering.lights import Light
 from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: of the object's size, left free around it
-#: Pixels along photographs in which the table's albedo is looked for, a quarter of its width by the cameras' distance,
-#: and texels across: what it reflects varies slowly.
-TABLE_SEEN, TABLE_REACH, TABLE_TEXELS = 600, 0.5, 128
+#: Pixels along photographs in which the table's albedo is looked for, half of its width by the cameras' distance, and
+#: texels across: what it reflects varies slowly.
+TABLE_SEEN, TABLE_REACH, TABLE_TEXELS = 600, 1.0, 256
 OBJECT, UNSURE = 255, 128  #: in masks; 0 is the background
 
 

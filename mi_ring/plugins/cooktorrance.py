@@ -25,18 +25,23 @@ class CookTorrance(mi.BSDF):
                                        Default: the mesh attribute ``vertex_roughness``
     ``distribution`` string            D and the G that belongs to it: ``ggx`` or ``beckmann``.
                                        Default: ``ggx``
+    ``fresnel``      boolean           is more reflected at grazing angles? Default: false, the paper's
     ================ ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
     Rough Surfaces): D is equation 33 (GGX) or 25 (Beckmann) without its 1/π, G Smith's product of equations 34 or 27,
     the latter Walter's rational fit to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor`` with F = 1.
 
+    With ``fresnel`` ρᵞ rises to 1/4, as of a mirror, with the angle between o and h, by "An Inexpensive BRDF Model for
+    Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ of F₀ = 4 ρᵞ, which must be the true one.
+    A light next to the camera does not see it; light from a table does.
+
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
-    and narrow lobes reach it. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves energy. Nothing enforces
-    that: ρ also holds the scale of lamp and camera.
+    and narrow lobes reach it, without ``fresnel``. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves
+    energy. Nothing enforces that: ρ also holds the scale of lamp and camera.
 
     With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer.
     Black there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o
@@ -71,6 +76,9 @@ class CookTorrance(mi.BSDF):
         if self.distribution not in DISTRIBUTIONS:
             allowed = " or ".join(f'"{name}"' for name in DISTRIBUTIONS)
             raise ValueError(f'cooktorrance "{props.id()}": distribution is "{self.distribution}", must be {allowed}')
+        self.fresnel = props.get("fresnel", False)
+        if not isinstance(self.fresnel, bool):
+            raise ValueError(f'cooktorrance "{props.id()}": fresnel is {self.fresnel}, must be true or false')
         self.textures = {}
         for name in self.channels:
             if name not in props:
@@ -96,19 +104,25 @@ class CookTorrance(mi.BSDF):
         """D / π, G and the visible normals of a roughness, by Mitsuba."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
+    def at(self, specular, cosine):
+        """ρᵞ where o·h is a `cosine`."""
+        if not self.fresnel:
+            return specular
+        return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
+
     def reflected(self, ctx, si, wo, diffuse, specular, r, active):
         """B (n·i) of equation 1 [1/sr]."""
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the rim h may lie below; Mitsuba's D would jump to 0 there
-        lobe = self.lobe(r)
+        lobe, specular = self.lobe(r), self.at(specular, dr.dot(si.wi, h))
         # G for m = n: it asks nothing of m but the side, which is for `front` to say.
         gloss = specular * lobe.eval(h) * lobe.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
         value = diffuse * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
-    def gloss_probability(self, ctx, diffuse, specular):
+    def gloss_probability(self, ctx, si, diffuse, specular):
         """Probability of sampling the specular lobe, in proportion to the bounds of the two albedos, π ρᵈ and 4 ρᵞ.
 
         Detached: the choice of a lobe does not move with the parameters, so that its probability must not either.
@@ -117,7 +131,7 @@ class CookTorrance(mi.BSDF):
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         if not (has_diffuse and has_gloss):
             return mi.Float(1.0 if has_gloss else 0.0)
-        d, s = dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(diffuse))), dr.detach(4 * specular)
+        d, s = dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(diffuse))), dr.detach(4 * self.at(specular, si.wi.z))
         return dr.select(d + s > 0, s / (d + s), 0.5)
 
     def density(self, si, wo, r, gloss, active):
@@ -134,16 +148,16 @@ class CookTorrance(mi.BSDF):
 
     def pdf(self, ctx, si, wo, active=True):
         diffuse, specular, r = self.parameters(si, active)
-        return self.density(si, wo, r, self.gloss_probability(ctx, diffuse, specular), active)
+        return self.density(si, wo, r, self.gloss_probability(ctx, si, diffuse, specular), active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
         diffuse, specular, r = self.parameters(si, active)
         value = self.reflected(ctx, si, wo, diffuse, specular, r, active)
-        return value, self.density(si, wo, r, self.gloss_probability(ctx, diffuse, specular), active)
+        return value, self.density(si, wo, r, self.gloss_probability(ctx, si, diffuse, specular), active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         diffuse, specular, r = self.parameters(si, active)
-        gloss = self.gloss_probability(ctx, diffuse, specular)
+        gloss = self.gloss_probability(ctx, si, diffuse, specular)
         chosen = sample1 < gloss
         normal, _ = self.lobe(r).sample(si.wi, sample2)
         bs = dr.zeros(mi.BSDFSample3f)
