@@ -22,7 +22,8 @@ import trimesh
 
 from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
-from mi_ring.plugins import cooktorrance, flash, photograph, photometric, room, shapenet, table
+from mi_ring.plugins import cooktorrance, flash, merl, photograph, photometric, room, shapenet, table
+from mi_ring.rendering.measured import LAYERS
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 
@@ -33,7 +34,8 @@ def plugins():
     """By name; the modules are loaded anew with each variant, so that they must be asked each time."""
     return {
         "photograph": photograph.Photograph, "flash": flash.Flash, "room": room.Room, "shapenet": shapenet.ShapeNetMesh,
-        "cooktorrance": cooktorrance.CookTorrance, "table": table.Table, "photometric": photometric.Photometric,
+        "cooktorrance": cooktorrance.CookTorrance, "merl": merl.Merl, "table": table.Table,
+        "photometric": photometric.Photometric,
     }  # fmt: skip
 
 
@@ -127,6 +129,8 @@ def values(tmp_path):
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
     ring = Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
+    networks = tmp_path / "networks.npz"
+    np.savez(networks, names=["one"], **{name: np.zeros((1, *shape)) for name, shape in LAYERS.items()})
     moved = mi.ScalarTransform4f().translate([3, -1, 2])
     film = {"type": "hdrfilm", "width": 7, "height": 5}
     light = {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": [4, 5, 6]}}
@@ -143,10 +147,12 @@ def values(tmp_path):
         "shapenet": [
             {"weights": str(tmp_path / "ring.pt"), "subdivisions": 1, "to_world": moved, "flash": False},
             {"domain": str(tmp_path / "ball.ply"), "center": [1, 2, 3], "radius": 2.0, "subdivisions": 1,
-             "ground": [1, 1, 3], "up": [0, 2, 0],
+             "ground": [1, 1, 3], "up": [0, 2, 0], "metres": 0.01,
              "bsdf": {"type": "cooktorrance", "diffuse": grey, "specular": 0.2, "roughness": 0.4}},
         ],
-        "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "distribution": "beckmann"}],
+        "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "distribution": "beckmann",
+                          "fresnel": True}],
+        "merl": [{"filename": str(networks), "material": "one"}],
         "table": [{"to_world": moved, "bsdf": {"type": "diffuse", "reflectance": grey}}],
         "photometric": [{"shadows": False}],
     }  # fmt: skip
