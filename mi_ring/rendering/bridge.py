@@ -237,7 +237,7 @@ class Surroundings:
 
 
 def surroundings(
-    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 64, spp: int = 8,
+    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16,
     bounces: int = BOUNCES, room: bool = False,
 ) -> Surroundings:  # fmt: skip
     """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
