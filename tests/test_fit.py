@@ -543,8 +543,8 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--preset", "quick"], ["invalid choice 'quick' for argument '--preset'", "fast"]),
-        (["--preset"], ["Missing value for argument '--preset'"]),
+        (["--preset", "quick"], ["--preset: is quick; must be one of fast"]),
+        (["--preset"], ["--preset: has no value"]),
         (["--weights.mask", "-5"], ["--weights", "0 or more"]),
         (["--seed", str(2**70)], ["--seed", "below 2^63"]),
         (["--iterations", "many"], ["--iterations: is many; must be a whole number"]),
@@ -554,7 +554,7 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
         (["--iteration", "5"], ["Unrecognized options: --iteration", "--iterations"]),
         (["--levels", "4", "9"], ["--levels", "0 to 8"]),
         (["--levels", "4"], ["--widths", "as many"]),
-        (["--loss", "l3"], ["invalid choice 'l3' for argument '--loss'", "log"]),
+        (["--loss", "l3"], ["--loss: is l3; must be one of", "log"]),
         (["--domain", "cube"], ["--domain: is cube; must be auto|sphere|hull|mesh PATH"]),
         (["--domain", "mesh"], ["--domain: is mesh; must be"]),
         (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
