@@ -104,18 +104,18 @@ def main() -> None:
                     "--size", options.size]  # fmt: skip
             folder = options.out / name / row.replace(", ", "_").replace(" ", "_").rstrip("%")
             kept, words = folder / "result.json", " ".join(map(str, [*made, *fit]))
-            known_before = json.loads(kept.read_text()) if kept.exists() else {}
-            if known_before.get("made") != words:
+            numbers = json.loads(kept.read_text()) if kept.exists() else {}
+            if numbers.get("made") != words:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
-                exact = ambient == USUAL  # it is the same whatever the room
-                numbers = found(folder, made, fit, exact) if options.rows == "all" else known(folder, made, fit)
+                if options.rows == "all":
+                    numbers = found(folder, made, fit, ambient == USUAL)  # the exact one is alike whatever the room
+                else:
+                    numbers = known(folder, made, fit)
                 if "failed" not in numbers["this"]:
                     kept.write_text(json.dumps(numbers | {"made": words}))
-            else:
-                numbers = known_before
             results[row, name] = numbers
-            print(f"{name}, {row}: {results[row, name]}", file=sys.stderr, flush=True)
+            print(f"{name}, {row}: {numbers}", file=sys.stderr, flush=True)
     reference = "exact" if options.rows == "all" else "this"  # of the first row
     exact = {name: results[next(iter(rows)), name][reference] for name in options.objects}
     lines = [["exact", *(cell(exact[name], exact[name]) for name in options.objects)]] if options.rows == "all" else []

@@ -90,9 +90,10 @@ def test_alignment_finds_the_motion_between_two_samplings_of_one_surface():
 def test_photographs_move_with_the_truth(small_capture):
     """A point is where it was in each, and as brightly lit."""
     matrix, point = np.eye(4), np.array([[0.3, -0.2, 0.5]]) + CENTER
-    matrix[:3] = np.c_[1.3 * Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), [5.0, -7, 2]]
+    turn, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]), np.array([5.0, -7, 2])
+    matrix[:3] = np.c_[1.3 * turn.as_matrix(), shift]
     capture = loading.load_capture(small_capture)
-    there = calibrated.moved(capture, matrix)
+    there = calibrated.moved(capture, 1.3, turn.as_matrix(), shift)
     for one, other in zip(capture.sensors, there.sensors):
         places = [
             sensor.camera.project(p) for sensor, p in ((one, point), (other, trimesh.transform_points(point, matrix)))
@@ -101,8 +102,8 @@ def test_photographs_move_with_the_truth(small_capture):
         np.testing.assert_allclose(1.3 * places[0][1], places[1][1], rtol=1e-5)
     sun = Light("directional", np.array([0.6, 0.0, -0.8]), np.array([3.0, 2, 1]))
     lit = calibrated.with_calibration(capture, [s.camera for s in capture.sensors], [sun] * len(capture))
-    turned = Lights.of(calibrated.moved(lit, matrix).sensors)[0]
-    np.testing.assert_allclose(turned.vector, Rotation.from_rotvec([0.1, -0.2, 0.3]).apply(sun.vector), atol=1e-6)
+    turned = Lights.of(calibrated.moved(lit, 1.3, turn.as_matrix(), shift).sensors)[0]
+    np.testing.assert_allclose(turned.vector, turn.apply(sun.vector), atol=1e-6)
     np.testing.assert_allclose(turned.rgb, sun.rgb)
     before, after = Lights.of(capture.sensors), Lights.of(there.sensors)
     distances = [np.linalg.norm(lights.positions() - p, axis=1, keepdims=True)

@@ -576,4 +576,4 @@ def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_p
         noisy = picture + random.normal(0, 3, sharp.shape)
         cv2.imwrite(str(tmp_path / f"{name}.png"), noisy.clip(0, 255).astype(np.uint8))
     sharp, blurred = (motion.detail_of(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
-    assert blurred < motion.PLAIN * sharp
+    assert blurred < motion.BLURRED * sharp

@@ -7,7 +7,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import load_element, photograph_element
-from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.camera import Camera, moved_pose
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import Photographs
 
@@ -35,21 +35,17 @@ def with_calibration(
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))
 
 
-def moved(capture: Capture, matrix: np.ndarray) -> Capture:
-    """The same photographs, with the cameras and lights of a scene that a similarity (4, 4) has moved.
+def moved(capture: Capture, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Capture:
+    """The same photographs, with cameras and lights in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
 
     What else the scene holds (a room, a table, lamps) stays as it is: for small motions.
     """
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-    rotation = matrix[:3, :3] / scale
     cameras, lights, before = [], [], Lights.of(capture.sensors)
     for k, sensor in enumerate(capture.sensors):
         light = before[k]
-        to_world = matrix @ sensor.camera.to_world
-        to_world[:3, :3] /= scale
-        cameras.append(sensor.camera._replace(to_world=to_world))
+        cameras.append(sensor.camera._replace(to_world=moved_pose(sensor.camera.to_world, scale, rotation, shift)))
         if light.kind == "point":  # as bright as before from scaled distances
-            lights.append(Light("point", matrix[:3, :3] @ light.vector + matrix[:3, 3], scale**2 * light.rgb))
+            lights.append(Light("point", scale * rotation @ light.vector + shift, scale**2 * light.rgb))
         else:
             lights.append(light._replace(vector=rotation @ light.vector))
     return with_calibration(capture, cameras, lights, room=capture.photographs.room)

@@ -39,8 +39,7 @@ LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
 RAMP = 0.05  #: over how much of a fit refinement sets in
-#: Width [px] and paths per pixel of interreflection, and where a table has a pattern that is reflected.
-SMOOTH, PATTERNED = (32, 16), (64, 8)
+PATTERNED = 64, 8  #: width [px] and paths per pixel of interreflection where a table has a pattern that is reflected
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -197,7 +196,7 @@ class Fit:
         lit = calibration is not None or photographs.room is not None
         if not (self.ring.indirect or lit):
             return predicted
-        width, spp = SMOOTH if self.surface.table is None else PATTERNED
+        width, spp = (bridge.WIDTH, bridge.SPP) if self.surface.table is None else PATTERNED
         around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), width, spp,
                                      BOUNCES if self.ring.indirect else 1, lit)  # fmt: skip
         if self.ring.indirect:

@@ -11,6 +11,14 @@ class NoParallax(InputError):
     """All cameras are in one place or look along one line: they do not say how far the object is."""
 
 
+def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """A camera-to-world pose (4, 4) in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+    there = np.eye(4)
+    there[:3, :3] = rotation @ pose[:3, :3]
+    there[:3, 3] = scale * rotation @ pose[:3, 3] + shift
+    return there
+
+
 class Camera(NamedTuple):
     """A pinhole camera. The picture spans [0, W] × [0, H], x right, y down: the first pixel's centre is (0.5, 0.5)."""
 

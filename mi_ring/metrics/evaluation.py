@@ -43,14 +43,15 @@ def evaluate_fit(
     if align:
         matrix = alignment(truth_mesh, guess_mesh, align == "similarity")
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        angle = Rotation.from_matrix(matrix[:3, :3] / scale).magnitude()
+        rotation = matrix[:3, :3] / scale
+        angle = Rotation.from_matrix(rotation).magnitude()
         before = truth_mesh.bounds.mean(0)
         truth_mesh.apply_transform(matrix)
         shift = np.linalg.norm(matrix[:3, :3] @ before + matrix[:3, 3] - before)
         motion = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
                  "aligned_scale": scale}  # fmt: skip
         truth, diagonal = scene_of(truth_mesh.vertices, truth_mesh.faces), diagonal * scale
-        unseen = unseen and moved(unseen, matrix)
+        unseen = unseen and moved(unseen, scale, rotation, matrix[:3, 3])
     numbers, views = compare_surfaces(capture, guess, truth, diagonal)
     numbers |= motion
     numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None)

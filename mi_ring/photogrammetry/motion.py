@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from PIL import Image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mi_ring.errors import InputError
+from mi_ring.geometry.camera import moved_pose
+from mi_ring.images import read_image
 from mi_ring.importers.cameras import Lens
 from mi_ring.photogrammetry.board import Sighting
 from mi_ring.photogrammetry.bundle import adjusted, cameras_of, reduction
@@ -29,7 +30,7 @@ FEWEST_MATCHES, FIRM = 15, 0.7  #: of two photographs, and the share that camera
 PART = 3  #: photographs at least
 NAMED = 30  #: photographs in a message, at most
 FEWEST_POINTS = 30  #: that a photograph must show of those in space
-PLAIN = 0.25  #: of the detail of those with a camera: a photograph that has less is blurred, or shows something plain
+BLURRED = 0.25  #: of the detail of those with a camera: a photograph that has less is blurred, or shows something plain
 
 
 @dataclass
@@ -50,12 +51,9 @@ class Motion:
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Motion":
         """In another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
-        cameras = {}
-        for name, (lens, pose) in self.cameras.items():
-            there = np.eye(4)
-            there[:3, :3] = rotation @ pose[:3, :3]
-            there[:3, 3] = scale * rotation @ pose[:3, 3] + shift
-            cameras[name] = lens, there
+        cameras = {
+            name: (lens, moved_pose(pose, scale, rotation, shift)) for name, (lens, pose) in self.cameras.items()
+        }
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
 
@@ -230,12 +228,12 @@ def reasons(failed: Sequence[Picture], others: Sequence[Picture], folder: Path) 
         return {}
     detail = {p.name: detail_of(folder / "grey" / file_of(p)) for p in (*failed, *others)}
     usual = float(np.median([detail[p.name] for p in others]))
-    return {p.name: reason_of(p, folder, detail[p.name] < PLAIN * usual) for p in failed}
+    return {p.name: reason_of(p, folder, detail[p.name] < BLURRED * usual) for p in failed}
 
 
 def detail_of(file: Path) -> float:
     """How much a photograph varies from pixel to pixel, but for noise."""
-    grey = np.array(Image.open(file).convert("L"))
+    grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 

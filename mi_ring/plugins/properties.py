@@ -20,6 +20,19 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
     raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {value}, must be {wanted}')
 
 
+def vector(props, name: str, kind: str) -> np.ndarray | None:
+    """A property of a plugin that is a <point> or <vector>, `kind`, (3,); None if there is none.
+
+    Raises ValueError, which names it, if it is anything else.
+    """
+    if name not in props:
+        return None
+    found = np.array(props[name]).ravel()
+    if found.shape == (3,) and found.dtype.kind == "f" and np.isfinite(found).all():
+        return found
+    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {props[name]}, must be a <{kind}>')
+
+
 def number_list(props, name: str, count: int) -> list[float]:
     """A property of a plugin that is so many finite numbers. Raises ValueError, which names it, if it is not."""
     text = str(props.get(name, ""))

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.plugins.properties import beside_scene, number
+from mi_ring.plugins.properties import beside_scene, number, vector
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 
@@ -98,17 +98,11 @@ class ShapeNetMesh(mi.Mesh):
             # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
-        def three(key, kind):
-            found = np.array(given[key]).ravel() if key in given else None
-            if found is not None and not (found.shape == (3,) and found.dtype.kind == "f" and np.isfinite(found).all()):
-                raise ValueError(f'shapenet "{props.id()}": {key} is {given[key]}, must be a <{kind}>')
-            return found
-
         #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
-        self.center = three("center", "point")
+        self.center = vector(props, "center", "point")
         self.radius = number(props, "radius", positive=True) if "radius" in given else None
         #: (3,) what is up, and the length of a scene unit, for exports; None where it says nothing.
-        self.up, self.metres = three("up", "vector"), None
+        self.up, self.metres = vector(props, "up", "vector"), None
         if self.up is not None:
             if not self.up.any():
                 raise ValueError(f'shapenet "{props.id()}": up is {given["up"]}, must be a <vector> that is not 0')
@@ -116,7 +110,7 @@ class ShapeNetMesh(mi.Mesh):
         if "metres" in given:
             self.metres = number(props, "metres", positive=True)
         #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
-        self.ground = three("ground", "point")
+        self.ground = vector(props, "ground", "point")
         if self.ground is not None:
             self.ground = np.stack([self.ground, [0.0, 0.0, 1.0] if self.up is None else self.up])
         #: The domain that it names, with its own normalising sphere, or None.

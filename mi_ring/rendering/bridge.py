@@ -21,6 +21,8 @@ from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 from mi_ring.rendering.scenes import assembled, own_emitters, parted
 
+WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
+
 
 def to_drjit(tensor: Tensor):
     """A tensor, flattened, as a Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
@@ -237,7 +239,7 @@ class Surroundings:
 
 
 def surroundings(
-    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = 32, spp: int = 16,
+    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = WIDTH, spp: int = SPP,
     bounces: int = BOUNCES, room: bool = False,
 ) -> Surroundings:  # fmt: skip
     """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
