@@ -1,12 +1,11 @@
 """The `merl` BSDF: tables written from a closed form, networks against numpy, and what was measured."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import test_bsdf
 from scipy.spatial.transform import Rotation
 
-CONTEXT = mi.BSDFContext()
 SCALES = np.array([1, 1.15, 1.66]) / 1500
 
 
@@ -48,11 +47,8 @@ def directions(count, seed, widest=75.0):
 
 
 def evaluate(bsdf, wi, wo):
-    """f · (n·wo) at pairs of directions (n, 3): (n, 3)."""
-    si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
-    si.wi = mi.Vector3f(wi.T.astype(np.float32))
-    value = bsdf.eval(CONTEXT, si, mi.Vector3f(wo.T.astype(np.float32)))
-    return np.array(value).reshape(3, -1).T
+    """f · (n·wo) at pairs of directions (n, 3), to the viewer and to the light: (n, 3)."""
+    return test_bsdf.evaluate(bsdf, wo, wi)
 
 
 def rusinkiewicz(wi, wo):
@@ -135,9 +131,9 @@ def test_seen_from_the_light_it_is_the_cell_of_its_angle(table):
 
 @pytest.mark.parametrize("viewer", [(0, 0), (40, -37), (75, 110)])
 def test_directions_are_drawn_by_the_density(table, viewer):
-    angle, azimuth = np.radians(viewer)
-    wi = [np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)]
-    sample, pdf = mi.chi2.BSDFAdapter("merl", f'<string name="filename" value="{table}"/>', wi=list(map(float, wi)))
+    sample, pdf = mi.chi2.BSDFAdapter(
+        "merl", f'<string name="filename" value="{table}"/>', wi=test_bsdf.direction(*viewer).tolist()
+    )
     test = mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, ires=16)
     assert test.run(significance_level=0.01, test_count=3, quiet=True), test.messages
 
@@ -153,11 +149,7 @@ def test_directions_are_drawn_by_the_density_of_a_network(tmp_path):
 def test_drawn_directions_give_the_albedo(table):
     """By samples and by a sum over directions."""
     bsdf, wi = mi.load_dict({"type": "merl", "filename": str(table)}), directions(1, 8)
-    n = 1 << 16
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.wi = mi.Vector3f(*map(float, wi[0]))
-    rng = mi.PCG32(n)
-    _, weight = bsdf.sample(CONTEXT, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    _, weight = test_bsdf.draw(bsdf, wi[0], 1 << 16)
     drawn = np.array(weight).reshape(3, -1).mean(1)
     mu, phi = np.meshgrid((np.arange(200) + 0.5) / 200, (np.arange(400) + 0.5) / 200 * np.pi, indexing="ij")
     wo = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), np.sqrt(1 - mu**2) * np.sin(phi), mu], -1).reshape(-1, 3)
