@@ -123,6 +123,10 @@ def names(cell: str) -> list[str]:
     return re.findall("``(.*?)``", cell)
 
 
+def save_networks(path: Path, material: str) -> None:
+    np.savez(path, names=[material], **{name: np.zeros((1, *shape)) for name, shape in LAYERS.items()})
+
+
 @pytest.fixture
 def values(tmp_path):
     """Of each plugin a value for each parameter, none of them the default; what must not be together is apart."""
@@ -130,7 +134,7 @@ def values(tmp_path):
     ring = Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
     networks = tmp_path / "networks.npz"
-    np.savez(networks, names=["one"], **{name: np.zeros((1, *shape)) for name, shape in LAYERS.items()})
+    save_networks(networks, "one")
     moved = mi.ScalarTransform4f().translate([3, -1, 2])
     film = {"type": "hdrfilm", "width": 7, "height": 5}
     light = {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": [4, 5, 6]}}
@@ -226,9 +230,10 @@ def test_flags_are_those_of_traverse(name, values):
 @pytest.mark.parametrize("name", plugins())
 def test_snippets_load_and_say_the_same(name, tmp_path):
     torch.save(ring_state(Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)), tmp_path / "ring.pt")
+    save_networks(tmp_path / "networks.npz", "gold-paint")
     blocks = {}
     for kind, block in re.findall(r"\.\. code-block:: (\w+)\n\n((?: {8}.*\n?|\n)+)", inspect.getdoc(plugins()[name])):
-        blocks[kind] = inspect.cleandoc(block).replace("ring.pt", str(tmp_path / "ring.pt"))
+        blocks[kind] = re.sub(r"ring\.pt|networks\.npz", lambda m: str(tmp_path / m[0]), inspect.cleandoc(block))
     if name == "shapenet":  # the same, only faster
         blocks = {kind: re.sub(r"(subdivisions\W+(?:value=\W)?)6", r"\g<1>2", block) for kind, block in blocks.items()}
     element = ElementTree.fromstring(blocks["xml"])

@@ -195,7 +195,7 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
     distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
     assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
     assert none is None and known
-    ways = {name: Rotation.from_euler("z", 30 * k, degrees=True).apply([0, -1, 0]) for k, name in enumerate(cameras)}
+    ways = {name: Rotation.from_euler("z", 150 * k, degrees=True).apply([0, -1, 0]) for k, name in enumerate(cameras)}
     assert not upright(motion, turn @ CENTER, None, ways)[2]  # held in every way
     low = Plane(turn[:, 2], float(turn[:, 2] @ turn @ (CENTER - [0, 0, 3])))  # 3 below the object's middle
     exact, plane, _ = upright(motion, turn @ CENTER, low, ups)

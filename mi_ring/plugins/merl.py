@@ -41,7 +41,8 @@ class Merl(mi.BSDF):
         .. code-block:: xml
 
             <bsdf type="merl">
-                <string name="filename" value="gold-paint.binary"/>
+                <string name="filename" value="networks.npz"/>
+                <string name="material" value="gold-paint"/>
             </bsdf>
 
         .. code-block:: python
