@@ -189,7 +189,15 @@ def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
         (aside / name).replace(finished / name)
 
 
-def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(small_capture, tmp_path):
+TABLE = """<shape type="table"><transform name="to_world"><scale value="90"/><translate x="400" y="-150" z="60"/></transform>
+  <bsdf type="diffuse"/></shape></scene>"""
+
+
+@pytest.mark.parametrize("table", [False, True])
+def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_capture, tmp_path, table):
+    small_capture, edit = broken_capture
+    if table:
+        edit("</scene>", TABLE)
     arguments = [str(small_capture), "--iterations", "14", "--deterministic", "--seed", "4", *QUICK]
     for name in ("a", "b"):
         assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0

@@ -123,8 +123,8 @@ def compare(
     room = calibration.roomlight().cpu()
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
-        around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, room=bool(room.any()),
-                                     bounces=BOUNCES if fit.ring.indirect else 1)  # fmt: skip
+        around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
+                                     bounces=BOUNCES if fit.ring.indirect else 1, room=bool(room.any()))  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
         roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
+from mi_ring.fitting.averages import Averages
 from mi_ring.fitting.calibration import LIT, Calibration, overall, refined_of
 from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
@@ -39,7 +40,6 @@ LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
 RAMP = 0.05  #: over how much of a fit refinement sets in
-PATTERNED = 64, 8  #: width [px] and paths per pixel of interreflection where a table has a pattern that is reflected
 FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -119,6 +119,7 @@ class Fit:
         self.iteration, self.seconds = 0, 0.0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.restraint = Restraint()
+        self.averages = Averages()
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         self.failures = 0  # losses or gradients in a row that were not finite
         if state:
@@ -196,9 +197,10 @@ class Fit:
         lit = calibration is not None or photographs.room is not None
         if not (self.ring.indirect or lit):
             return predicted
-        width, spp = (bridge.WIDTH, bridge.SPP) if self.surface.table is None else PATTERNED
-        around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), width, spp,
-                                     BOUNCES if self.ring.indirect else 1, lit)  # fmt: skip
+        around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
+                                     bounces=BOUNCES if self.ring.indirect else 1)  # fmt: skip
+        if self.surface.table is not None:
+            around = self.averages.of(around, index)
         if self.ring.indirect:
             predicted = predicted + (self.calibration.bounced(around.interreflection) if self.calibration
                                      else around.interreflection)  # fmt: skip
@@ -320,6 +322,7 @@ class Fit:
             "log": self.log,
             "restraint": vars(self.restraint),
             "calibration": self.calibration and self.calibration.state_dict(),
+            "averages": self.averages.pictures,
             "confirmed": self.confirmed,
             "outlines": self.outlines,
         }
@@ -333,6 +336,7 @@ class Fit:
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
         vars(self.restraint).update(state["restraint"])
+        self.averages.pictures = state["averages"]
         self.confirmed = state["confirmed"]
         self.take_outlines(state["outlines"])
         if self.calibration:

@@ -22,6 +22,7 @@ from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 from mi_ring.rendering.scenes import assembled, own_emitters, parted
 
 WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
+PATTERNED = 128, 3  #: the same where a table has a pattern, which glossy surfaces mirror
 
 
 def to_drjit(tensor: Tensor):
@@ -239,14 +240,17 @@ class Surroundings:
 
 
 def surroundings(
-    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int = WIDTH, spp: int = SPP,
-    bounces: int = BOUNCES, room: bool = False,
+    surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
+    spp: int | None = None, bounces: int = BOUNCES, room: bool = False,
 ) -> Surroundings:  # fmt: skip
     """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
 
     `photographs`: as they were rendered; `coverage` (N, H, W): of that picture. This light varies slowly: it is
-    rendered at most `width` pixels wide (a few good pixels did better than many noisy ones), and smoothed.
+    rendered at most `width` pixels wide, with `spp` paths per pixel (a few good pixels did better than many noisy
+    ones), and smoothed. Where there is a table both are by default others, `PATTERNED`.
     """
+    usual = (WIDTH, SPP) if surface.table is None else PATTERNED
+    width, spp = width or usual[0], spp or usual[1]
     table = surface.table if bounces > 1 else None  # it would only keep the room's light from the object
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)
