@@ -189,8 +189,8 @@ def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
         (aside / name).replace(finished / name)
 
 
-TABLE = """<shape type="table"><transform name="to_world"><scale value="90"/><translate x="400" y="-150" z="60"/></transform>
-  <bsdf type="diffuse"/></shape></scene>"""
+TABLE = """<shape type="table"><bsdf type="diffuse"/><transform name="to_world">
+  <scale value="90"/><translate x="400" y="-150" z="60"/></transform></shape></scene>"""
 
 
 @pytest.mark.parametrize("table", [False, True])

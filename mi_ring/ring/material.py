@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Sphere
+from mi_ring.geometry.spherical import SphericalMap
 from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
@@ -22,7 +24,8 @@ class MaterialOptions:
     """Another material for the object."""
 
     material: Path | None = None
-    """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain."""
+    """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain, or
+    from surfaces without handles."""
     specular_scale: float = 1.0
     """Factor of the specular reflectance."""
     roughness_add: float = 0.0
@@ -35,12 +38,12 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
     """Give a ring the material that the options ask for. Raises InputError if it cannot have it."""
     if options.material:
         other = load_fit(options.material)
-        if not same_domain(ring, other):
-            own = "another" if about(ring) == about(other) else about(ring)
-            raise InputError(f"{options.material}: --material: was fitted from {about(other)}, the shape from {own}; a "
-                             "material is a function on where the fit started: fit both with the same --domain, "
-                             "sphere or mesh FILE")  # fmt: skip
-        ring.brdf_net, ring.bsdf = other.brdf_net, other.bsdf
+        ring.bsdf = other.bsdf
+        if same_domain(ring, other):
+            ring.brdf_net = other.brdf_net
+        else:
+            maps = [spherical(path, r) for path, r in (("its shape", ring), (options.material, other))]
+            ring.brdf_net = Carried(other.brdf_net, *maps)
         ring.indirect = ring.indirect and other.indirect
     gains: dict[str, ArrayLike] = {}
     offsets: dict[str, float] = {}
@@ -74,6 +77,15 @@ def named(ring: Ring, option: str, names: Sequence[str]) -> list[str]:
     return found
 
 
+def spherical(name: str | Path, ring: Ring) -> SphericalMap:
+    """Where the domain of a ring is on the sphere. Raises InputError if it has handles."""
+    try:
+        return SphericalMap(ring.domain)
+    except ValueError:
+        what = "was fitted from a surface with handles or of several pieces, whose points correspond to none of another"
+        raise InputError(f"{name}: --material: {what}; fit both with the same --domain, sphere or mesh FILE") from None
+
+
 def same_domain(a: Ring, b: Ring) -> bool:
     """Are two rings functions on the same surface?"""
     if isinstance(a.domain, Sphere) or isinstance(b.domain, Sphere):
@@ -81,9 +93,16 @@ def same_domain(a: Ring, b: Ring) -> bool:
     return np.array_equal(a.domain.points, b.domain.points) and np.array_equal(a.domain.faces, b.domain.faces)
 
 
-def about(ring: Ring) -> str:
-    """The domain of a ring, for messages."""
-    return "a sphere" if isinstance(ring.domain, Sphere) else f"a mesh of {len(ring.domain.points):,} vertices"
+class Carried(ReflectanceMap):
+    """A BRDF-Net on another domain than its own, by way of the sphere."""
+
+    def __init__(self, net: ReflectanceMap, here: SphericalMap, there: SphericalMap) -> None:
+        super().__init__(net.bsdf_parameters, float(net.scale))
+        self.net, self.here, self.there = net, here, there
+
+    def forward(self, s: Tensor) -> dict[str, Tensor]:
+        own = self.there.to_domain(self.here.to_sphere(s.detach().reshape(-1, 3).cpu().numpy()))
+        return self.net(torch.from_numpy(own).to(s).reshape(s.shape))
 
 
 class Edited(ReflectanceMap):
