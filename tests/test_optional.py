@@ -23,8 +23,9 @@ def without(missing, command, *arguments, cwd):
 QUICK = ["--iterations", 1, "--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2]
 
 
-def test_a_fit_from_a_sphere_needs_none_of_them(small_capture, tmp_path):
-    arguments = [small_capture, "--out", tmp_path / "run", "--domain", "sphere", *QUICK]
+@pytest.mark.parametrize("domain", ["sphere", "auto"])
+def test_a_fit_from_a_sphere_needs_none_of_them(small_capture, tmp_path, domain):
+    arguments = [small_capture, "--out", tmp_path / "run", "--domain", domain, *QUICK]
     status, complaint = without("gpytoolbox xatlas pycolmap", "fit", *arguments, cwd=tmp_path)
     assert status == 0, complaint
     assert (tmp_path / "run/report.html").is_file() and (tmp_path / "run/mesh.ply").is_file()

@@ -22,7 +22,7 @@ class Config:
 
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
-    the scene's own if it names one, else the hull; the sphere where there are no masks to make one of."""
+    the scene's own if it names one, else the hull, or the sphere where there are no masks to make one of."""
     masks: Literal["auto", "given", "none"] = "auto"
     """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
     if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,

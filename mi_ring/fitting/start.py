@@ -12,11 +12,12 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import overall, refined_of
 from mi_ring.fitting.config import Config
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
-from mi_ring.geometry.meshes import load_closed_mesh
+from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.rendering.scenes import has_table
 from mi_ring.ring.ring import Ring
+from mi_ring.system.optional import installed
 
 
 def starting_ring(
@@ -72,7 +73,8 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     if surface is None and choice == "hull":
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
-    if surface is not None:
+    # Where the hull has no handles and what it takes to start from one is missing, a sphere does, too.
+    if surface is not None and (choice == "hull" or genus(surface) or installed("gpytoolbox")):
         return closed_domain(surface, shape.center, shape.radius)
     return Sphere(), *capture.sphere()
 

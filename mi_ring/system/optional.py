@@ -1,11 +1,16 @@
 """Packages that not every machine can install: asked for when they are needed."""
 
-import importlib
+import importlib.util
 import signal
 import threading
 from types import ModuleType
 
 from mi_ring.errors import InputError
+
+
+def installed(package: str) -> bool:
+    """Is it there?"""
+    return importlib.util.find_spec(package) is not None
 
 
 def need(package: str, what: str) -> ModuleType:
