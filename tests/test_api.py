@@ -13,7 +13,7 @@ from torch import nn
 
 import mi_ring
 
-QUICK = {"levels": (2, 3), "widths": (28, 56), "shares": (0.6, 0.4), "batch": 4, "subdivisions": 3}
+QUICK = {"levels": (2, 3), "widths": (28, 56), "shares": (0.6, 0.4), "batch": 4, "subdivisions": 3, "domain": "sphere"}
 
 
 @mi_ring.register_network("siren of the tests")

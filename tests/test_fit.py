@@ -441,7 +441,7 @@ def test_a_finished_fit_is_not_silently_fitted_anew(finished, tmp_path):
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
     folder = tmp_path / "run"
-    options = ["--out", str(folder), "--iterations", "200", *QUICK]
+    options = ["--out", str(folder), "--iterations", "200", *SPHERE]
     call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), *options]
     process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
@@ -468,7 +468,9 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
     with pytest.raises(InputError, match="gone.xml: no such file"):
         fit.main([str(tmp_path / "gone.xml"), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="--batch: was 4 before, is 5 now"):
-        fit.main([str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *SPHERE, "--batch", "5"])
+        fit.main(
+            [str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *SPHERE, "--batch", "5"]
+        )
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
