@@ -276,7 +276,7 @@ class Fit:
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 begun = min(1.0, max(0.0, (progress - group.get("start", -1.0)) / RAMP))
-                group["lr"] = group["initial_lr"] * self.config.decay**progress * begun
+                group["lr"] = group["initial_lr"] * group.get("decay", self.config.decay) ** progress * begun
             if healthy:
                 optimizer.step()
 
