@@ -1,7 +1,7 @@
 """What each disturbance of a simulated phone capture costs, and all of them at once, by `phone.py`.
 
     python benchmarks/phone_table.py OUT [--rows all|alone] [--objects pot2 bunny spot] [--views 24] [--size 1440x1080]
-        [--spp 36] [options of mi_ring.fit]
+        [--paths 36] [options of mi_ring.fit]
 
 all: every disturbance at once, at two strengths of the room's light, with calibration and masks that
 `mi_ring.photos` finds, and the exact capture of the same views. alone: a row without any disturbance, one of all that
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["pot2", "bunny", "spot"])
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--size", default="1440x1080")
-    parser.add_argument("--spp", default="36")
+    parser.add_argument("--paths", default="36", help="per pixel of the captures, a square number")
     options, fit = parser.parse_known_args()
     if options.rows == "all":
         rows = {f"all, room {ambient:.0%}": ("all", ambient) for ambient in AMBIENT}
@@ -102,7 +102,7 @@ def main() -> None:
     for row, (disturbances, ambient) in rows.items():
         for name in options.objects:
             made = ["--object", name, "--disturbances", disturbances, "--ambient", ambient, "--views", options.views,
-                    "--size", options.size, "--spp", options.spp]  # fmt: skip
+                    "--size", options.size, "--spp", options.paths]  # fmt: skip
             folder = options.out / name / row.replace(", ", "_").replace(" ", "_").rstrip("%")
             kept, words = folder / "result.json", " ".join(map(str, [*made, *fit]))
             numbers = json.loads(kept.read_text()) if kept.exists() else {}
@@ -126,7 +126,7 @@ def main() -> None:
 
     speed = product_speed(4096, 4096, torch.float32) / 1e9
     print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.views} photographs of {options.size} "
-          f"px, {options.spp} paths per pixel; mi_ring.fit {' '.join(fit)}\n")  # fmt: skip
+          f"px, {options.paths} paths per pixel; mi_ring.fit {' '.join(fit)}\n")  # fmt: skip
     print(table(["normals / depth (times exact), size", *options.objects], lines))
 
 

@@ -35,6 +35,16 @@ def test_light_is_averaged_over_what_was_covered_and_the_outline_is_the_newest()
         np.testing.assert_allclose(seen.alpha, alpha, rtol=1e-6)
 
 
+def test_what_is_not_finite_is_left_out():
+    averages, alpha, broken = Averages(), np.ones((1, 5, 7)), np.full((1, 5, 7, 3), 2.0)
+    broken[0, 2, 3, 1] = np.nan
+    seen = averages.of(around(broken, alpha), np.array([0]))
+    assert seen.radiance.isfinite().all() and not averages.pictures
+    for picture in (np.full((1, 5, 7, 3), 2.0), broken):
+        np.testing.assert_allclose(averages.of(around(picture, alpha), np.array([0])).radiance, 2)
+    assert averages.pictures[0][0] == 1
+
+
 def test_what_was_is_forgotten_and_other_sizes_begin_anew():
     averages, alpha = Averages(), np.ones((1, 5, 7))
     for k in range(12):

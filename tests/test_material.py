@@ -114,9 +114,9 @@ def test_pictures_of_a_shape_in_anothers_bsdf(small_capture, tmp_path):
 @pytest.mark.parametrize(
     ("one", "two", "which"),
     [
-        (None, mesh_domain(), "1.pt"),
-        (mesh_domain(), None, "its shape"),
-        (mesh_domain(), mesh_domain(1.1), "its shape"),
+        (None, mesh_domain(), "1.pt: --material: "),
+        (mesh_domain(), None, "--material: the shape"),
+        (mesh_domain(), mesh_domain(1.1), "--material: the shape"),
     ],
     ids=["mesh on sphere", "sphere on mesh", "another mesh"],
 )
@@ -126,7 +126,7 @@ def test_materials_of_other_domains_with_handles_are_refused(tmp_path, one, two,
         with pytest.raises(InputError) as error:
             main([str(paths[0]), *to.split(), "--material", str(paths[1])])
         message = str(error.value)
-        assert "\n" not in message and f"{which}: --material: " in message and "--domain" in message
+        assert "\n" not in message and which in message and "of 1 handles" in message and "--domain" in message
 
 
 def test_a_material_of_another_start_is_carried_by_way_of_the_sphere(tmp_path):

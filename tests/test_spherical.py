@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.geometry.spherical import SphericalMap
 
@@ -58,5 +59,5 @@ def test_the_sphere_is_itself():
     trimesh.creation.torus(1.0, 0.4), trimesh.util.concatenate([BALL, BALL.copy().apply_translation([3, 1, 0])]),
 ], ids=["handle", "pieces"])  # fmt: skip
 def test_handles_and_pieces_are_refused(mesh):
-    with pytest.raises(ValueError, match="handles"):
+    with pytest.raises(InputError, match="handles and . pieces"):
         SphericalMap(Domain(mesh.vertices, mesh.faces))

@@ -340,8 +340,8 @@ def test_the_command_leaves_out_what_is_not_seen(run, capsys):
     assert numbers[1]["chamfer"] < 0.001 and numbers[1]["f_score_0.1"] == 1
     assert 0.5 < numbers[1]["unseen_true"] < numbers[1]["unseen"] < 0.9
     for key in numbers[0].keys() - {"chamfer", "f_score_0.1", "f_score_0.5"}:
-        # The error of normals is that of rounding here, whose last digit varies from run to run without --seen, too.
-        assert numbers[0][key] == pytest.approx(numbers[1][key], rel=1e-3, abs=1e-3), key
+        # The error of normals is that of rounding here, whose last digits vary from run to run without --seen, too.
+        assert numbers[0][key] == pytest.approx(numbers[1][key], rel=1e-3, abs=1e-3 if "normal" in key else 2e-4), key
 
 
 def test_a_surface_inside_out_is_told():

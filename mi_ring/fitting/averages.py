@@ -26,11 +26,13 @@ class Averages:
         averages = []
         for k, new in zip(index.tolist(), torch.cat([around.radiance, around.alpha[..., None]], -1)):
             count, average = self.pictures.get(k, (0, new))
-            if average.shape != new.shape:  # those of the stage before
+            if average.shape != new.shape:
                 count, average = 0, new
             average = average.to(new)
-            average = average + (new - average) * max(1 / (count + 1), LATEST)
-            self.pictures[k] = count + 1, average
-            averages.append(average)
+            # What is not would stay: the iteration goes without it.
+            if bool(new.isfinite().all()):
+                average = average + (new - average) * max(1 / (count + 1), LATEST)
+                self.pictures[k] = count + 1, average
+            averages.append(average.nan_to_num(0.0, 0.0, 0.0))
         shown = torch.stack(averages)
         return replace(around, radiance=shown[..., :3] / shown[..., 3:].clamp(min=1e-2) * around.alpha[..., None])

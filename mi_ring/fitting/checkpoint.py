@@ -18,7 +18,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
     """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
     path = folder / NAME
     state = read_state(path, "a checkpoint", ADVICE)
-    if not {"settings", "files", "fit"} <= set(state):
+    if not {"settings", "files", "fit"} <= set(state) or "averages" not in state["fit"]:
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
         if state["settings"].get(name) != value:

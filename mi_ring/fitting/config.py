@@ -72,7 +72,7 @@ class Config:
     muon_rate: float = 3e-2
     """Learning rate of Muon."""
     decay: float = 0.1
-    """The learning rates fall exponentially to this share."""
+    """The learning rates fall exponentially to this share; those of cameras to less."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer
     GPUs)."""

@@ -105,13 +105,14 @@ class Fit:
         self.ring.to(self.device)
         self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
+        near = not isinstance(self.ring.domain, Sphere)
         self.calibration: Calibration | None = None
         if refined := refined_of(seen, self.config, self.albedo):
             power = overall(refined, self.albedo)
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
-            self.optimizers += self.calibration.optimizers()
+            self.optimizers += self.calibration.optimizers(near)
             self.calibration.room.to(self.device)
-        self.stages = stages_of(self.config, near=not isinstance(self.ring.domain, Sphere))
+        self.stages = stages_of(self.config, near)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
         #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.
@@ -199,7 +200,7 @@ class Fit:
             return predicted
         around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
                                      bounces=BOUNCES if self.ring.indirect else 1)  # fmt: skip
-        if self.surface.table is not None:
+        if self.ring.indirect and self.surface.table is not None:
             around = self.averages.of(around, index)
         if self.ring.indirect:
             predicted = predicted + (self.calibration.bounced(around.interreflection) if self.calibration

@@ -14,6 +14,7 @@ RIDGE = 0.01  #: pull toward what the capture says, by the mean of what the phot
 DIM = 0.3  #: radiance, in units of the exposure, below which errors count no more than there
 ROBUST = 0.2  #: relative error from which it counts as its root
 SURELY = 0.99  #: share of a pixel that must be object
+WIDEST = 64  #: width of the pictures that are compared [px]
 
 
 class Room(nn.Module):
@@ -43,16 +44,23 @@ class Room(nn.Module):
 
         `telling` (N, H, W): where they say something of the object.
         """
-        height, width = around.alpha.shape[1:]
+        assert around.harmonics is not None
+
+        def pooled(pictures: Tensor, factor: int) -> Tensor:
+            means = F.avg_pool2d(pictures.movedim(-1, 1), factor, ceil_mode=True, count_include_pad=False)
+            return means.movedim(1, -1)
+
+        # Few paths for many pixels: their noise would make the room darker.
+        coarser = max(1, max(around.alpha.shape[1:]) // WIDEST)
+        alpha = pooled(around.alpha[..., None], coarser)[..., 0]
+        height, width = alpha.shape[1:]
 
         def small(pictures: Tensor) -> Tensor:
-            pooled = F.avg_pool2d(pictures.movedim(-1, 1), around.factor, ceil_mode=True, count_include_pad=False)
-            return pooled[:, :, :height, :width].movedim(1, -1)
+            return pooled(pictures, around.factor * coarser)[:, :height, :width]
 
-        inside = torch.minimum(small(telling.float()[..., None])[..., 0], around.alpha) > SURELY
+        inside = torch.minimum(small(telling.float()[..., None])[..., 0], alpha) > SURELY
         missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
-        assert around.harmonics is not None
-        basis = around.harmonics[:, inside]  # (BASIS, n, 3)
+        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.harmonics])  # (BASIS, n, 3)
         scale = light + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, self.harmonics)
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2

@@ -14,6 +14,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
+from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
 
 CHECKPOINT_SECONDS = 30.0
@@ -67,7 +68,9 @@ def start_of(fit: Fit) -> str:
     """What a fit starts from."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
     if isinstance(domain, Sphere):
-        return f"a sphere of radius {float(fit.ring.radius):.4g} about {place}"
+        missing = fit.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")
+        better = "; the masks' hull would be a better one, for which the package gpytoolbox is needed" * missing
+        return f"a sphere of radius {float(fit.ring.radius):.4g} about {place}{better}"
     return f"a surface of genus {genus(trimesh.Trimesh(domain.points, domain.faces, process=False))} about {place}"
 
 

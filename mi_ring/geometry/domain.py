@@ -30,7 +30,7 @@ def closed_domain(
 
 def gpytoolbox() -> ModuleType:
     """The package, when it is needed: it takes a second. Raises InputError where it is not installed."""
-    return need("gpytoolbox", "a start from the visual hull or a mesh")
+    return need("gpytoolbox", "a start from another surface than the sphere")
 
 
 class Domain:

@@ -5,6 +5,7 @@ import trimesh
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere, gpytoolbox
 from mi_ring.geometry.meshes import genus
 
@@ -15,10 +16,10 @@ STEPS, STEP = 40, 0.1  #: of the curvature flow, on a surface of the sphere's ar
 class SphericalMap:
     """A map of a domain onto the unit sphere and back, one to one and conformal, turned as little as can be.
 
-    Raises ValueError for a domain with handles or of several pieces, of which there is none.
+    Raises InputError, which begins with `name`, for a domain with handles or of several pieces: there is none.
     """
 
-    def __init__(self, domain: Domain) -> None:
+    def __init__(self, domain: Domain, name: str = "domain") -> None:
         self.same = isinstance(domain, Sphere)
         if self.same:
             return
@@ -26,7 +27,9 @@ class SphericalMap:
         self.points, self.faces = points.numpy().astype(float), faces.astype(np.int32)
         mesh = trimesh.Trimesh(self.points, self.faces, process=False)
         if genus(mesh) or mesh.body_count > 1:
-            raise ValueError(f"{genus(mesh)} handles, {mesh.body_count} pieces: a sphere has neither")
+            shape = f"{genus(mesh)} handles and {mesh.body_count} pieces"
+            what = f"was fitted from a surface of {shape}, whose points correspond to none of another"
+            raise InputError(f"{name}: {what}; fit both with the same --domain, sphere or mesh FILE")
         self.directions = rounded(self.points, self.faces)
         outward = self.points - mesh.center_mass
         turn, _ = Rotation.align_vectors(outward, self.directions, np.linalg.norm(outward, axis=1))

@@ -249,9 +249,9 @@ def surroundings(
     rendered at most `width` pixels wide, with `spp` paths per pixel (a few good pixels did better than many noisy
     ones), and smoothed. Where there is a table both are by default others, `PATTERNED`.
     """
-    usual = (WIDTH, SPP) if surface.table is None else PATTERNED
-    width, spp = width or usual[0], spp or usual[1]
     table = surface.table if bounces > 1 else None  # it would only keep the room's light from the object
+    usual = (WIDTH, SPP) if table is None else PATTERNED
+    width, spp = width or usual[0], spp or usual[1]
     factor = -(-max(photographs.size) // width)
     small = photographs.select(np.array(photographs.index), photographs.size, factor)
     channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, table)]

@@ -25,7 +25,7 @@ class MaterialOptions:
 
     material: Path | None = None
     """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain, or
-    from surfaces without handles."""
+    from surfaces without handles; these meet on the sphere, where long limbs are small."""
     specular_scale: float = 1.0
     """Factor of the specular reflectance."""
     roughness_add: float = 0.0
@@ -42,8 +42,9 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
         if same_domain(ring, other):
             ring.brdf_net = other.brdf_net
         else:
-            maps = [spherical(path, r) for path, r in (("its shape", ring), (options.material, other))]
-            ring.brdf_net = Carried(other.brdf_net, *maps)
+            here = SphericalMap(ring.domain, "--material: the shape")
+            there = SphericalMap(other.domain, f"{options.material}: --material")
+            ring.brdf_net = Carried(other.brdf_net, here, there)
         ring.indirect = ring.indirect and other.indirect
     gains: dict[str, ArrayLike] = {}
     offsets: dict[str, float] = {}
@@ -75,15 +76,6 @@ def named(ring: Ring, option: str, names: Sequence[str]) -> list[str]:
     if not found:
         raise InputError(f"{option}: this material has no such parameter; it has {', '.join(parameters)}")
     return found
-
-
-def spherical(name: str | Path, ring: Ring) -> SphericalMap:
-    """Where the domain of a ring is on the sphere. Raises InputError if it has handles."""
-    try:
-        return SphericalMap(ring.domain)
-    except ValueError:
-        what = "was fitted from a surface with handles or of several pieces, whose points correspond to none of another"
-        raise InputError(f"{name}: --material: {what}; fit both with the same --domain, sphere or mesh FILE") from None
 
 
 def same_domain(a: Ring, b: Ring) -> bool:
