@@ -219,20 +219,19 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_captur
     assert logs[0] == logs[1]
 
 
-@pytest.mark.parametrize(("table", "options", "averaged"), [
-    (True, [], True), (True, ["--no-indirect"], False), (False, [], False),
-], ids=["table", "table, direct light alone", "no table"])  # fmt: skip
-def test_interreflection_is_averaged_beside_a_table(broken_capture, table, options, averaged):
+@pytest.mark.parametrize(("table", "indirect"), [(True, True), (True, False), (False, True)])
+def test_interreflection_is_averaged_beside_a_table(broken_capture, table, indirect):
     path, edit = broken_capture
     if table:
         edit("</scene>", TABLE)
-    running = Fit(load_capture(path), fit.parse_options([str(path), "--iterations", "7", *SPHERE, *options]))
+    one_stage = {"levels": (2,), "widths": (28,), "shares": (1.0,), "batch": 4, "domain": "sphere"}
+    running = Fit(load_capture(path), Config(iterations=7, indirect=indirect, **one_stage))
     seen = np.zeros(len(running.capture), int)
     for it in running:
         seen[it.index] += 1
     assert seen.sum() == 7 * 4
     counts = {k: count for k, (count, _) in running.averages.pictures.items()}
-    assert counts == ({k: count for k, count in enumerate(seen) if count} if averaged else {})
+    assert counts == ({k: count for k, count in enumerate(seen) if count} if table and indirect else {})
 
 
 def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture):
