@@ -288,7 +288,7 @@ class Calibration(nn.Module):
         total = sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(()))
         return total / 2 / len(self.lens)
 
-    def optimizers(self, near: bool = True) -> list[torch.optim.Optimizer]:
+    def optimizers(self, near: bool) -> list[torch.optim.Optimizer]:
         """Adam, whose groups say when they begin; none if least squares finds all. `near`: is the first surface?"""
         cameras = {"initial_lr": CAMERA_RATE, "decay": CAMERA_DECAY, "start": START if near else SETTLED}
         groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE, "start": START}

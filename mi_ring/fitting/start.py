@@ -74,7 +74,7 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
     # Where the hull has no handles and what it takes to start from one is missing, a sphere does, too.
-    if surface is not None and (choice == "hull" or genus(surface) or installed("gpytoolbox")):
+    if surface is not None and (choice == "hull" or installed("gpytoolbox") or genus(surface)):
         return closed_domain(surface, shape.center, shape.radius)
     return Sphere(), *capture.sphere()
 

@@ -33,6 +33,18 @@ def gpytoolbox() -> ModuleType:
     return need("gpytoolbox", "a start from another surface than the sphere")
 
 
+def carried(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Points (N, 3), or those of the mesh nearest to them, as its triangles lie with `others` (V, 3) as vertices."""
+    mesh = vertices.astype(float), faces.astype(np.int32)
+    _, face, weights = gpytoolbox().squared_distance(points.astype(float), *mesh, use_cpp=True)
+    return (others[faces[face]] * weights[..., None]).sum(1)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3) of length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 class Domain:
     """A closed surface in the normalised frame, given as a mesh, points (V, 3) and faces (F, 3), of any triangles.
 
@@ -67,11 +79,7 @@ class Domain:
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """The points of the surface that are nearest to these (N, 3)."""
-
-        faces = self.faces.astype(np.int32)
-        mesh = self.points.astype(float), faces
-        _, face, weights = gpytoolbox().squared_distance(points.astype(float), *mesh, use_cpp=True)
-        return (self.points[self.faces[face]] * weights[..., None]).sum(1)
+        return carried(points, self.points, self.faces, self.points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """The surface in about 20 · 4^level triangles."""
@@ -132,7 +140,7 @@ class Sphere(Domain):
         return np.linalg.norm(points, axis=1) < 1
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        return points / np.linalg.norm(points, axis=1, keepdims=True)
+        return unit(points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.creation.icosphere(subdivisions=level)

@@ -6,7 +6,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.domain import Domain, Sphere, gpytoolbox
+from mi_ring.geometry.domain import Domain, Sphere, carried, gpytoolbox, unit
 from mi_ring.geometry.meshes import genus
 
 LEVEL = 4  #: of the mesh that is mapped
@@ -37,16 +37,11 @@ class SphericalMap:
 
     def to_sphere(self, points: np.ndarray) -> np.ndarray:
         """Where points (N, 3) of the domain are on the sphere."""
-        return points if self.same else unit(self.carried(points, self.points, self.directions))
+        return points if self.same else unit(carried(points, self.points, self.faces, self.directions))
 
     def to_domain(self, directions: np.ndarray) -> np.ndarray:
         """Which points (N, 3) of the domain are there."""
-        return directions if self.same else self.carried(directions, self.directions, self.points)
-
-    def carried(self, points: np.ndarray, vertices: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """Points (N, 3) on triangles of `vertices`, at the same place of the same triangles of the `others`."""
-        _, face, weights = gpytoolbox().squared_distance(points.astype(float), vertices, self.faces, use_cpp=True)
-        return (others[self.faces[face]] * weights[..., None]).sum(1)
+        return directions if self.same else carried(directions, self.directions, self.faces, self.points)
 
 
 def rounded(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -64,8 +59,3 @@ def rounded(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         x = splu((mass + STEP * laplacian).tocsc()).solve(mass @ x)
         x = x - mass.diagonal() @ x / mass.diagonal().sum()
     return unit(x)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (N, 3) of length 1."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
