@@ -52,11 +52,9 @@ ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 BLACK = 1e-6  #: radiance, in units of the file's, below which an S goes on straight
 DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
-START, SETTLED = 0.2, 0.4  #: progress of the fit when refinement begins, that of cameras if the start is far off
+START = 0.2  #: progress of the fit when refinement begins
 LIT = 0.15  #: and when that of the room's light does
-#: Of Adam, in standard deviations an iteration, and the share that it falls to, where not to that of the networks.
-#: Cameras have far to go and must come to rest: each is seen in a few iterations, and a tenth of a pixel matters.
-RATE, CAMERA_RATE, CAMERA_DECAY = 0.1, 0.5, 0.01
+RATE = 0.1  #: of Adam, in standard deviations an iteration
 
 
 def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ...]:
@@ -288,12 +286,11 @@ class Calibration(nn.Module):
         total = sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(()))
         return total / 2 / len(self.lens)
 
-    def optimizers(self, near: bool) -> list[torch.optim.Optimizer]:
-        """Adam, whose groups say when they begin; none if least squares finds all. `near`: is the first surface?"""
-        cameras = {"initial_lr": CAMERA_RATE, "decay": CAMERA_DECAY, "start": START if near else SETTLED}
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        """Adam, whose groups say when they begin, for all but cameras; none if there is nothing for it to find."""
+        found = [UNKNOWNS[group] for group in self.refined if group != "cameras"]
         groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE, "start": START}
-                  | (cameras if group == "cameras" else {})
-                  for group, names in UNKNOWNS.items() if names and group in self.refined]  # fmt: skip
+                  for names in found if names]  # fmt: skip
         return [torch.optim.Adam(groups, lr=RATE)] if groups else []
 
     def unknown(self, name: str) -> tuple[Tensor, Tensor]:

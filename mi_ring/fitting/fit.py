@@ -21,6 +21,7 @@ from mi_ring.fitting.holdout import confirm
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
+from mi_ring.fitting.poses import GaussNewton
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import starting_ring
@@ -107,10 +108,14 @@ class Fit:
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         near = not isinstance(self.ring.domain, Sphere)
         self.calibration: Calibration | None = None
+        self.poses: GaussNewton | None = None
         if refined := refined_of(seen, self.config, self.albedo):
             power = overall(refined, self.albedo)
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
-            self.optimizers += self.calibration.optimizers(near)
+            self.optimizers += self.calibration.optimizers()
+            if "cameras" in refined:
+                self.poses = GaussNewton(self.calibration, near)
+                self.optimizers.append(self.poses)
             self.calibration.room.to(self.device)
         self.stages = stages_of(self.config, near)
         self.iterations = self.stages[-1].last
@@ -143,6 +148,8 @@ class Fit:
             self.take_outlines(find_outlines(self))
         it = self.predict()
         loss = self.weigh(it)
+        if self.poses:
+            self.poses.look(it)
         self.descend(loss, it.progress)
         self.follow_power()
         it.loss = float(loss.detach())

@@ -17,6 +17,15 @@ DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
+def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
+    """Radiance as `kind` of the losses of colours compares it, in units of `exposure`."""
+    linear = photographs / exposure
+    if kind in ("l2", "l1"):
+        return linear
+    log = (4 * linear).clamp(min=-0.5).log1p()
+    return log if kind == "log" else (linear + log) / 2  # both rise, so this is the mean of two losses
+
+
 def rgb_loss(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, telling: Tensor | None = None
 ) -> Tensor:
@@ -27,15 +36,7 @@ def rgb_loss(
     `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
     that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the mean of both.
     """
-
-    def perceived(photographs: Tensor) -> Tensor:
-        linear = photographs / exposure
-        if kind in ("l2", "l1"):
-            return linear
-        log = (4 * linear).clamp(min=-0.5).log1p()
-        return log if kind == "log" else (linear + log) / 2  # both rise, so this is the mean of two losses
-
-    error = perceived(predicted) - perceived(observed)
+    error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
     error = torch.where(clipped, error.clamp(max=0), error)
     if telling is not None:
         error = error * telling[..., None]
@@ -77,13 +78,23 @@ class Term(NamedTuple):
     schedule: Callable[[Iteration], float] | None = None  #: a factor of the weight in the course of the fit
 
 
-def rgb(it: Iteration) -> Tensor:
-    """Colours: predicted photographs against observed ones.
+def telling(it: Iteration) -> Tensor | None:
+    """(n, H, W) bool: where colours count; None: everywhere.
 
     In a room that was not black, what is not wholly object by its mask and by its prediction could be anything.
     """
-    telling = it.surely() if it.fit.capture.lit_room else None
-    return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss, telling)
+    return it.surely() if it.fit.capture.lit_room else None
+
+
+def rgb(it: Iteration) -> Tensor:
+    """Colours: predicted photographs against observed ones."""
+    return rgb_loss(it.predicted, it.observed, it.clipped, it.fit.exposure, it.fit.config.loss, telling(it))
+
+
+def outline_blur(it: Iteration) -> float:
+    """Standard deviation [px] of the blur of silhouettes: it shrinks, to a pixel for the last fifth of the fit."""
+    width = it.fit.capture.sensors[it.index[0]].size[0] / it.scale
+    return max(1.0, it.fit.config.blur * (1 - it.progress / 0.8) * width)
 
 
 def mask(it: Iteration) -> Tensor | None:
@@ -94,15 +105,13 @@ def mask(it: Iteration) -> Tensor | None:
     """
     if not it.masked.any():
         return None
-    # The blur shrinks, to a pixel for the last fifth of the fit.
-    sigma = it.fit.config.blur * (1 - it.progress / 0.8) * it.fit.capture.sensors[it.index[0]].size[0] / it.scale
     coverage, threshold = it.coverage, it.fit.capture.threshold
     if threshold is not None:  # of the object, such masks show what is bright
         lit = torch.maximum(it.observed, it.predicted.detach()).amax(-1) > threshold
         coverage = torch.where(lit, coverage, 0)
     valid = None if it.valid is None else it.valid[it.masked]
     doubt = DOUBT if it.fit.capture.lit_room and it.progress > SETTLED else math.inf
-    return mask_loss(coverage[it.masked], it.mask[it.masked], max(1.0, sigma), valid, doubt)
+    return mask_loss(coverage[it.masked], it.mask[it.masked], outline_blur(it), valid, doubt)
 
 
 def velocity(it: Iteration) -> Tensor:

@@ -1,0 +1,119 @@
+"""Gauss-Newton steps of the cameras: how pictures move with them, and where the steps lead."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import mi_ring
+from mi_ring.fitting.poses import motion, slopes
+from mi_ring.geometry.camera import Camera
+
+SIZE = (7, 5)
+
+
+def on_sphere(camera, center, radius):
+    """Points (H·W, 3) of a sphere that the pixels see, None for those that miss it."""
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = camera.directions(np.stack([x.ravel(), y.ravel()], 1))
+    away = camera.position - center
+    along = rays @ away
+    inside = along**2 - (away @ away - radius**2)
+    return [camera.position + (-b - np.sqrt(d)) * ray if d > 0 else None for ray, b, d in zip(rays, along, inside)]
+
+
+def test_pixels_move_as_points_of_a_sphere_do_when_the_camera_does():
+    to_world = np.eye(4)
+    to_world[:3, :3] = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    to_world[:3, 3] = 30, -20, 11
+    camera = Camera(to_world, np.array([9.0, 11.0]), np.array([3.0, 2.9]), SIZE)
+    inside = np.array([1.0, -2.0, 40.0])  # in the camera's axes
+    center, radius = to_world[:3, :3] @ inside + to_world[:3, 3], 9.0
+    points = on_sphere(camera, center, radius)
+    seen = [k for k, point in enumerate(points) if point is not None]
+    assert 5 < len(seen) < 30
+    found = motion(torch.tensor([9.0, 11.0, 3.0, 2.9]), SIZE, torch.tensor(inside).float(), radius)
+    found = found.reshape(-1, 2, 6).numpy()
+    for j, step in enumerate(1e-5 * np.eye(6)):
+        moved = to_world.copy()
+        moved[:3, :3] = to_world[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
+        moved[:3, 3] = to_world[:3, 3] + to_world[:3, :3] @ step[3:]
+        for k in seen:
+            before, after = (c.project(points[k][None])[0][0] for c in (camera, camera._replace(to_world=moved)))
+            np.testing.assert_allclose(found[k, :, j], (after - before) / 1e-5, rtol=1e-3, atol=2e-4)
+    assert np.isfinite(found).all()  # of those that miss it, too
+
+
+def test_slopes_are_those_of_a_plane():
+    y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
+    found = slopes(torch.stack([2 * x - 3 * y, 0.5 * y], -1))
+    torch.testing.assert_close(found[1:-1, 1:-1], torch.tensor([[2.0, -3.0], [0.0, 0.5]]).expand(3, 5, 2, 2))
+
+
+def posed(capture, **changes):
+    """A fit that refines cameras, at an iteration in its middle, and photographs that show what it predicts."""
+    config = mi_ring.Config(refine=("cameras",), levels=(4,), widths=(56,), shares=(1.0,), batch=4, spp=16, **changes)
+    fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
+    fit.iteration, chosen = fit.iterations // 2, fit.choose()
+    fit.choose = lambda: chosen
+    with torch.no_grad():
+        seen = fit.predict()
+    index = seen.index
+
+    def predict():
+        it = predicted()
+        it.observed, it.mask = seen.predicted, seen.coverage
+        return it
+
+    predicted, fit.predict = fit.predict, predict
+    fit.optimizers = [fit.poses]  # the surface stays as it is
+    return fit, index
+
+
+@pytest.mark.parametrize("loss", ["l1+log", "l2"])
+def test_cameras_go_where_photographs_were_taken(small_capture, loss):
+    fit, index = posed(small_capture, loss=loss)
+    calibration, center = fit.calibration, fit.calibration.center
+    random = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        calibration.turn += 2 * torch.randn(calibration.turn.shape, generator=random)
+        calibration.move += 2 * torch.randn(calibration.move.shape, generator=random)
+    untouched = np.setdiff1d(np.arange(len(fit.capture)), index)
+    before = calibration.turn.detach().clone()
+
+    def pixels():
+        """How far the object's centre is from where it was, in photographs of 56 × 40 [px]: (4,)."""
+        cameras = calibration()[0].detach()[index]
+        found = torch.einsum("nji,nj->ni", cameras[:, :, :3], center - cameras[:, :, 3])
+        base = calibration.base.cameras[index]
+        true = torch.einsum("nji,nj->ni", base[:, :, :3], center - base[:, :, 3])
+        return 60 * (found[:, :2] / found[:, 2:] - true[:, :2] / true[:, 2:]).norm(dim=1)
+
+    first = pixels()
+    assert first.mean() > 1
+    for _ in range(8):
+        fit.step()
+    assert pixels().max() < 0.1 * first.mean()
+    assert torch.equal(calibration.turn[untouched], before[untouched])
+
+
+def test_right_cameras_stay(small_capture):
+    fit, _ = posed(small_capture)
+    for _ in range(8):
+        fit.step()
+    # About and along the optical axis pictures tell the least: a quarter is less than a twentieth of a pixel at the rim.
+    assert fit.calibration.turn.abs().max() < 0.25 and fit.calibration.move.abs().max() < 0.25
+
+
+@pytest.mark.parametrize(("domain", "start"), [("hull", 0.2), ("sphere", 0.4)])
+def test_cameras_begin_when_there_is_a_shape(small_capture, domain, start):
+    fit, _ = posed(small_capture, domain=domain)
+    for progress, moved in (start - 0.01, False), (start + 0.05, True):
+        with torch.no_grad():
+            fit.calibration.move += 1
+        before = fit.calibration.move.detach().clone()
+        it = fit.predict()
+        loss = fit.weigh(it)
+        fit.poses.look(it)
+        fit.descend(loss, progress)
+        assert (not torch.equal(fit.calibration.move, before)) == moved
