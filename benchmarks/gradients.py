@@ -29,11 +29,12 @@ SHIFT, AXIS = [1.0, 0.3, -0.2], [0.48, 0.8, 0.36]  #: along which things are mov
 #: What moves, and by how much to either side in the finite difference.
 STEPS = {
     "translate": 0.016, "scale": 0.016, "bump": 0.01, "camera moves": 0.016, "camera turns": 0.004,
-    "focal length": 0.008, "principal point": 0.5, "light moves": 0.03, "intensity": 0.05,
+    "focal length": 0.008, "principal point": 0.5, "distortion": 0.02, "light moves": 0.03, "intensity": 0.05,
     "falloff": 0.05, "room": 0.05,
 }  # fmt: skip
-MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.centre", "sensor.falloff", "sensor.light", "room")
-CONE = 4.0  #: exponent of the flash's, where that changes
+MOVABLE = ("sensor.to_world", "sensor.focal", "sensor.centre", "sensor.distortion", "sensor.falloff", "sensor.light",
+           "room")  # fmt: skip
+CONE, BENT = 4.0, -0.3  #: exponent of the flash's, and distortion of the lens, where these change
 ROOM = np.linspace(0.5, -0.3, 27)  #: harmonics of the room's light, where they change
 LIGHTS, SHAPES = ("flash", "lamp", "directional"), ("sphere", "bumpy")
 
@@ -70,6 +71,8 @@ class Picture:
                 "sampler": {"type": "multijitter"}, "light": lamp,
             },
         }  # fmt: skip
+        if moved == "distortion":
+            scene["sensor"]["distortion"] = BENT
         if moved == "falloff":
             scene["sensor"]["falloff"] = CONE
         if moved == "room":
@@ -118,6 +121,8 @@ class Picture:
                 return {"sensor.focal": focal * (1 + t)}
             case "principal point":
                 return {"sensor.centre": self.before["sensor.centre"] + t * mi.Vector2f(*SHIFT[:2])}
+            case "distortion":
+                return {"sensor.distortion": self.before["sensor.distortion"] + t}
             case "falloff":
                 return {"sensor.falloff": self.before["sensor.falloff"] + t}
             case "room":

@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from test_bridge import HEIGHT, OFF_CAMERA, WIDTH, Setting, tensor
+from test_poses import posed
 
 import mi_ring
 from mi_ring import InputError, fit
@@ -296,7 +297,8 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
         calibration.focal[0] = 3
         calibration.power[:] = tensor(np.random.default_rng(2).normal(size=(12, 3)))
         calibration.falloff.fill_(2)
-    cameras, intrinsics, places, strengths, falloff = (t.detach().numpy() for t in calibration())
+        calibration.distortion.fill_(-1.5)
+    cameras, intrinsics, places, strengths, falloff, distortion = (t.detach().numpy() for t in calibration())
     old = capture.sensors[3].camera.to_world[:3]
     x, y, z, position = old.T
     moved = position + 2 * widths["move"] * distance * z
@@ -308,6 +310,7 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
     np.testing.assert_allclose(factors.mean(0), 0, atol=1e-5)  # brightness against albedo
     assert factors.std() == pytest.approx(widths["power"], rel=0.3)
     np.testing.assert_allclose(falloff, 2 * widths["falloff"], rtol=1e-5)
+    np.testing.assert_allclose(distortion, -1.5 * widths["distortion"], rtol=1e-5)
 
 
 def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_capture, tmp_path):
@@ -428,7 +431,7 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     np.testing.assert_allclose(read.photographs.room, applied.photographs.room, rtol=1e-5)
     np.testing.assert_allclose(read.part([3, 1]).photographs.room, applied.photographs.room, rtol=1e-5)
     for a, b in ((applied.photographs, read.photographs), (applied.photographs.lights, read.photographs.lights)):
-        for name in ("cameras", "intrinsics", "places", "strengths"):
+        for name in ("cameras", "intrinsics", "distortion", "places", "strengths"):
             if hasattr(a, name):
                 np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
     assert [s.gamma for s in read.sensors] == pytest.approx([s.gamma for s in applied.sensors])
@@ -444,6 +447,20 @@ def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, t
         pass
     off = running.calibration.flash.mean(0) + running.calibration.value("light")[0] * running.calibration.distance
     assert np.linalg.norm(off.detach().numpy() - FLASH) < 0.35 * np.linalg.norm(wrong)
+
+
+def test_distortion_goes_where_the_lens_has_it(small_capture):
+    fit, _ = posed(small_capture, refine=("distortion",))
+    with torch.no_grad():
+        fit.calibration.distortion.fill_(1)  # 0.05: a tenth of a pixel where the object ends
+    for _ in range(60):
+        fit.step()
+    found = [sensor.camera.distortion for sensor in fit.calibrated().sensors]
+    assert np.abs(found).max() < 0.3 * 0.05
+    fit.surface.show(fit.ring, *fit.ring.domain.sample(3))
+    summary = fit.summary(fit.calibrated())["unknowns"]["distortion"]
+    assert summary["before"] == [0] and summary["after"] == pytest.approx(found[:1], abs=1e-6)
+    assert 0 < summary["std"][0] < 0.05
 
 
 def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_capture, monkeypatch):

@@ -37,6 +37,8 @@ CELLS = [  # moved, light, wall, shape, unit, channels
     ("light moves", "directional", True, "sphere", 1.0, RADIANCE),
     ("light moves", "flash", True, "bumpy", 1.0, RADIANCE),
     ("principal point", "lamp", False, "bumpy", 1.0, RADIANCE),
+    ("distortion", "lamp", True, "sphere", 1.0, RADIANCE),
+    ("distortion", "flash", False, "bumpy", 1.0, COVERAGE),
     ("falloff", "flash", False, "bumpy", 1000.0, RADIANCE),
     ("falloff", "lamp", True, "sphere", 1.0, RADIANCE),
     ("room", "flash", True, "bumpy", 1.0, RADIANCE),

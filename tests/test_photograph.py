@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_ring.rendering.pinhole import camera_ray, project
+from mi_ring.geometry.camera import Camera
+from mi_ring.rendering.pinhole import camera_ray, project, project_tangent
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 7, 5, 9.5, 7.25, 3.1, 2.8  # [px]; nothing in the middle, nothing square
 POSE = np.array(mi.ScalarTransform4f().look_at([1.3, -0.7, 2.9], [0.2, 0.1, -0.3], [0.2, 1, 0.1]).matrix)
@@ -53,7 +54,7 @@ def rays_of(sensor, u, v, size=(WIDTH, HEIGHT)):
 
 def camera():
     """The arguments of `camera_ray` and `project` for the camera above."""
-    return mi.Matrix4f(POSE), mi.Point2f(FX, FY), mi.Point2f(CX, CY)
+    return mi.Matrix4f(POSE), mi.Point2f(FX, FY), mi.Point2f(CX, CY), None
 
 
 # Rays. float32 keeps about seven digits: 1e-5 leaves room for a few operations.
@@ -68,7 +69,7 @@ def test_camera_ray_is_the_pinhole_of_the_conventions():
 
 
 def test_a_pixel_further_right_looks_further_right_and_a_lower_one_further_down():
-    _, axis = camera_ray(mi.Matrix4f(np.eye(4)), mi.Point2f(FX, FY), mi.Point2f(CX, CY), mi.Point2f(CX + 2, CY + 1))
+    _, axis = camera_ray(mi.Matrix4f(np.eye(4)), *camera()[1:], mi.Point2f(CX + 2, CY + 1))
     # By hand, camera frame x left, y up, z forward: (-2 / fx, -1 / fy, 1), normalised
     expected = np.array([-2 / FX, -1 / FY, 1]) / np.sqrt((2 / FX) ** 2 + (1 / FY) ** 2 + 1)
     np.testing.assert_allclose(np.array(axis).ravel(), expected, atol=1e-6)
@@ -83,6 +84,50 @@ def test_project_inverts_camera_ray():
     pixel, z = project(*camera(), mi.Point3f(*point.T.astype(np.float32)))
     np.testing.assert_allclose(np.array(pixel).T, np.stack([u, v], -1), atol=1e-4)  # [px], of numbers below 10
     np.testing.assert_allclose(np.array(z), depth, rtol=1e-5)
+
+
+@pytest.mark.parametrize("distortion", [-0.3, -0.05, 0.4])
+def test_a_lens_bends_rays_as_colmaps_does(distortion):
+    """Where a point is photographed, by COLMAP; the ray through there meets the point, and it projects there."""
+    pycolmap = pytest.importorskip("pycolmap")
+    lens = pycolmap.Camera(model="FULL_OPENCV", width=WIDTH, height=HEIGHT,
+                           params=[FX, FY, CX, CY, distortion, *[0.0] * 7])  # fmt: skip
+    local = np.random.default_rng(3).uniform([-0.3, -0.3, 1], [0.3, 0.3, 1], (50, 3)) * 4  # x right, y down, z forward
+    photographed = np.stack([lens.img_from_cam(point) for point in local])
+    there = local * [-1, -1, 1] @ POSE[:3, :3].T + POSE[:3, 3]
+    dress = (*camera()[:3], mi.Float(distortion))
+    pixel, depth = project(*dress, mi.Point3f(*there.T.astype(np.float32)))
+    np.testing.assert_allclose(np.array(pixel).T, photographed, atol=1e-4)
+    np.testing.assert_allclose(np.array(depth), 4, rtol=1e-5)
+    ours = Camera(POSE, np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), distortion)
+    np.testing.assert_allclose(ours.project(there)[0], photographed, atol=1e-9)
+    away = there - POSE[:3, 3]
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    np.testing.assert_allclose(ours.directions(photographed), away, atol=1e-9)
+    _, rays = camera_ray(*dress, mi.Point2f(*photographed.T.astype(np.float32)))
+    np.testing.assert_allclose(np.array(rays).T, away, atol=1e-5)
+    u, v = pixel_centres()
+    inside = (ours.directions(np.stack([u, v], 1)) @ POSE[:3, 2]).reshape(HEIGHT, WIDTH)
+    np.testing.assert_allclose(ours.cosines(), inside, atol=1e-9)
+    if distortion < -0.1:
+        return  # its corners would be seen twice
+    _, direction = rays_of(mi.load_dict(photograph(distortion=distortion)), u, v)
+    np.testing.assert_allclose(direction, ours.directions(np.stack([u, v], 1)), atol=1e-5)
+
+
+def test_a_step_along_an_edge_is_photographed_by_a_lens_as_finite_differences_say():
+    dress = (*camera()[:3], mi.Float(-0.2))
+    point, tangent = np.array([0.4, 0.1, -0.2]), np.array([0.3, -0.5, 0.2])
+    ours = Camera(POSE, np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), -0.2)
+    high, low = (ours.project((point + t * tangent)[None])[0][0] for t in (1e-5, -1e-5))
+    to_world, focal, _, distortion = dress
+    found = project_tangent(to_world, focal, distortion, mi.Point3f(point.tolist()), mi.Vector3f(tangent.tolist()))
+    np.testing.assert_allclose(np.array(found).ravel(), (high - low) / 2e-5, rtol=1e-4)
+
+
+def test_a_lens_that_folds_the_picture_is_refused():
+    with pytest.raises(Exception, match="distortion is -2, must be above"):
+        mi.load_dict(photograph(distortion=-2.0))
 
 
 def test_sensor_rays_pass_through_the_pixels():
@@ -341,16 +386,16 @@ def test_gradients_pass_through_the_camera_ray():
     """Against central differences, in the parameters that a calibration would refine."""
     pose = mi.Matrix4f(POSE)
 
-    def pixel_x(cx, fx):
-        _, d = camera_ray(pose, mi.Point2f(fx, FY), mi.Point2f(cx, CY), mi.Point2f(5.2, 1.4))
+    def pixel_x(cx, fx, distortion):
+        _, d = camera_ray(pose, mi.Point2f(fx, FY), mi.Point2f(cx, CY), distortion, mi.Point2f(5.2, 1.4))
         return d.x
 
-    cx, fx = mi.Float(CX), mi.Float(FX)
-    dr.enable_grad(cx, fx)
-    dr.backward(pixel_x(cx, fx))
+    cx, fx, distortion = mi.Float(CX), mi.Float(FX), mi.Float(-0.3)
+    dr.enable_grad(cx, fx, distortion)
+    dr.backward(pixel_x(cx, fx, distortion))
     step = 0.05  # float32: rounding 1e-7 / 0.1, truncation below 1e-5
-    for given, name in ((cx, "cx"), (fx, "fx")):
-        at = {"cx": mi.Float(CX), "fx": mi.Float(FX)}
+    for given, name in ((cx, "cx"), (fx, "fx"), (distortion, "distortion")):
+        at = {"cx": mi.Float(CX), "fx": mi.Float(FX), "distortion": mi.Float(-0.3)}
         high, low = pixel_x(**at | {name: at[name] + step}), pixel_x(**at | {name: at[name] - step})
         assert dr.grad(given)[0] == pytest.approx((high - low)[0] / (2 * step), rel=1e-3)
 

@@ -22,7 +22,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.room import Room
-from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.camera import FOLD, Camera, straightening
 from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
@@ -36,6 +36,7 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     },
     "focal": {"focal": 0.01},  # logarithm, one for each lens
     "principal": {"principal": 0.01},  # along both axes of the picture, one for each lens [focal lengths]
+    "distortion": {"distortion": 0.05},  # first radial one, for each lens
     "light": {"light": 0.1},  # along each axis [the same distance]; of distant ones [rad]
     "power": {"power": 0.1},  # logarithm, of each photograph and colour
     "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
@@ -93,6 +94,7 @@ class Calibrated(NamedTuple):
     places: Tensor  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
     strengths: Tensor  #: (P, 3) intensities, of distant ones irradiances
     falloff: Tensor  #: (P,) exponents of flashes' cones
+    distortion: Tensor  #: (P,) first radial ones of the lenses
 
 
 class Calibration(nn.Module):
@@ -113,7 +115,8 @@ class Calibration(nn.Module):
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
         cones = np.array([sensor.cone for sensor in capture.sensors])
-        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones
+        bent = np.array([camera.distortion for camera in cameras])
+        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, bent
         self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
         self.center = torch.from_numpy(np.asarray(center)).float()
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
@@ -129,6 +132,9 @@ class Calibration(nn.Module):
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
         self.sizes = [sensor.size for sensor in capture.sensors]
+        corners = [np.maximum(c.centre, c.size - c.centre) / c.focal for c in cameras]
+        #: Of distortion: right below, the corners of the widest photograph would be seen twice.
+        self.least = 0.9 * FOLD / max(float(corner @ corner) for corner in corners)
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
         lenses = np.unique(intrinsics[:, :2].round(3), axis=0, return_inverse=True)[1].ravel()
@@ -137,7 +143,8 @@ class Calibration(nn.Module):
         self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
         count = len(cameras)
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
-                  "principal": (int(lenses.max()) + 1, 2), "falloff": (), "vignetting": (),
+                  "principal": (int(lenses.max()) + 1, 2), "distortion": (int(lenses.max()) + 1,),
+                  "falloff": (), "vignetting": (),
                   "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": (), "contrast": (),
                   "scale": ()}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
@@ -153,7 +160,7 @@ class Calibration(nn.Module):
 
     def forward(self) -> Calibrated:
         """Cameras and lights as they are by now."""
-        cameras, intrinsics, places, strengths, falloff = self.base
+        cameras, intrinsics, places, strengths, falloff, distortion = self.base
         if "cameras" in self.refined:
             turned = cameras[:, :, :3] @ rotations(self.value("turn"))
             moved = cameras[:, :, 3:] + cameras[:, :, :3] @ (self.value("move") * self.distance)[..., None]
@@ -164,6 +171,8 @@ class Calibration(nn.Module):
         if "principal" in self.refined:
             shift = self.value("principal")[self.lens] * intrinsics[:, :2]
             intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
+        if "distortion" in self.refined:
+            distortion = (distortion + self.value("distortion")[self.lens]).clamp(min=self.least)
         offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
             moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
@@ -174,7 +183,7 @@ class Calibration(nn.Module):
         power = self.value("power")
         scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
         strengths = strengths * (scale + power - (power.mean(0) if power.ndim else 0)).exp()
-        return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"))
+        return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"), distortion)
 
     def scaled(self, scale: int) -> Calibrated:
         """For photographs `scale` times smaller."""
@@ -208,10 +217,13 @@ class Calibration(nn.Module):
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """(N, H, W, 1) of the angles between the optical axis and the rays of photographs, `scale` times smaller."""
         width, height = (size // scale for size in self.sizes[index[0]])
-        fx, fy, cx, cy = (self.scaled(scale).intrinsics[index].detach().T)[..., None, None]
+        at = self.scaled(scale)
+        fx, fy, cx, cy = (at.intrinsics[index].detach().T)[..., None, None]
         x = (torch.arange(width) + 0.5 - cx) / fx
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
-        return (1 + x**2 + y**2)[..., None] ** -0.5
+        distance2 = x**2 + y**2
+        factor = straightening(at.distortion[index].detach()[:, None, None], distance2)
+        return (1 + factor**2 * distance2)[..., None] ** -0.5
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """Radiance (N, H, W, 3) as lens and curve record it, decoded by what the capture says of both.
@@ -276,10 +288,10 @@ class Calibration(nn.Module):
     def room_share(self) -> Tensor:
         """(3,) the room's light on the object, mean over all directions, by that of the flash where it faces it."""
         with torch.no_grad():
-            _, _, places, strengths, _ = self()
-            distance2 = torch.where(self.finite, (places - self.center).square().sum(-1, keepdim=True), 1.0)
+            now = self()
+            distance2 = torch.where(self.finite, (now.places - self.center).square().sum(-1, keepdim=True), 1.0)
             mean = self.room.harmonics[0].cpu() / math.sqrt(4 * math.pi)
-            return math.pi * mean / (strengths / distance2).median(0).values
+            return math.pi * mean / (now.strengths / distance2).median(0).values
 
     def prior(self) -> Tensor:
         """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""
@@ -302,7 +314,7 @@ class Calibration(nn.Module):
     def applied(self, capture: Capture) -> Capture:
         """The capture with cameras, lights and curve as they are by now."""
         with torch.no_grad():
-            matrices, intrinsics, places, strengths, falloff = (part.double().numpy() for part in self())
+            matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in self())
             gamma, vignetting = float(self.gamma), float(self.value("vignetting"))
             contrast = float(self.value("contrast").exp())
         # The curve's fixed point is the exposure here, full scale in a scene file.
@@ -310,7 +322,7 @@ class Calibration(nn.Module):
         cameras, lights = [], []
         for k, sensor in enumerate(capture.sensors):
             to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
-            cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size))
+            cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size, distortion[k]))
             point = bool(self.finite[k])
             lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
         room = None

@@ -15,7 +15,6 @@ from torch.nn import functional as F
 
 from mi_ring.fitting.calibration import Calibration
 from mi_ring.rendering import bridge
-from mi_ring.rendering.indirect import BOUNCES
 from mi_ring.rendering.photographs import Photographs
 
 if TYPE_CHECKING:
@@ -38,7 +37,8 @@ class Entries:
 
     def rows(self, name: str, index: np.ndarray) -> np.ndarray:
         """Which row of an unknown is that of each photograph."""
-        shared = {"focal": self.calibration.lens, "principal": self.calibration.lens, "light": self.calibration.place}
+        lens = dict.fromkeys(("focal", "principal", "distortion"), self.calibration.lens)
+        shared = lens | {"light": self.calibration.place}
         if name in shared:
             return shared[name][index].numpy()
         return index if getattr(self.calibration, name).ndim else np.zeros_like(index)
@@ -124,7 +124,7 @@ def compare(
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
         around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
-                                     bounces=BOUNCES if fit.ring.indirect else 1, room=bool(room.any()))  # fmt: skip
+                                     indirect=fit.ring.indirect, room=bool(room.any()))  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
         roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
 

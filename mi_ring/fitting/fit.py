@@ -32,7 +32,6 @@ from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.rendering.indirect import BOUNCES
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device, release_memory
@@ -206,7 +205,7 @@ class Fit:
         if not (self.ring.indirect or lit):
             return predicted
         around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
-                                     bounces=BOUNCES if self.ring.indirect else 1)  # fmt: skip
+                                     indirect=self.ring.indirect)  # fmt: skip
         if self.ring.indirect and self.surface.table is not None:
             around = self.averages.of(around, index)
         if self.ring.indirect:

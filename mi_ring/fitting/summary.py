@@ -49,6 +49,9 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     if "principal" in now:
         add("principal", "principal point [px]", [old[k].camera.centre for k in lenses],
             [new[k].camera.centre for k in lenses], focal * deviations["principal"])  # fmt: skip
+    if "distortion" in now:
+        add("distortion", "first radial distortion of the lens", [old[k].bend for k in lenses],
+            [new[k].bend for k in lenses], deviations["distortion"])  # fmt: skip
     for name, attribute, what in (
         ("falloff", "cone", "exponent of the flash's cone"),
         ("vignetting", "vignetting", "exponent of the lens' vignetting"),

@@ -1,6 +1,6 @@
 """Pinhole cameras as numpy arrays: the twin of `mi_ring.rendering.pinhole`."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +19,33 @@ def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.n
     return there
 
 
+FOLD = -4 / 27  #: of `distortion` times the squared distance from the centre [focal lengths²], where a lens folds
+NEWTON = 6  #: steps, which leave less than float64 rounds up to nine tenths of the way to there
+
+
+def straightening(distortion: Any, distance2: Any) -> Any:
+    """The factor by which a point of a photograph is nearer its centre, or farther, than it would be in a pinhole's.
+
+    `distance2`: its squared distance from the centre [focal lengths²], as photographed. The inverse of
+    1 + `distortion` r², by Newton's method; of arrays of numpy, torch and Dr.Jit alike. Right above `FOLD`.
+    """
+    k = distortion * distance2
+    factor = 1 / (1 + k)
+    for _ in range(NEWTON):
+        factor = factor - (factor + k * factor**3 - 1) / (1 + 3 * k * factor**2)
+    return factor
+
+
 class Camera(NamedTuple):
-    """A pinhole camera. The picture spans [0, W] × [0, H], x right, y down: the first pixel's centre is (0.5, 0.5)."""
+    """A camera. The picture spans [0, W] × [0, H], x right, y down: the first pixel's centre is (0.5, 0.5)."""
 
     to_world: np.ndarray  #: (4, 4) camera-to-world, Mitsuba's axes: x left, y up, z forward
     focal: np.ndarray  #: (2,) focal lengths [px]
     centre: np.ndarray  #: (2,) principal point [px]
     size: tuple[int, int]  #: (width, height) [px]
+    #: First radial one of the lens: what a pinhole has at r focal lengths from the centre is 1 + distortion · r² times
+    #: as far from it.
+    distortion: float = 0.0
 
     @property
     def position(self) -> np.ndarray:
@@ -44,34 +64,42 @@ class Camera(NamedTuple):
 
     @property
     def projection(self) -> np.ndarray:
-        """(3, 4): of a point (x, y, z, 1) pixel coordinates times depth, and depth."""
+        """(3, 4): of a point (x, y, z, 1) pixel coordinates times depth, and depth; without distortion."""
         across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
         rows = np.column_stack([across, self.forward]).T
         return np.column_stack([rows, -rows @ self.position])
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) in the world through pixel coordinates (n, 2)."""
-        x, y = ((pixels - self.centre) / self.focal).T
+        x, y = self.undistorted((pixels - self.centre) / self.focal).T
         d = np.stack([-x, -y, np.ones_like(x)], 1) @ self.to_world[:3, :3].T
         return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+    def undistorted(self, places: np.ndarray) -> np.ndarray:
+        """Where a pinhole would have what is photographed at places (..., 2), from the centre [focal lengths]."""
+        if not self.distortion:
+            return places
+        return places * straightening(self.distortion, np.square(places).sum(-1, keepdims=True))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates (n, 2), and depths (n,) along the optical axis [scene units], of points (n, 3)."""
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
         with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
-            return self.centre - self.focal * np.stack([x, y], 1) / z[:, None], z
+            places = np.stack([x, y], 1) / z[:, None]
+            places *= 1 + self.distortion * np.square(places).sum(1, keepdims=True)
+            return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:
         """(H, W) cosines of the angles between the pixels' rays and the optical axis."""
         width, height = self.size
-        x = (np.arange(width) + 0.5 - self.centre[0]) / self.focal[0]
-        y = (np.arange(height) + 0.5 - self.centre[1]) / self.focal[1]
-        return (1 + x**2 + y[:, None] ** 2) ** -0.5
+        y, x = np.mgrid[:height, :width]
+        places = self.undistorted((np.stack([x, y], -1) + 0.5 - self.centre) / self.focal)
+        return (1 + np.square(places).sum(-1)) ** -0.5
 
     def shrunk(self, scale: int) -> "Camera":
         """Of the same photograph, `scale` times smaller."""
         size = self.size[0] // scale, self.size[1] // scale
-        return Camera(self.to_world, self.focal / scale, self.centre / scale, size)
+        return self._replace(focal=self.focal / scale, centre=self.centre / scale, size=size)
 
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:

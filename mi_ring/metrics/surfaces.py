@@ -66,11 +66,11 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
     """
     # As `center_rays`, but not divided by the focal length: so Dr.Jit rounds where cameras are constants in the code.
     # Rays that differ in the last bit show in the fourth digit of the means, by pixels that just graze the surface.
-    to_world, focal, centre = photograph.camera(mi.UInt32(0))
+    to_world, focal, centre, distortion = photograph.camera(mi.UInt32(0))
     width, height = photograph.size
     pixel = dr.arange(mi.UInt32, width * height)
     where = (mi.Point2f(pixel % width, pixel // width) + 0.5 - centre) * mi.Point2f(1 / np.array(focal))
-    rays = mi.Ray3f(*camera_ray(to_world, mi.Point2f(1), mi.Point2f(0), where))
+    rays = mi.Ray3f(*camera_ray(to_world, mi.Point2f(1), mi.Point2f(0), distortion, where))
     si = scene.ray_intersect(rays)
     back = si.is_valid() & (dr.dot(mi.Vector3f(si.n), rays.d) > 0)
     return np.array(si.is_valid()), np.array(si.t), np.array(si.sh_frame.n).T, np.array(back)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.camera import FOLD, Camera
 from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.pinhole import camera_ray
 
@@ -30,6 +30,9 @@ class Photograph(mi.Sensor):
     ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the
                                   centre of the first pixel is (0.5, 0.5). Default: the middle of the
                                   film
+    ``distortion``   float        first radial one of the lens: what a pinhole would have at r focal     P, ∂
+                                  lengths from the principal point is at r (1 + ``distortion`` r²), as
+                                  COLMAP's SIMPLE_RADIAL and OpenCV's k1 have it. Default: 0
     ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale.    P, ∂
                                   Default: the identity
     ``encoding``     string       ``srgb`` or ``linear``; linear data of 8 bits is refused. Default:
@@ -62,7 +65,7 @@ class Photograph(mi.Sensor):
     ================ ============ ====================================================================== =====
 
     Every integrator sees the nested light while it renders this sensor, through the `flash` emitter that a `shapenet`
-    shape carries. What it does not do: depth of field, lens distortion, motion blur; light tracing integrators
+    shape carries. What it does not do: depth of field, other lens distortion, motion blur; light tracing integrators
     (``ptracer``) and the ``batch`` sensor cannot see the nested light.
 
     .. tab-set-code::
@@ -114,6 +117,11 @@ class Photograph(mi.Sensor):
         width, height = (int(s) for s in self.film().size())
         self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))
         self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
+        self.distortion = mi.Float(number(props, "distortion", 0.0))
+        far = np.maximum(np.ravel(self.centre), [width, height] - np.ravel(self.centre)) / np.ravel(self.focal)
+        if not self.bend * (far @ far) > FOLD:
+            raise ValueError(f'photograph "{props.id()}": distortion is {self.bend:.6g}, must be above '
+                             f"{FOLD / (far @ far):.6g}: below, the lens shows things twice")  # fmt: skip
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
         rotation = matrix[:3, :3]
         rigid = np.isfinite(matrix).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
@@ -132,7 +140,7 @@ class Photograph(mi.Sensor):
             raise ValueError(
                 f'photograph "{props.id()}": falloff is for point lights, not for {self.light.class_name()}'
             )
-        dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff)
+        dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff, self.distortion)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -146,6 +154,11 @@ class Photograph(mi.Sensor):
         return float(np.ravel(self.falloff)[0])
 
     @property
+    def bend(self) -> float:
+        """``distortion`` as a number."""
+        return float(np.ravel(self.distortion)[0])
+
+    @property
     def files(self) -> set[Path]:
         """All that it names, resolved."""
         return {file.resolve() for file in (self.filename, self.mask, self.valid) if file}
@@ -154,13 +167,14 @@ class Photograph(mi.Sensor):
     def camera(self) -> Camera:
         """The camera as numpy arrays."""
         matrix = np.array(self.to_world.matrix).reshape(4, 4)
-        return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), self.size)
+        return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), self.size, self.bend)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         Photograph.current = self
         film = self.film()
         pixel = sample2 * mi.ScalarVector2f(film.crop_size()) + mi.ScalarVector2f(film.crop_offset())
-        origin, direction = camera_ray(self.to_world.matrix, self.focal, self.centre, pixel)
+        lens = self.focal, self.centre, self.distortion
+        origin, direction = camera_ray(self.to_world.matrix, *lens, pixel)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         return mi.Ray3f(origin, direction, SHUTTER, wavelengths), weight
 
@@ -173,12 +187,14 @@ class Photograph(mi.Sensor):
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
         callback.put("focal", self.focal, mi.ParamFlags.Differentiable)
         callback.put("centre", self.centre, mi.ParamFlags.Differentiable)
+        callback.put("distortion", self.distortion, mi.ParamFlags.Differentiable)
         callback.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
         callback.put("light", self.light, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys):
         super().parameters_changed(keys)
-        dr.make_opaque(self.falloff)  # Dr.Jit gives literals, which are shared, the size of a call that reads them
+        # Dr.Jit gives literals, which are shared, the size of a call that reads them.
+        dr.make_opaque(self.falloff, self.distortion)
 
     def to_string(self):
         return f"Photograph[filename={self.filename}, size={self.size}]"

@@ -40,7 +40,7 @@ def boundary(scene, photographs, curve: Curve, seed, shadows, window):
     with dr.suspend_grad():
         q = dr.detach(where)
         active = curve.active & (depth > 0) & dr.all((q > window[0]) & (q < window[1]))
-        along = project_tangent(camera[0], camera[1], curve.point, curve.tangent)
+        along = project_tangent(camera[0], camera[1], camera[3], curve.point, curve.tangent)
         across = mi.Vector2f(-along.y, along.x)
         active &= dr.isfinite(dr.squared_norm(across)) & (dr.squared_norm(across) > 0)
         offset = max(curve.offset, EDGE_ROUNDINGS * 2.0**-24 * max(photographs.size))

@@ -194,7 +194,7 @@ def draw(
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
     if indirect or photographs.room is not None:
-        around = surroundings(surface, photographs, coverage, seed + 1, 128, 32, BOUNCES if indirect else 1,
+        around = surroundings(surface, photographs, coverage, seed + 1, 128, 32, indirect,
                               photographs.room is not None)  # fmt: skip
         rgb = rgb + (around.interreflection if indirect else 0)
         if photographs.room is not None:
@@ -241,15 +241,18 @@ class Surroundings:
 
 def surroundings(
     surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
-    spp: int | None = None, bounces: int = BOUNCES, room: bool = False,
+    spp: int | None = None, indirect: bool = True, room: bool = False,
 ) -> Surroundings:  # fmt: skip
     """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
+
+    Not `indirect`: the room's light is then what the surface reflects but once, and interreflection means nothing.
 
     `photographs`: as they were rendered; `coverage` (N, H, W): of that picture. This light varies slowly: it is
     rendered at most `width` pixels wide, with `spp` paths per pixel (a few good pixels did better than many noisy
     ones), and smoothed. Where there is a table both are by default others, `PATTERNED`.
     """
-    table = surface.table if bounces > 1 else None  # it would only keep the room's light from the object
+    bounces = BOUNCES if indirect else 1
+    table = surface.table if indirect else None  # it would only keep the room's light from the object
     usual = (WIDTH, SPP) if table is None else PATTERNED
     width, spp = width or usual[0], spp or usual[1]
     factor = -(-max(photographs.size) // width)

@@ -27,6 +27,7 @@ class Photographs:
     size: tuple[int, int]
     colocated: bool  #: is every light at its camera's centre? Then nothing that is seen is in shadow
     falloff: object = None  #: Float, one per photograph: exponent of its flash's cone; None if all shine to all sides
+    distortion: object = None  #: Float, one per photograph: its lens' as `Camera` has it; None if no lens has any
     room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
 
     @classmethod
@@ -37,12 +38,13 @@ class Photographs:
         intrinsics = np.stack([np.concatenate([camera.focal, camera.centre]) for camera in cameras])
         lights = Lights.of(sensors)
         falloff = np.array([sensor.cone for sensor in sensors], np.float32)
+        bent = np.array([camera.distortion for camera in cameras], np.float32)
         # Equal but for the rounding of float32.
         off = np.abs(lights.positions() - matrices[:, :, 3]).max(1) > 1e-6 * np.abs(matrices[:, :, 3]).max()
         return cls(
             mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
             dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(),
-            mi.Float(falloff) if falloff.any() else None, room,
+            mi.Float(falloff) if falloff.any() else None, mi.Float(bent) if bent.any() else None, room,
         )  # fmt: skip
 
     @classmethod
@@ -55,6 +57,7 @@ class Photographs:
             intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
             lights=Lights.attached(sensor),
             falloff=mi.Float(sensor.falloff),
+            distortion=mi.Float(sensor.distortion),
         )
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
@@ -65,25 +68,27 @@ class Photographs:
             index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale),
         )  # fmt: skip
 
-    def moved(self, cameras, intrinsics, places, strengths, falloff=None) -> "Photographs":
+    def moved(self, cameras, intrinsics, places, strengths, falloff=None, distortion=None) -> "Photographs":
         """The same with other buffers of cameras and lights; no light is taken to be exactly at its camera."""
         lights = replace(self.lights, places=places, strengths=strengths)
-        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False, falloff=falloff)
+        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False, falloff=falloff,
+                       distortion=distortion)  # fmt: skip
 
     def __len__(self) -> int:
         return dr.width(self.index)
 
     def camera(self, view):
-        """(to_world, focal, centre) of the selected photograph `view`, one per lane."""
+        """(to_world, focal, centre, distortion) of the selected photograph `view`, one per lane."""
         k = dr.gather(mi.UInt32, self.index, view)
         rows = [dr.gather(mi.Vector4f, self.cameras, 3 * k + row) for row in range(3)]
         f = dr.gather(mi.Vector4f, self.intrinsics, k)
         to_world = mi.Matrix4f(*[list(row) for row in rows], [0, 0, 0, 1])
-        return to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w)
+        distortion = None if self.distortion is None else dr.gather(mi.Float, self.distortion, k)
+        return to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion
 
     def eye(self, view):
         """The camera of photograph `view`, one per lane, as an eye of `Edges`."""
-        to_world, _, _ = self.camera(view)
+        to_world, *_ = self.camera(view)
         return mi.Vector3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]), mi.Bool(True)
 
     def source(self, view):

@@ -1,16 +1,22 @@
-"""Pinhole cameras in Dr.Jit: rays through pixels and back."""
+"""Pinhole cameras in Dr.Jit, perhaps with a lens: rays through pixels and back."""
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_ring.geometry.camera import straightening
 
-def camera_ray(to_world, focal, centre, pixel):
+
+def camera_ray(to_world, focal, centre, distortion, pixel):
     """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
 
-    `to_world`: Matrix4f camera-to-world; `focal`, `centre`: Point2f (fx, fy), (cx, cy) [px]; `pixel`: Point2f [px],
-    x right, y down. Arguments may hold one camera or one camera per lane. Returns (origin, unit direction).
+    `to_world`: Matrix4f camera-to-world; `focal`, `centre`: Point2f (fx, fy), (cx, cy) [px]; `distortion`: Float as
+    `mi_ring.geometry.camera.Camera` has it, None for none; `pixel`: Point2f [px], x right, y down. Arguments may hold
+    one camera or one camera per lane. Returns (origin, unit direction).
     """
     x, y = (pixel.x - centre.x) / focal.x, (pixel.y - centre.y) / focal.y
+    if distortion is not None:
+        factor = straightening(distortion, x * x + y * y)
+        x, y = x * factor, y * factor
     m = to_world
     direction = mi.Vector3f(
         -m[0, 0] * x - m[0, 1] * y + m[0, 2],
@@ -26,14 +32,23 @@ def camera_coordinates(to_world, vector):
     return dr.rcp(mi.Matrix3f([[to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
 
-def project(to_world, focal, centre, point):
+def project(to_world, focal, centre, distortion, point):
     """The inverse of `camera_ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point."""
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
-    return mi.Point2f(centre.x - focal.x * x / z, centre.y - focal.y * y / z), z
+    x, y = x / z, y / z
+    if distortion is not None:
+        factor = 1 + distortion * (x * x + y * y)
+        x, y = x * factor, y * factor
+    return mi.Point2f(centre.x - focal.x * x, centre.y - focal.y * y), z
 
 
-def project_tangent(to_world, focal, point, tangent):
+def project_tangent(to_world, focal, distortion, point, tangent):
     """Pixels that a point moves in the picture for a step `tangent` in the world: the derivative of `project`."""
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     dx, dy, dz = camera_coordinates(to_world, tangent)
-    return mi.Vector2f(focal.x * (x * dz - dx * z), focal.y * (y * dz - dy * z)) / (z * z)
+    moved = mi.Vector2f(dx * z - x * dz, dy * z - y * dz) / (z * z)
+    if distortion is not None:
+        place = mi.Vector2f(x / z, y / z)
+        turned = 2 * distortion * dr.dot(place, moved) * place
+        moved = (1 + distortion * dr.squared_norm(place)) * moved + turned
+    return -mi.Vector2f(focal) * moved
