@@ -22,12 +22,12 @@ def cameras(count, distance=20.0):
         yield matrix
 
 
-def silhouettes(hit, count=24, scale=1):
+def silhouettes(hit, count=24, scale=1, distortion=0.0):
     """Masks of a body: `hit(origin, directions)` says which rays meet it. `scale`: so many times as many pixels."""
     y, x = np.mgrid[: scale * H, : scale * W] + 0.5
     pixels, lens = np.stack([x.ravel(), y.ravel()], 1), (scale * FOCAL, scale * CENTRE, (scale * W, scale * H))
     for k, matrix in enumerate(cameras(count)):
-        camera = Camera(matrix, *lens)
+        camera = Camera(matrix, *lens, distortion)
         mask = hit(camera.position, camera.directions(pixels)).reshape(x.shape)
         yield Silhouette(np.where(mask, 255, 0).astype(np.uint8), camera, f"mask {k}")
 
@@ -57,8 +57,9 @@ def test_signed_distance_of_a_half_plane():
     np.testing.assert_allclose(signed_distance(mask)[2], [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5, 3.5])
 
 
-def test_depth_in_a_ball_is_that_of_the_ball():
-    hull = Hull(list(silhouettes(ball(4.0))), "scene.xml")
+@pytest.mark.parametrize("distortion", [0.0, 2.0])  # which moves the outline by two pixels
+def test_depth_in_a_ball_is_that_of_the_ball(distortion):
+    hull = Hull(list(silhouettes(ball(4.0), distortion=distortion)), "scene.xml")
     np.testing.assert_allclose(hull.center, CENTER, atol=0.1)
     assert 4 <= hull.reach < 4.5
     away = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)))

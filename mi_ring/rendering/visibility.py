@@ -35,7 +35,7 @@ class Visibility:
         self.mesh = mesh_of((self.vertices - self.middle) / self.size, faces)  # for float32
         self.scene = mi.load_dict({"type": "scene", "mesh": self.mesh})
         # Photographs that differ in their light alone show the same.
-        keys = [(v.camera.to_world.tobytes(), *map(tuple, v.camera[1:]), id(v.valid)) for v in views]
+        keys = [(*(np.asarray(part).tobytes() for part in v.camera), id(v.valid)) for v in views]
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
