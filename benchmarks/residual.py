@@ -2,7 +2,7 @@
 
     python benchmarks/residual.py PHOTOS MASKS RENDERED [--pictures FOLDER]
 
-Three folders of files with the same names, as `judge_photos.py` has them: 8-bit sRGB photographs, masks of what is
+Three folders of files with the same names, whatever their suffixes: 8-bit sRGB photographs, masks of what is
 judged (255), and renderings, which may be smaller. Each row gives the pictures the freedom that an explanation would
 have, and says how near they then get: what a freedom does not help is not its part. All values are as encoded.
 """
@@ -56,7 +56,7 @@ def pairs(photos: Path, masks: Path, rendered: Path) -> Iterator[tuple[np.ndarra
 
 
 def psnr(errors: list[np.ndarray]) -> str:
-    """Mean over photographs [dB], as the judge has it."""
+    """Mean over photographs [dB]."""
     return f"{np.mean([-10 * np.log10(np.mean(error**2)) for error in errors]):.2f}"
 
 
@@ -73,7 +73,7 @@ def smooth_gain(pair: Pair, order: int) -> np.ndarray:
 
 
 def best_shift(pair: Pair) -> np.ndarray:
-    """What is left after the translation of the picture that brings it nearest."""
+    """What is left after a translation of the picture by a few pixels that brings it near."""
 
     def left(by: np.ndarray) -> np.ndarray:
         return (pair.photo - shift(pair.picture, (*by, 0), order=1))[pair.drawn]
@@ -110,14 +110,14 @@ def main() -> None:
         ["as they are", raw],
         ["one factor for each photograph: exposure", [pair.error[pair.judged] for pair in several]],
         ["without what pictures leave black: shadows, missing parts", drawn],
-        ["then: one curve for all: response", answered],
-        ["or: the best shift of each picture: cameras", [best_shift(pair) for pair in several]],
+        ["and one curve for all: response", answered],
+        ["or the best shift of each picture: cameras", [best_shift(pair) for pair in several]],
     ]
     for order in 1, 2, 4:
         left = [smooth_gain(pair, order) for pair in several]
-        rows.append([f"or: a polynomial of order {order} over each picture: falloff, room", left])
+        rows.append([f"or a polynomial of order {order} over each picture: falloff, room", left])
     for sigma in BLURS:
-        rows.append([f"or: without what is finer than {sigma} px: resolution", [blurred(p, sigma) for p in several]])
+        rows.append([f"or without what is finer than {sigma} px: resolution", [blurred(p, sigma) for p in several]])
     rows = [[what, psnr(left)] for what, left in rows]
     print(table(["", "PSNR, dB"], rows))
     if options.pictures:

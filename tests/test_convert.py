@@ -37,7 +37,8 @@ def by_hand(R, t, calibration=K):
 
 def in_scene(sensor):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    x, depth = pinhole.project(sensor.to_world.matrix, sensor.focal, sensor.centre, mi.Point3f(POINTS.T.astype("f4")))
+    lens = sensor.focal, sensor.centre, None
+    x, depth = pinhole.project(sensor.to_world.matrix, *lens, mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T
 

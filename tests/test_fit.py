@@ -486,6 +486,10 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         fit.main(
             [str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *SPHERE, "--batch", "5"]
         )
+    state = torch.load(finished / "checkpoint.pt", weights_only=False)
+    torch.save(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
+    with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint of this version"):
+        fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])

@@ -102,7 +102,7 @@ def emitter_element(light: Light) -> Element:
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
     """A camera as Mitsuba's `perspective`, whose clipping planes hold points (n, 3) between them.
 
-    Its pixels are square, so that it may have more or fewer rows.
+    Its pixels are square, so that it may have more or fewer rows, and it has no distortion.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)

@@ -22,7 +22,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.room import Room
-from mi_ring.geometry.camera import FOLD, Camera, straightening
+from mi_ring.geometry.camera import LEAST, MOST, Camera, straightening
 from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
@@ -115,8 +115,10 @@ class Calibration(nn.Module):
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
         cones = np.array([sensor.cone for sensor in capture.sensors])
-        bent = np.array([camera.distortion for camera in cameras])
-        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, bent
+        distortion = np.array([camera.distortion for camera in cameras])
+        #: Does any lens have a distortion, or one that is to be found?
+        self.bent = bool(distortion.any()) or "distortion" in refined
+        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, distortion
         self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
         self.center = torch.from_numpy(np.asarray(center)).float()
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
@@ -132,12 +134,10 @@ class Calibration(nn.Module):
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
         self.sizes = [sensor.size for sensor in capture.sensors]
-        corners = [np.maximum(c.centre, c.size - c.centre) / c.focal for c in cameras]
-        #: Of distortion: right below, the corners of the widest photograph would be seen twice.
-        self.least = 0.9 * FOLD / max(float(corner @ corner) for corner in corners)
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
-        lenses = np.unique(intrinsics[:, :2].round(3), axis=0, return_inverse=True)[1].ravel()
+        kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
+        lenses = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         places = np.unique(lights.positions().round(6), axis=0, return_inverse=True)[1].ravel()
         places = places if self.flash is None else np.zeros_like(places)
         self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
@@ -171,8 +171,13 @@ class Calibration(nn.Module):
         if "principal" in self.refined:
             shift = self.value("principal")[self.lens] * intrinsics[:, :2]
             intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
-        if "distortion" in self.refined:
-            distortion = (distortion + self.value("distortion")[self.lens]).clamp(min=self.least)
+        if self.bent:
+            width, height = torch.tensor(self.sizes).T
+            fx, fy, cx, cy = intrinsics.detach().T
+            corner2 = (torch.maximum(cx, width - cx) / fx) ** 2 + (torch.maximum(cy, height - cy) / fy) ** 2
+            if "distortion" in self.refined:
+                distortion = distortion + self.value("distortion")[self.lens]
+            distortion = distortion.clamp(0.999 * LEAST / corner2, 0.999 * MOST / corner2)
         offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
             moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
@@ -222,8 +227,9 @@ class Calibration(nn.Module):
         x = (torch.arange(width) + 0.5 - cx) / fx
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
-        factor = straightening(at.distortion[index].detach()[:, None, None], distance2)
-        return (1 + factor**2 * distance2)[..., None] ** -0.5
+        if self.bent:
+            distance2 = distance2 * straightening(at.distortion[index].detach()[:, None, None], distance2) ** 2
+        return (1 + distance2)[..., None] ** -0.5
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """Radiance (N, H, W, 3) as lens and curve record it, decoded by what the capture says of both.

@@ -11,6 +11,7 @@ from mi_ring.ring.saved import read_state
 from mi_ring.system.files import relative_to, write_state
 
 NAME = "checkpoint.pt"
+FORMAT = 2  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 
@@ -18,7 +19,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
     """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
     path = folder / NAME
     state = read_state(path, "a checkpoint", ADVICE)
-    if not {"settings", "files", "fit"} <= set(state) or "averages" not in state["fit"]:
+    if state.get("format") != FORMAT:
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
         if state["settings"].get(name) != value:
@@ -39,7 +40,8 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
     """Write what `--resume` needs; `files` are the `digests` of the capture's."""
-    write_state({"settings": fit.config.settings(), "files": files, "fit": fit.state()}, folder / NAME)
+    state = {"format": FORMAT, "settings": fit.config.settings(), "files": files, "fit": fit.state()}
+    write_state(state, folder / NAME)
 
 
 def digests(capture: Capture, config: Config) -> dict[str, str]:

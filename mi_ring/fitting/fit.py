@@ -113,7 +113,7 @@ class Fit:
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
             self.optimizers += self.calibration.optimizers()
             if "cameras" in refined:
-                self.poses = GaussNewton(self.calibration, near)
+                self.poses = GaussNewton(self.calibration, near, self.terms)
                 self.optimizers.append(self.poses)
             self.calibration.room.to(self.device)
         self.stages = stages_of(self.config, near)
@@ -338,7 +338,7 @@ class Fit:
     def restore(self, state: dict) -> None:
         """Take up what a `state` says besides the ring."""
         state = copy.deepcopy(state)  # which the next iteration would change
-        for optimizer, saved in zip(self.optimizers, state["optimizers"]):
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]

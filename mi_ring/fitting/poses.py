@@ -6,19 +6,24 @@ here is what it has to be divided by. Direct image alignment, as in "Lucas-Kanad
 IJCV 2004), with the surface instead of a template.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mi_ring.errors import InputError
 from mi_ring.fitting import terms
 from mi_ring.fitting.calibration import Calibration
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.images import blur
 
-#: Of the diagonal, that is added to it (Marquardt); the longest step, in standard deviations.
-DAMPING, LONGEST = 0.1, 3.0
+#: Shares of the diagonal, and of its largest entry, that are added to it: by the latter a direction that pictures
+#: hardly tell (about the optical axis, of what is round) goes slowly. The longest step, in standard deviations.
+DAMPING, FLOOR, LONGEST = 0.1, 0.01, 3.0
 #: What a step is multiplied by at first, and the share that this falls to: in the end it averages over iterations.
 RATE, DECAY = 1.0, 0.5
+LEAST = 1e-9  #: of what each unknown is told, so that what no photograph shows stays
 NEAR, FAR = 0.2, 0.4  #: progress of the fit when they begin, by how far off its first surface is
 
 
@@ -34,11 +39,13 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
     """How far the pixels of a sphere move with the camera: (H, W, 2, 6) [px], right and down.
 
     For a turn [rad] about each axis of the camera and a step [scene units] along each, Mitsuba's axes. `intrinsics`
-    (4,) fx, fy, cx, cy [px]; `size` (width, height); `center` (3,) of the sphere, in the camera's axes; where a ray
-    misses it, the depth is that of the point next to it.
+    (4,) fx, fy, cx, cy [px], of a pinhole: distortion changes little of it; `size` (width, height); `center` (3,) of
+    the sphere, in the camera's axes, of which a camera inside it sees a smaller one. Where a ray misses it, the depth
+    is that of the point next to it.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
+    radius = min(radius, 0.9 * float(center.norm()))
     x = (cx - torch.arange(width) - 0.5) / fx
     y = (cy - torch.arange(height) - 0.5)[:, None] / fy
     x, y = torch.broadcast_tensors(x, y)
@@ -57,62 +64,77 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
 
 
 class GaussNewton(torch.optim.Optimizer):
-    """Steps of the photographs that an iteration has seen, and of no others.
+    """Steps of the photographs that an iteration has seen, and of no others: `look` at it, then `step`.
 
     It changes `turn` and `move` of a calibration. `near`: is the first surface near the object? Else it begins later.
+    `given`: terms of the loss. Raises InputError where `rgb` or `mask` is not the default one, whose curvature it has.
     """
 
-    def __init__(self, calibration: Calibration, near: bool) -> None:
+    def __init__(self, calibration: Calibration, near: bool, given: Mapping[str, terms.Term]) -> None:
+        for name in "rgb", "mask":
+            if given.get(name, terms.default_terms[name]) is not terms.default_terms[name]:
+                raise InputError(f"terms: {name}: must be the default one for --refine cameras, which has to know how "
+                                 "it changes with them; give yours another name")  # fmt: skip
         unknowns = [calibration.unknown(name)[0] for name in ("turn", "move")]
-        group = {"params": unknowns, "initial_lr": RATE, "decay": DECAY, "start": NEAR if near else FAR}
+        self.start = NEAR if near else FAR
+        group = {"params": unknowns, "initial_lr": RATE, "decay": DECAY, "start": self.start}
         super().__init__([group], {"lr": RATE})
+        self.seen: tuple[Tensor, Tensor] | None = None  # which photographs, and the curvature
 
     def look(self, it: Iteration) -> None:
         """Take note of which photographs an iteration sees, and of the second derivatives of its loss."""
-        self.index, self.curvature = torch.from_numpy(it.index), curvature(it)
+        self.seen = None if it.progress < self.start else (torch.from_numpy(it.index), curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """One, for the gradients that the parameters have."""
+        """One, for the gradients that the parameters have; none if it has not begun, or if there are none."""
         (group,) = self.param_groups
         turn, move = group["params"]
-        gradient = torch.cat([turn.grad[self.index], move.grad[self.index]], 1)
-        damped = self.curvature + DAMPING * torch.diag_embed(self.curvature.diagonal(dim1=1, dim2=2))
+        if self.seen is None or turn.grad is None:
+            return
+        index, matrix = self.seen
+        gradient = torch.cat([turn.grad[index], move.grad[index]], 1)
+        own = matrix.diagonal(dim1=1, dim2=2)
+        damped = matrix + torch.diag_embed(DAMPING * own + FLOOR * own.amax(1, keepdim=True))
         step = torch.linalg.solve(damped, gradient)
         step *= group["lr"] * (LONGEST / step.norm(dim=1, keepdim=True)).clamp(max=1)
-        turn[self.index] -= step[:, :3]
-        move[self.index] -= step[:, 3:]
+        turn[index] -= step[:, :3]
+        move[index] -= step[:, 3:]
 
 
 @torch.no_grad()
 def curvature(it: Iteration) -> Tensor:
     """Second derivatives (n, 6, 6) of the loss of an iteration by `turn` and `move` of its photographs.
 
-    By Gauss-Newton, as if the surface were a sphere; absolute differences as if they were squares of the same slope
-    (iteratively reweighted least squares), those below the usual one as if they were that.
+    Of its colours, outlines and prior, by Gauss-Newton, as if the surface were a sphere; absolute differences as if
+    they were squares of the same slope (iteratively reweighted least squares), those below the usual one as if they
+    were that. Masks as if they told of every pixel.
     """
     fit, calibration, (n, height, width) = it.fit, it.fit.calibration, it.coverage.shape
     assert calibration is not None
-    perceived = [terms.perceived(light, fit.exposure, fit.config.loss) for light in (it.predicted, it.observed)]
-    error = (perceived[0] - perceived[1]).abs()
-    if fit.config.loss == "l2":
+    kind, telling = fit.config.loss, terms.telling(it)
+    error = terms.colour_error(it.predicted, it.observed, it.clipped, fit.exposure, kind, telling).abs()
+    if kind == "l2":
         weight = 2 * torch.ones_like(error)
     else:
         usual = error[it.coverage > 0.5].mean().nan_to_num(1.0).clamp(min=1e-6)
         weight = 1 / error.maximum(usual)
-    if (telling := terms.telling(it)) is not None:
-        weight = weight * telling[..., None]
+    weight *= ~it.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
+    if telling is not None:
+        weight *= telling[..., None]
     weight *= it.weights.get("rgb", 0.0) / weight.numel()
+    colours = terms.perceived(it.predicted, fit.exposure, kind)
     outlines = blur(it.coverage, terms.outline_blur(it))
     outlined = 2 * it.weights.get("mask", 0.0) / (max(1, int(it.masked.sum())) * height * width)
 
-    at = calibration.scaled(it.scale)
+    at, radius = calibration.scaled(it.scale), float(fit.ring.radius)
     unit = torch.tensor([calibration.widths["turn"]] * 3 + [calibration.distance * calibration.widths["move"]] * 3)
-    result = torch.eye(6).repeat(n, 1, 1) * it.weights.get("calibration", 0.0) / len(calibration.lens)
+    prior = it.weights.get("calibration", 0.0) / len(calibration.lens)
+    result = torch.eye(6).repeat(n, 1, 1) * max(prior, LEAST)
     for i, k in enumerate(it.index):
         center = at.cameras[k, :, :3].T @ (calibration.center - at.cameras[k, :, 3])
-        moving = motion(at.intrinsics[k], (width, height), center, float(fit.ring.radius)) * unit
-        colour, outline = slopes(perceived[0][i]), slopes(outlines[i, ..., None])
+        moving = motion(at.intrinsics[k], (width, height), center, radius) * unit
+        colour, outline = slopes(colours[i]), slopes(outlines[i, ..., None])
         structure = torch.einsum("hwc,hwca,hwcb->hwab", weight[i], colour, colour)
         structure = structure + outlined * it.masked[i] * torch.einsum("hwca,hwcb->hwab", outline, outline)
         result[i] += torch.einsum("hwaj,hwab,hwbk->jk", moving, structure.cpu(), moving)

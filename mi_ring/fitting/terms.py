@@ -26,20 +26,29 @@ def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
     return log if kind == "log" else (linear + log) / 2  # both rise, so this is the mean of two losses
 
 
+def colour_error(
+    predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, telling: Tensor | None = None
+) -> Tensor:
+    """By how much predicted photographs (n, H, W, 3) are brighter than observed ones, `perceived`.
+
+    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error. Where
+    not `telling` (n, H, W) nothing is.
+    """
+    error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
+    error = torch.where(clipped, error.clamp(max=0), error)
+    return error if telling is None else error * telling[..., None]
+
+
 def rgb_loss(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, telling: Tensor | None = None
 ) -> Tensor:
     """L_rgb: how far predicted photographs (n, H, W, 3) are from observed ones, in units of `exposure`.
 
-    Where `clipped` (n, H, W, 3) the scene was at least as bright as observed: a brighter prediction is no error. Where
-    not `telling` (n, H, W) nothing is.
-    `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares ratios rather than differences, so
-    that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the mean of both.
+    Arguments as of `colour_error`. `kind`: `l2` squares (the paper), `l1` is robust, `log` is robust and compares
+    ratios rather than differences, so that dim surfaces seen at a slant count as much as bright ones, `l1+log` is the
+    mean of both.
     """
-    error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
-    error = torch.where(clipped, error.clamp(max=0), error)
-    if telling is not None:
-        error = error * telling[..., None]
+    error = colour_error(predicted, observed, clipped, exposure, kind, telling)
     return error.square().mean() if kind == "l2" else error.abs().mean()
 
 

@@ -1,10 +1,15 @@
-"""Pinhole cameras as numpy arrays: the twin of `mi_ring.rendering.pinhole`."""
+"""Cameras, pinholes or with a lens, as numpy arrays: the twin of `mi_ring.rendering.pinhole`."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mi_ring.errors import InputError
+
+#: Of `distortion` times the squared distance of a picture's corner from its centre [focal lengths²]: below −4/27 the
+#: lens folds the picture and shows things twice; up to here Newton's method leaves less than a millionth.
+LEAST, MOST = 0.9 * -4 / 27, 10.0
+NEWTON = 6  #: steps
 
 
 class NoParallax(InputError):
@@ -19,15 +24,12 @@ def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.n
     return there
 
 
-FOLD = -4 / 27  #: of `distortion` times the squared distance from the centre [focal lengths²], where a lens folds
-NEWTON = 6  #: steps, which leave less than float64 rounds up to nine tenths of the way to there
-
-
 def straightening(distortion: Any, distance2: Any) -> Any:
-    """The factor by which a point of a photograph is nearer its centre, or farther, than it would be in a pinhole's.
+    """The factor by which a pinhole would have a point of a photograph nearer the centre, or farther, than a lens has.
 
-    `distance2`: its squared distance from the centre [focal lengths²], as photographed. The inverse of
-    1 + `distortion` r², by Newton's method; of arrays of numpy, torch and Dr.Jit alike. Right above `FOLD`.
+    `distance2`: the point's squared distance from the centre [focal lengths²], as photographed. It solves
+    s (1 + `distortion` s² `distance2`) = 1 by Newton's method, within `LEAST` and `MOST`; for arrays of numpy, torch
+    and Dr.Jit alike.
     """
     k = distortion * distance2
     factor = 1 / (1 + k)
@@ -82,11 +84,15 @@ class Camera(NamedTuple):
         return places * straightening(self.distortion, np.square(places).sum(-1, keepdims=True))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates (n, 2), and depths (n,) along the optical axis [scene units], of points (n, 3)."""
+        """Pixel coordinates (n, 2), and depths (n,) along the optical axis [scene units], of points (n, 3).
+
+        NaN beyond where a lens folds: it does not show what is farther out.
+        """
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
         with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
             places = np.stack([x, y], 1) / z[:, None]
-            places *= 1 + self.distortion * np.square(places).sum(1, keepdims=True)
+            k = self.distortion * np.square(places).sum(1, keepdims=True)
+            places *= np.where(1 + 3 * k > 0, 1 + k, np.nan)
             return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:

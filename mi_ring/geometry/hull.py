@@ -97,7 +97,8 @@ class Hull:
             local = (points - matrix[:3, 3]) @ matrix[:3, :3]
             z = local[:, 2]
             flat = local[:, :2] / z[:, None]
-            flat = flat * (1 + camera.distortion * flat.square().sum(1, keepdim=True))
+            bent = camera.distortion * flat.square().sum(1, keepdim=True)
+            flat = flat * torch.where(1 + 3 * bent > 0, 1 + bent, torch.nan)  # what is beyond is not seen
             place = (centre - focal * flat) / torch.tensor(mask.shape[::-1])  # in [0, 1]
             seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
             if valid is not None:

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.geometry.camera import FOLD, Camera
+from mi_ring.geometry.camera import LEAST, MOST, Camera
 from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.pinhole import camera_ray
 
@@ -119,9 +119,10 @@ class Photograph(mi.Sensor):
         self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
         self.distortion = mi.Float(number(props, "distortion", 0.0))
         far = np.maximum(np.ravel(self.centre), [width, height] - np.ravel(self.centre)) / np.ravel(self.focal)
-        if not self.bend * (far @ far) > FOLD:
-            raise ValueError(f'photograph "{props.id()}": distortion is {self.bend:.6g}, must be above '
-                             f"{FOLD / (far @ far):.6g}: below, the lens shows things twice")  # fmt: skip
+        if not LEAST <= self.bend * (far @ far) <= MOST:
+            least, most = LEAST / (far @ far), MOST / (far @ far)
+            raise ValueError(f'photograph "{props.id()}": distortion is {self.bend:.6g}, must be within {least:.6g} '
+                             f"and {most:.6g}: below, its corners would show what is elsewhere, too")  # fmt: skip
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
         rotation = matrix[:3, :3]
         rigid = np.isfinite(matrix).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3

@@ -162,7 +162,7 @@ def render(
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
     samples. `calibration`: other cameras and lights of all photographs, as `Photographs.moved` takes them: (P, 3, 4),
-    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) if flashes have cones.
+    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) each if flashes have cones and lenses distortion.
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage; by one backward pass,
@@ -245,7 +245,7 @@ def surroundings(
 ) -> Surroundings:  # fmt: skip
     """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
 
-    Not `indirect`: the room's light is then what the surface reflects but once, and interreflection means nothing.
+    Not `indirect`: of the room's light what the surface reflects but once; `interreflection` is then not to be used.
 
     `photographs`: as they were rendered; `coverage` (N, H, W): of that picture. This light varies slowly: it is
     rendered at most `width` pixels wide, with `spp` paths per pixel (a few good pixels did better than many noisy

@@ -69,10 +69,16 @@ class Photographs:
         )  # fmt: skip
 
     def moved(self, cameras, intrinsics, places, strengths, falloff=None, distortion=None) -> "Photographs":
-        """The same with other buffers of cameras and lights; no light is taken to be exactly at its camera."""
-        lights = replace(self.lights, places=places, strengths=strengths)
-        return replace(self, cameras=cameras, intrinsics=intrinsics, lights=lights, colocated=False, falloff=falloff,
-                       distortion=distortion)  # fmt: skip
+        """The same with other buffers of cameras and lights; no light is taken to be exactly at its camera.
+
+        Cones of flashes and distortion of lenses stay as they are if none are given.
+        """
+        return replace(
+            self, cameras=cameras, intrinsics=intrinsics, colocated=False,
+            lights=replace(self.lights, places=places, strengths=strengths),
+            falloff=self.falloff if falloff is None else falloff,
+            distortion=self.distortion if distortion is None else distortion,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return dr.width(self.index)
