@@ -30,7 +30,7 @@ from mi_ring.ring.saved import load_fit
 
 def photograph(sensor) -> dict:
     """A photograph as the viewer's `draw` takes it. Raises ValueError if its light is no point."""
-    matrix, (fx, fy), (cx, cy), (width, height) = sensor.camera
+    matrix, (fx, fy), (cx, cy), (width, height), _ = sensor.camera
     light = Lights.of([sensor])[0]
     if light.kind == "directional":
         raise ValueError("the viewer has a point light, this photograph a distant one")

@@ -41,7 +41,7 @@ def test_cameras_of_the_pot_put_the_true_mesh_into_the_masks():
     scene = loading.load_capture(POT)
     mesh = trimesh.load(ROOT / "scenes/pot2/truth/mesh.ply", process=False)
     for k in (0, 5, 17, 31):
-        matrix, focal, centre, _ = scene.sensors[k].camera
+        matrix, focal, centre, *_ = scene.sensors[k].camera
         local = (mesh.vertices - matrix[:3, 3]) @ matrix[:3, :3]
         column, row = (centre - focal * local[:, :2] / local[:, 2:]).T
         rows, columns = np.nonzero(scene.masks[k] > 127)

@@ -396,7 +396,7 @@ np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
     sensor = mitsuba_scene.first_photograph(run)
-    matrix, (fx, fy), (cx, cy), _ = sensor.camera
+    matrix, (fx, fy), (cx, cy), *_ = sensor.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
     light = Lights.of([sensor])[0]
     scene = mi.load_dict({

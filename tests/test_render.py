@@ -66,14 +66,14 @@ def look_at(eye, target, up):
 
 def project(sensor, points):
     """Pixels (N, 2) where a photograph shows points (N, 3)."""
-    matrix, focal, centre, _ = sensor.camera
+    matrix, focal, centre, *_ = sensor.camera
     x, y, z = ((np.atleast_2d(points) - matrix[:3, 3]) @ matrix[:3, :3].astype(float)).T
     return np.stack([centre[0] - focal[0] * x / z, centre[1] - focal[1] * y / z], 1)
 
 
 def normal_in(sensor, x, y, center, radius):
     """Of a sphere, where the middle of pixel (x, y) sees it."""
-    matrix, focal, centre, _ = sensor.camera
+    matrix, focal, centre, *_ = sensor.camera
     d = matrix[:3, :3].astype(float) @ [(centre[0] - x - 0.5) / focal[0], (centre[1] - y - 0.5) / focal[1], 1]
     d, away = d / np.linalg.norm(d), matrix[:3, 3] - center
     b = d @ away
@@ -180,7 +180,7 @@ def test_a_turntable_goes_once_around_the_axis_with_its_light(tmp_path, up):
         np.testing.assert_allclose(eyes[k] + eyes[(k + 4) % 8], 2 * (eyes[k] @ axis) * axis, atol=0.2)
     own = []
     for frame in frames:
-        matrix, focal, centre, _ = frame.sensor.camera
+        matrix, focal, centre, *_ = frame.sensor.camera
         assert frame.sensor.size == (7, 5) and centre.tolist() == [3.5, 2.5] and focal[0] == focal[1]
         assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1, abs=1e-5)
         np.testing.assert_allclose(project(frame.sensor, middle), [[3.5, 2.5]], atol=0.05)

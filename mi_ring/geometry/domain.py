@@ -88,11 +88,14 @@ class Domain:
 
         mesh = trimesh.Trimesh(self.points, self.faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
-        points, faces = gpytoolbox().remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
-        remeshed = trimesh.Trimesh(points, faces)
-        if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
-            return points, faces
-        points, faces = self.points, self.faces  # too coarse for the surface's handles
+        try:
+            points, faces = gpytoolbox().remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+            remeshed = trimesh.Trimesh(points, faces)
+            if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
+                return points, faces
+        except ValueError:  # the surface touches itself in an edge
+            pass
+        points, faces = self.points, self.faces  # else too coarse for the surface's handles
         while len(faces) < 20 * 4**level:
             points, faces = trimesh.remesh.subdivide(points, faces)
         return points, faces

@@ -96,10 +96,11 @@ class Hull:
             matrix, focal, centre = (torch.tensor(a, dtype=torch.float32) for a in camera[:3])
             local = (points - matrix[:3, 3]) @ matrix[:3, :3]
             z = local[:, 2]
-            flat = local[:, :2] / z[:, None]
-            bent = camera.distortion * flat.square().sum(1, keepdim=True)
-            flat = flat * torch.where(1 + 3 * bent > 0, 1 + bent, torch.nan)  # what is beyond is not seen
-            place = (centre - focal * flat) / torch.tensor(mask.shape[::-1])  # in [0, 1]
+            across = local[:, :2]
+            if camera.distortion:
+                bent = camera.distortion * (across / z[:, None]).square().sum(1, keepdim=True)
+                across = across * torch.where(1 + 3 * bent > 0, 1 + bent, torch.nan)  # what is beyond is not seen
+            place = (centre - focal * across / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
             seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
             if valid is not None:
                 row, column = (place * torch.tensor(mask.shape[::-1])).nan_to_num(-1).long().flip(1).T
