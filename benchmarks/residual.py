@@ -24,13 +24,18 @@ BLURS = 1, 2, 4, 8, 16, 32  #: [px]
 
 
 class Pair(NamedTuple):
-    """A photograph and the picture of it, at its best exposure; (H, W, 3), encoded."""
+    """A photograph and the picture of it; (H, W, 3), encoded."""
 
     name: str
     photo: np.ndarray
-    picture: np.ndarray
+    rendered: np.ndarray  #: the picture as it is
+    picture: np.ndarray  #: and at its best exposure
     judged: np.ndarray  #: (H, W) bool
-    drawn: np.ndarray  #: (H, W) bool: judged, and not black
+
+    @property
+    def drawn(self) -> np.ndarray:
+        """(H, W) bool: what is judged and not black."""
+        return self.judged & (self.rendered.max(-1) > 0)
 
     @property
     def error(self) -> np.ndarray:
@@ -38,8 +43,8 @@ class Pair(NamedTuple):
         return self.photo - self.picture
 
 
-def pairs(photos: Path, masks: Path, rendered: Path) -> Iterator[tuple[np.ndarray, Pair]]:
-    """Each photograph with its picture as it is, and at its best exposure."""
+def pairs(photos: Path, masks: Path, rendered: Path) -> Iterator[Pair]:
+    """Each photograph that has a mask, with its picture."""
     for mask in sorted(masks.glob("*.png")):
         photo, picture = (
             Image.open(next(file for file in sorted(folder.iterdir()) if file.stem == mask.stem)).convert("RGB")
@@ -52,7 +57,7 @@ def pairs(photos: Path, masks: Path, rendered: Path) -> Iterator[tuple[np.ndarra
         x, y = srgb_to_linear(a)[judged], srgb_to_linear(b)
         gain = (x * y[judged]).sum() / (y[judged] ** 2).sum()
         exposed = linear_to_srgb(np.clip(gain * y, 0, 1)).astype(float)
-        yield b, Pair(mask.stem, a, exposed, judged, judged & (b.max(-1) > 0))
+        yield Pair(mask.stem, a, b, exposed, judged)
 
 
 def psnr(errors: list[np.ndarray]) -> str:
@@ -99,8 +104,8 @@ def main() -> None:
         parser.add_argument(folder, type=Path)
     parser.add_argument("--pictures", type=Path, help="photograph, picture and twice their difference, side by side")
     options = parser.parse_args()
-    as_drawn, several = zip(*pairs(options.photos, options.masks, options.rendered))
-    raw = [(pair.photo - picture)[pair.judged] for pair, picture in zip(several, as_drawn)]
+    several = list(pairs(options.photos, options.masks, options.rendered))
+    raw = [(pair.photo - pair.rendered)[pair.judged] for pair in several]
     curve = np.polyfit(
         *(np.concatenate([getattr(p, side)[p.drawn].ravel() for p in several]) for side in ("picture", "photo")), 4
     )

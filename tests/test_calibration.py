@@ -341,6 +341,21 @@ def test_prior_expects_one_half_of_each_unknown(small_capture):
     assert calibration.prior().item() == pytest.approx(6 / 2)
 
 
+@pytest.mark.parametrize(("domain", "start"), [("hull", 0.2), ("sphere", 0.4)])
+def test_rates_of_cameras_and_lights_rise_once_there_is_a_shape_and_fall(small_capture, domain, start):
+    changes = {"levels": (2,), "widths": (28,), "shares": (1.0,), "refine": ("cameras", "light"), "domain": domain}
+    fit = mi_ring.Fit(mi_ring.load_capture(small_capture), mi_ring.Config(**changes))
+
+    def rates(progress):
+        fit.descend(sum(p.sum() for p in fit.calibration.parameters()) * 0.0, progress)
+        groups = [g for o in fit.optimizers for g in o.param_groups]
+        return [next(g["lr"] for g in groups if any(p is unknown for p in g["params"]))
+                for unknown in (fit.calibration.turn, fit.calibration.light)]  # fmt: skip
+
+    assert rates(start - 0.01)[0] == 0 < rates(start + 0.01)[0] < rates(start + 0.05)[0]
+    assert rates(0.7) == pytest.approx([0.5**0.7, 0.1 * 0.1**0.7])
+
+
 def test_distant_lights_keep_their_length_and_each_place_has_one_unknown(small_capture, tmp_path):
     def lamp(element):
         emitter = element.find("emitter")

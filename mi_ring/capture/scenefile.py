@@ -19,6 +19,9 @@ from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
 
+#: What a photograph says of lens, curve and flash by one number each, and what it says by saying nothing.
+USUAL = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
+
 
 def photograph_element(
     name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
@@ -31,9 +34,10 @@ def photograph_element(
         if value:
             ElementTree.SubElement(element, "string", name=field, value=value)
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
-    usual = {"saturation": None, "gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
-    given = dict(zip(usual, (saturation, gamma, contrast, falloff, vignetting, camera.distortion)))
-    fields |= {field: value for field, value in given.items() if value != usual[field]}
+    if saturation is not None:
+        fields["saturation"] = saturation
+    given = dict(zip(USUAL, (gamma, contrast, falloff, vignetting, camera.distortion)))
+    fields |= {field: value for field, value in given.items() if value != USUAL[field]}
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
     if calibrated:
@@ -159,7 +163,7 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
         fields = {child.get("name"): child for child in new if child.tag in ("float", "transform")}
         for child in list(old):
             lit = child.tag == "emitter" or (child.tag == "ref" and root.find(f".//emitter[@id='{child.get('id')}']"))
-            if lit or child.get("name") in ("gamma", "contrast", "falloff", "vignetting", "distortion", *fields):
+            if lit or child.get("name") in {*USUAL, *fields}:
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
     frames = set()

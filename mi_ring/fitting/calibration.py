@@ -22,7 +22,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.room import Room
-from mi_ring.geometry.camera import LEAST, MOST, Camera, straightening
+from mi_ring.geometry.camera import Camera, distortion_range, straightening
 from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
@@ -172,12 +172,11 @@ class Calibration(nn.Module):
             shift = self.value("principal")[self.lens] * intrinsics[:, :2]
             intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
         if self.bent:
-            width, height = torch.tensor(self.sizes).T
-            fx, fy, cx, cy = intrinsics.detach().T
-            corner2 = (torch.maximum(cx, width - cx) / fx) ** 2 + (torch.maximum(cy, height - cy) / fy) ** 2
+            now = intrinsics.detach()
+            least, most = distortion_range(now[:, :2], now[:, 2:], torch.tensor(self.sizes))
             if "distortion" in self.refined:
                 distortion = distortion + self.value("distortion")[self.lens]
-            distortion = distortion.clamp(0.999 * LEAST / corner2, 0.999 * MOST / corner2)
+            distortion = distortion.clamp(0.999 * least, 0.999 * most)
         offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
             moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]

@@ -76,14 +76,14 @@ class GaussNewton(torch.optim.Optimizer):
                 raise InputError(f"terms: {name}: must be the default one for --refine cameras, which has to know how "
                                  "it changes with them; give yours another name")  # fmt: skip
         unknowns = [calibration.unknown(name)[0] for name in ("turn", "move")]
-        self.start = NEAR if near else FAR
-        group = {"params": unknowns, "initial_lr": RATE, "decay": DECAY, "start": self.start}
+        group = {"params": unknowns, "initial_lr": RATE, "decay": DECAY, "start": NEAR if near else FAR}
         super().__init__([group], {"lr": RATE})
         self.seen: tuple[Tensor, Tensor] | None = None  # which photographs, and the curvature
 
     def look(self, it: Iteration) -> None:
         """Take note of which photographs an iteration sees, and of the second derivatives of its loss."""
-        self.seen = None if it.progress < self.start else (torch.from_numpy(it.index), curvature(it))
+        begun = it.progress >= self.param_groups[0]["start"]
+        self.seen = (torch.from_numpy(it.index), curvature(it)) if begun else None
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]

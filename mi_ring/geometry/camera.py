@@ -38,6 +38,26 @@ def straightening(distortion: Any, distance2: Any) -> Any:
     return factor
 
 
+def bending(distortion: Any, distance2: Any) -> tuple[Any, Any]:
+    """The factor by which a lens has a point farther from the centre, or nearer, than a pinhole; and does it show it?
+
+    `distance2`: the point's squared distance from the centre [focal lengths²], in a pinhole's picture. Beyond where the
+    lens folds it shows nothing. For arrays of numpy, torch and Dr.Jit alike.
+    """
+    k = distortion * distance2
+    return 1 + k, 1 + 3 * k > 0
+
+
+def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
+    """Least and most distortion (...) of lenses by whose pictures' corners `straightening` works.
+
+    `focal`, `centre`, `size` (..., 2) [px], of numpy or torch.
+    """
+    corner = (abs(centre - size / 2) + size / 2) / focal
+    corner2 = (corner**2).sum(-1)
+    return LEAST / corner2, MOST / corner2
+
+
 class Camera(NamedTuple):
     """A camera. The picture spans [0, W] × [0, H], x right, y down: the first pixel's centre is (0.5, 0.5)."""
 
@@ -91,8 +111,8 @@ class Camera(NamedTuple):
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
         with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
             places = np.stack([x, y], 1) / z[:, None]
-            k = self.distortion * np.square(places).sum(1, keepdims=True)
-            places *= np.where(1 + 3 * k > 0, 1 + k, np.nan)
+            factor, shown = bending(self.distortion, np.square(places).sum(1, keepdims=True))
+            places *= np.where(shown, factor, np.nan)
             return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:

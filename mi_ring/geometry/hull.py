@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera, nearest_point
+from mi_ring.geometry.camera import Camera, bending, nearest_point
 
 SHOWN = 0.25  #: share of the photographs that must show a point, else it is outside
 MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
@@ -98,8 +98,8 @@ class Hull:
             z = local[:, 2]
             across = local[:, :2]
             if camera.distortion:
-                bent = camera.distortion * (across / z[:, None]).square().sum(1, keepdim=True)
-                across = across * torch.where(1 + 3 * bent > 0, 1 + bent, torch.nan)  # what is beyond is not seen
+                factor, shows = bending(camera.distortion, (across / z[:, None]).square().sum(1, keepdim=True))
+                across = across * torch.where(shows, factor, torch.nan)
             place = (centre - focal * across / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
             seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
             if valid is not None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from mi_ring.capture.outlines import grown
 from mi_ring.capture.scenefile import Element, photograph_element, table_element
-from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window, undistort
@@ -83,7 +82,7 @@ def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
         white = np.where(shown, 255, 0).astype(np.uint8)
         valid = writer.relative(writer.image(f"valid/{picture.name}", white[..., None]))
     camera = camera_of(shot.lens, shot.pose)
-    camera = Camera(camera.to_world, camera.focal, camera.centre - [left, top], (width, height))
+    camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
     return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid,
                               gamma=shot.gamma, falloff=shot.falloff)  # fmt: skip
 

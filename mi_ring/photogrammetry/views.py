@@ -52,7 +52,7 @@ def reduced(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> V
     width, height = camera.size
     small = cv2.resize(rgb[: height * scale, : width * scale], (width, height), interpolation=cv2.INTER_AREA)
     corner = np.array([window.left, window.top]) / scale
-    camera = Camera(camera.to_world, camera.focal, camera.centre - corner, (window.width, window.height))
+    camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
     places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
     straight = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
     shown = cv2.remap(np.ones((height, width), np.uint8), places[1], places[0], cv2.INTER_NEAREST)

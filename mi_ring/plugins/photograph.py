@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.geometry.camera import LEAST, MOST, Camera
+from mi_ring.geometry.camera import Camera, distortion_range
 from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.pinhole import camera_ray
 
@@ -118,9 +118,8 @@ class Photograph(mi.Sensor):
         self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))
         self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
         self.distortion = mi.Float(number(props, "distortion", 0.0))
-        far = np.maximum(np.ravel(self.centre), [width, height] - np.ravel(self.centre)) / np.ravel(self.focal)
-        if not LEAST <= self.bend * (far @ far) <= MOST:
-            least, most = LEAST / (far @ far), MOST / (far @ far)
+        least, most = distortion_range(np.ravel(self.focal), np.ravel(self.centre), np.array([width, height]))
+        if not least <= self.bend <= most:
             raise ValueError(f'photograph "{props.id()}": distortion is {self.bend:.6g}, must be within {least:.6g} '
                              f"and {most:.6g}: below, its corners would show what is elsewhere, too")  # fmt: skip
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)

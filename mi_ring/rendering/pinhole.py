@@ -3,7 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.geometry.camera import straightening
+from mi_ring.geometry.camera import bending, straightening
 
 OUTSIDE = 1e6  #: a factor of places in the picture
 
@@ -39,9 +39,9 @@ def project(to_world, focal, centre, distortion, point):
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     x, y = x / z, y / z
     if distortion is not None:
-        bent = distortion * (x * x + y * y)
-        # Beyond where the lens folds nothing is seen: outside every picture, and finite for the sake of gradients.
-        factor = dr.select(1 + 3 * bent > 0, 1 + bent, OUTSIDE)
+        factor, shown = bending(distortion, x * x + y * y)
+        # What is not shown is outside every picture, and finite for the sake of gradients.
+        factor = dr.select(shown, factor, OUTSIDE)
         x, y = x * factor, y * factor
     return mi.Point2f(centre.x - focal.x * x, centre.y - focal.y * y), z
 
