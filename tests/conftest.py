@@ -1,7 +1,14 @@
 """Small captures that the tests make themselves, and where the shared data is, if it is there."""
 
 import gc
+import os
 from pathlib import Path
+
+# Each of several processes has cores of its own: with more threads than cores they mostly wait for one another.
+if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
+    worker, workers = int(os.environ["PYTEST_XDIST_WORKER"][2:]), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    available = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, available[worker::workers] or [available[worker % len(available)]])
 
 import numpy as np
 import pytest

@@ -88,8 +88,9 @@ class Domain:
 
         mesh = trimesh.Trimesh(self.points, self.faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
+        package = gpytoolbox()  # its absence is not among the errors below
         try:
-            points, faces = gpytoolbox().remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+            points, faces = package.remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
             remeshed = trimesh.Trimesh(points, faces)
             if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
                 return points, faces
