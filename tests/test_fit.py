@@ -143,7 +143,7 @@ def test_log_and_configuration_tell_what_happened(finished):
 
 
 def test_scene_opens_in_mitsuba_and_path_shows_the_object(finished, small_capture):
-    scene = mi.load_file(str(finished / "scene.xml"))
+    scene = mi.load_file(str(finished / "scene.xml"), parallel=False)
     for k in (1, 8):
         photograph = np.array(mi.Bitmap(str(small_capture.parent / f"images/{k:03}.png"))) / 255.0
         linear = mi.render(scene, integrator=mi.load_dict({"type": "path"}), sensor=k, spp=16)

@@ -74,7 +74,7 @@ def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
                               indirect=True)  # fmt: skip
     np.testing.assert_array_equal(coverage, same)  # no camera sees it
 
-    scene, sensor = mi.load_file(str(write(tmp_path, more=more)), optimize=False), capture.sensors[0]
+    scene, sensor = mi.load_file(str(write(tmp_path, more=more)), optimize=False, parallel=False), capture.sensors[0]
     batch = capture.photographs.select([0], sensor.size)
     channels = [np.array(c) for c in render_path(scene, batch, sensor, 1024, 3, 5)]
     traced = np.stack(channels, -1).reshape(rgb[0].shape)
@@ -182,7 +182,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
     root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))
     writer.close()
-    _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False))
+    _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False, parallel=False))
     across = PLANE.axes()[:2]
     below = CENTER - PLANE.height(CENTER) * UP
     points = below + np.random.default_rng(1).uniform(-4, 4, (200, 2)) @ across

@@ -82,7 +82,7 @@ def test_on_a_convex_object_photometric_is_all_of_path(tmp_path, capsys):
     status, numbers = run(path)
     assert status == 0
     assert [row["name"] for row in numbers["photographs"]] == ["a.png", "b.png", "c.png"]
-    scene = mi.load_file(str(path))
+    scene = mi.load_file(str(path), parallel=False)
     for k, row in enumerate([*numbers["photographs"], numbers["all"]]):
         assert row["p_direct"] > 0.001 and row["p_path"] > 0.001
         assert row["interreflection"] == pytest.approx(0, abs=1e-6)
@@ -212,7 +212,7 @@ def test_lamps_and_sky_of_the_scene_light_both(tmp_path):
     path = write(tmp_path, ball, lamp, CONVEX[0])
     scene, sensors = path_tracing.open_lit_scene(path)
     kinds = sorted(emitter.class_name() for emitter in scene.emitters())
-    original = mi.load_file(str(path))
+    original = mi.load_file(str(path), parallel=False)
     assert kinds == sorted([*(emitter.class_name() for emitter in original.emitters()), "Emitter"])
     row = comparison(scene, sensors, spp=16)
     assert row.p_direct > 0.001
