@@ -1,8 +1,11 @@
 """Reconstruct an object from its photographs: `python -m mi_ring.fit SCENE.xml`."""
 
 import argparse
+import contextlib
 import dataclasses
 import json
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +16,19 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture, require_scene
 from mi_ring.errors import InputError
+from mi_ring.fitting.budget import Costs, all_stages, fitting_into, measure
 from mi_ring.fitting.checkpoint import read_checkpoint, require_same_files
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.session import run_session
+from mi_ring.geometry.domain import Sphere
 from mi_ring.output import results
 from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
+
+AFTERWARDS = 20.0  #: seconds that pictures before a fit and its results after it may take
+PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +43,9 @@ class Task:
     """Go on from the folder's checkpoint.pt. Give the same settings as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """Settings that go together; each can be overridden. paper: the paper's own, seven hours on two cores."""
+    minutes: float = 0
+    """How long the command may take, results included: the preset, unless one is given, and --iterations are chosen by
+    what iterations take on this machine. 0: as long as they take."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Variant of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is
     one."""
@@ -50,6 +61,10 @@ class FitConfig(Config, Task):
         super().__post_init__()
         if self.threads < 0:
             raise InputError(f"--threads: is {self.threads}, must be 0 or more")
+        if not 0 <= self.minutes < math.inf:
+            raise InputError(f"--minutes: is {self.minutes}, must be 0 or more")
+        if self.minutes and self.deterministic:
+            raise InputError("--deterministic: does not go with --minutes, by which the machine's speed decides")
         if self.deterministic and self.variant != "llvm_ad_rgb":
             raise InputError("--deterministic: needs --variant llvm_ad_rgb; a GPU adds numbers in an order of its own")
         if not set(self.weights) <= set(WEIGHTS):
@@ -68,11 +83,16 @@ class FitConfig(Config, Task):
 
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 130 if it was interrupted."""
+    started = time.monotonic()
     config = parse_options(arguments)
+    if config.minutes and given(arguments, "--iterations"):
+        raise InputError("--minutes: chooses --iterations; give one of the two")
     require_scene(config.scene)
     variant: Any = set_variant(config.variant)
     config = dataclasses.replace(config, variant=variant)
     folder = config.folder
+    if config.minutes and config.resume:
+        config = planned_before(config, arguments, folder)
     state = read_checkpoint(folder, config) if config.resume else None
     keep_memory()
     capture = load_capture(config.scene, masks=config.masks)
@@ -83,15 +103,48 @@ def main(arguments: Sequence[str]) -> int:
     elif config.masks != "given" and all(mask is None for mask in capture.masks):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config.thread_count):
-        fit = Fit(capture, config, state=state and state["fit"])
+        fit, costs = Fit(capture, config, state=state and state["fit"]), None
+        if config.minutes and not state:
+            config, costs = planned(config, arguments, fit, started)
+            fit = Fit(capture, config)
         results.fitted_scene(fit, folder)  # refuses what cannot be written later
         with locked(folder):
             options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
             results.prepare_folder(folder, config.scene, options, config.resume)
-            interrupted = run_session(fit, folder)
+            interrupted = run_session(fit, folder, costs)
     if interrupted:
         print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
     return 130 if interrupted else 0
+
+
+def planned(config: FitConfig, arguments: Sequence[str], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
+    """The configuration that --minutes asks for, and what iterations take. `started`: when the command was."""
+    choice = [config]
+    if not given(arguments, "--preset"):
+        choice = [parse_options([*arguments, "--preset", name]) for name in PLANNED]
+    print("Measuring what iterations take on this machine", flush=True)
+    costs = measure(fit, all_stages(fit, choice))
+    left = 60 * config.minutes - (time.monotonic() - started) - AFTERWARDS
+    if left <= 0:
+        raise InputError(f"--minutes: is {config.minutes:g}, of which start and results of this capture take all; "
+                         f"give {config.minutes + 1 - left / 60:.0f} or more")  # fmt: skip
+    chosen = fitting_into(left, choice, not isinstance(fit.ring.domain, Sphere), costs)
+    print(f"In {config.minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
+    return chosen, costs
+
+
+def planned_before(config: FitConfig, arguments: Sequence[str], folder: Path) -> FitConfig:
+    """The configuration that --minutes has led to before, by the folder's config.json, if there is one."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        before = json.loads((folder / "config.json").read_text())
+        config = parse_options([*arguments, "--preset", before["preset"]])
+        return dataclasses.replace(config, iterations=before["iterations"])
+    return config
+
+
+def given(arguments: Sequence[str], option: str) -> bool:
+    """Is it among the arguments?"""
+    return any(argument.split("=")[0] == option for argument in arguments)
 
 
 def parse_options(arguments: Sequence[str]) -> FitConfig:

@@ -9,6 +9,7 @@ from pathlib import Path
 import trimesh
 from tqdm import tqdm
 
+from mi_ring.fitting.budget import Costs, measure
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Sphere
@@ -18,7 +19,7 @@ from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
 
 CHECKPOINT_SECONDS = 30.0
-FIXED_WORK = 3000  #: what an iteration costs besides its vertices, in vertices: for the time left
+TELLING = 60  #: iterations: shorter fits do without measuring how long theirs take
 
 
 @contextlib.contextmanager
@@ -38,10 +39,11 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def train(fit: Fit, folder: Path, interrupted: Callable[[], bool]) -> None:
+def train(fit: Fit, folder: Path, interrupted: Callable[[], bool], costs: Costs | None) -> None:
     """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints in `folder`."""
-    vertices = {stage.level: len(fit.ring.domain.sample(stage.level)[0]) for stage in fit.stages}
-    work = [vertices[s.level] + FIXED_WORK for s in fit.stages for _ in range(s.first, s.last)]
+    if costs is None and fit.iterations - fit.iteration >= TELLING:
+        costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration])
+    work = [(costs or {}).get((s.level, s.width), 1.0) for s in fit.stages for _ in range(s.first, s.last)]
     saved, files = time.monotonic(), digests(fit.capture, fit.config)
     bar = progress(
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
@@ -74,8 +76,11 @@ def start_of(fit: Fit) -> str:
     return f"a surface of genus {genus(trimesh.Trimesh(domain.points, domain.faces, process=False))} about {place}"
 
 
-def run_session(fit: Fit, folder: Path) -> bool:
-    """Run a fit in a folder that has been prepared and write its results, whatever ends it. Was it interrupted?"""
+def run_session(fit: Fit, folder: Path, costs: Costs | None = None) -> bool:
+    """Run a fit in a folder that has been prepared and write its results, whatever ends it. Was it interrupted?
+
+    `costs`: of its iterations, if they have been measured already.
+    """
     fitted_scene = results.fitted_scene(fit, folder)
     with interruptible() as interrupted:
         print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
@@ -89,7 +94,7 @@ def run_session(fit: Fit, folder: Path) -> bool:
             print(f"Start: {start_of(fit)}")
             results.write_inputs(folder / "inputs.png", fit)
         try:
-            train(fit, folder, interrupted)
+            train(fit, folder, interrupted, costs)
         except Exception:
             results.write(folder, fit, fitted_scene)
             raise

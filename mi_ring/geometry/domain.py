@@ -12,9 +12,9 @@ from torch import Tensor
 
 from mi_ring.system.optional import need
 
-FINEST = 6  #: level up to which domains are remeshed; beyond it triangles are cut in four
+FINEST = 5  #: level up to which domains are remeshed; beyond it triangles are cut in four
 PLACES = 16  #: for each vertex to be at
-MOST_SAMPLES = 2**22  #: of the surface, among which they are found: at levels 7 and 8 some vertices have fewer places
+MOST_SAMPLES = 2**20  #: of the surface, among which they are found: from level 6 on some vertices have fewer places
 
 
 def closed_domain(
@@ -86,7 +86,8 @@ class Domain:
         if level > FINEST:
             return trimesh.remesh.subdivide(*self.sample(level - 1))
 
-        mesh = trimesh.Trimesh(self.points, self.faces)
+        vertices, faces = (self.points, self.faces) if level == FINEST else self.sample(level + 1)
+        mesh = trimesh.Trimesh(np.asarray(vertices), faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
         package = gpytoolbox()  # its absence is not among the errors below
         try:
