@@ -84,7 +84,7 @@ def watch() -> dict[str, float]:
 
     for part, cls in (("flow", shapenet._Flow), ("rendering", bridge._Render)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
-    bridge.interreflection = timed("rendering", bridge.interreflection)
+    bridge.surroundings = timed("rendering", bridge.surroundings)
     for cls in (torch.optim.Adam, Muon):
         cls.step = timed("optimiser", cls.step)
     return seconds

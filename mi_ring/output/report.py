@@ -169,7 +169,7 @@ def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
     predicted, coverage = (t[0].numpy() for t in bridge.draw(
-        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect
+        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=8
     ))  # fmt: skip
     sensor = capture.sensors[k]
     photo, guess = (linear_to_srgb(recorded(linear, sensor)) for linear in (observed, predicted * valid[..., None]))

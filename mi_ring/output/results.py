@@ -23,7 +23,7 @@ from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, relative_to, write_file, write_state, writing
 
-VIEWED, TEXELS = 5, 1024  #: level of the report's object, and texels across its textures
+VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
 
 
 def default_folder(scene: Path) -> Path:
@@ -156,7 +156,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
 
 def viewed(ring: Ring, views: Sequence[View] | None = None) -> bytes | None:
     """The object for the report's viewer as GLB, where that is possible."""
-    level = min(VIEWED, ring.subdivisions)
+    level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)
     except Exception as error:  # whatever it is, the report is worth more

@@ -179,11 +179,11 @@ def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photo
 
 def draw(
     surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
-    indirect: bool = False,
+    indirect: bool = False, paths: int = 32,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Like `render`, of the surface as last written, without gradients, in the processor's memory.
 
-    `indirect`: with interreflection; the light of the photographs' room is always part of them. However many pixels
+    `indirect`: with interreflection, of so many `paths` for each pixel of a picture 128 pixels wide; the light of the photographs' room is always part of them. However many pixels
     and samples, it takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures
     themselves take; `indirect` or a room add about 100 MB for each photograph.
     """
@@ -194,7 +194,7 @@ def draw(
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
     if indirect or photographs.room is not None:
-        around = surroundings(surface, photographs, coverage, seed + 1, 128, 32, indirect,
+        around = surroundings(surface, photographs, coverage, seed + 1, 128, paths, indirect,
                               photographs.room is not None)  # fmt: skip
         rgb = rgb + (around.interreflection if indirect else 0)
         if photographs.room is not None:
