@@ -40,7 +40,7 @@ class Config:
     first stage are exchanged for 40 % as many iterations of the second, which take about as long."""
     batch: int = 8
     """Photographs per iteration."""
-    steps: int = 5
+    steps: int = 3
     """Euler steps of the flow, the paper's T."""
     spp: int = 1
     """Samples per pixel."""
