@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -82,7 +83,7 @@ class FitConfig(Config, Task):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 0, or 130 if it was interrupted."""
+    """The command. Returns its exit status: 0, or 128 and the signal that it was interrupted by: 130 is Ctrl-C."""
     started = time.monotonic()
     config = parse_options(arguments)
     if config.minutes and given(arguments, "--iterations"):
@@ -110,11 +111,12 @@ def main(arguments: Sequence[str]) -> int:
         results.fitted_scene(fit, folder)  # refuses what cannot be written later
         with locked(folder):
             options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-            results.prepare_folder(folder, config.scene, options, config.resume)
-            interrupted = run_session(fit, folder, costs)
+            prepare = partial(results.prepare_folder, folder, config.scene, options)
+            prepare(config.resume)
+            interrupted = run_session(fit, folder, partial(prepare, resume=True), costs)
     if interrupted:
         print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
-    return 130 if interrupted else 0
+    return 128 + interrupted if interrupted else 0
 
 
 def planned(config: FitConfig, arguments: Sequence[str], fit: Fit, started: float) -> tuple[FitConfig, Costs]:

@@ -99,3 +99,17 @@ def test_what_a_domain_contains():
     points = np.array([[2, 0, 0.4], [0, -2.3, 0], [0, 0, 0], [2, 0, 0.6], [0, 1.4, 0], [9, 0, 0]]) @ tilt.T
     assert Domain(torus.vertices, torus.faces).contains(points).tolist() == [True, True, False, False, False, False]
     assert Sphere().contains(np.array([[0.57, 0.57, 0.57], [0.58, 0.58, 0.58]])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("level", [3, 4, 5, 6])
+def test_all_levels_are_of_the_same_surface(level):
+    """Each point of each sampling lies on the domain, here with edges, which coarser samplings cut off."""
+    gpytoolbox = pytest.importorskip("gpytoolbox")
+    box = trimesh.creation.box((1.0, 0.7, 1.4)).subdivide_loop(1).subdivide().subdivide().subdivide().subdivide()
+    domain = Domain(box.vertices, box.faces)
+    points, faces = domain.sample(level)
+    squared = gpytoolbox.squared_distance(points.numpy().astype(float), box.vertices, box.faces, use_cpp=True)[0]
+    assert squared.max() < 1e-12
+    mesh = trimesh.Trimesh(points.numpy(), faces, process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(box.volume, rel=0.02)
+    assert 0.7 < len(faces) / (20 * 4**level) < 1.4

@@ -4,9 +4,11 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -47,6 +49,7 @@ FILES = [
     "log.jsonl",
     "inputs.png",
     "report.html",
+    "checkpoint.before.pt",
     "checkpoint.pt",
     "calibration.json",
 ]
@@ -265,7 +268,8 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
 
     monkeypatch.setattr(results, moment, interrupted)
     status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *QUICK])
-    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == sorted(FILES)
+    never = {"checkpoint.before.pt"} if moment == "write_inputs" else set()  # before the first iteration
+    assert {p.name for p in (tmp_path / "run").iterdir()} == set(FILES) - never
     assert status == (130 if moment == "write_inputs" else 0)  # at the end there is nothing left to resume
     assert ("--resume" in capsys.readouterr().out) == (status == 130)
 
@@ -454,15 +458,86 @@ def test_a_finished_fit_is_not_silently_fitted_anew(finished, tmp_path):
         fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), *QUICK])
 
 
-def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
-    folder = tmp_path / "run"
-    options = ["--out", str(folder), "--iterations", "200", *SPHERE]
-    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), *options]
+def begun(call, folder):
+    """The process of a fit that has done some iterations."""
     process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
     while not ((folder / "log.jsonl").exists() and (folder / "log.jsonl").stat().st_size):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
+    return process
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_of_schedulers_and_terminals_lose_nothing(end, small_capture, tmp_path):
+    """Nor does a reader of the output that is gone: nobody hears of it then."""
+    folder = tmp_path / "run"
+    options = ["--out", str(folder), "--iterations", "500", *QUICK]
+    process = begun([sys.executable, "-m", "mi_ring.fit", str(small_capture), *options], folder)
+    process.stdout.close()
+    before = results.read_log(folder)[-1]["iteration"]
+    while results.read_log(folder)[-1]["iteration"] < before + 10:
+        assert process.poll() is None, "it did not outlive its reader"
+        time.sleep(0.05)
+    process.send_signal(end)
+    assert process.wait(120) == 128 + end
+    assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
+    assert load_fit(folder) and 0 < results.read_log(folder)[-1]["iteration"] < 500
+
+
+def test_a_folder_that_is_removed_comes_back(small_capture, tmp_path, monkeypatch):
+    folder, genuine = tmp_path / "run", results.add_to_log
+
+    def removed(*arguments):
+        monkeypatch.setattr(results, "add_to_log", genuine)
+        shutil.rmtree(folder)
+
+    monkeypatch.setattr(results, "add_to_log", removed)
+    monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "10", *QUICK]) == 0
+    assert sorted(p.name for p in folder.iterdir()) == sorted(set(FILES) - {"inputs.png"})
+    assert [entry["iteration"] for entry in results.read_log(folder)] == [5, 8]  # of 10: the start is near
+
+
+def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tmp_path, monkeypatch, capsys):
+    folder, genuine = tmp_path / "run", files.write_file
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def refused(path, content):
+        if path.parent == folder and path.name == "ring.pt":
+            raise InputError(f"{path}: cannot be written (as if); choose another place")
+        genuine(path, content)
+
+    for module in (files, results):
+        monkeypatch.setattr(module, "write_file", refused)
+    with pytest.raises(InputError, match="as if"):
+        fit.main([str(small_capture), "--out", str(folder), "--iterations", "2", *QUICK])
+    (elsewhere,) = tmp_path.glob("mi_ring-run-*")
+    assert f"the results are in {elsewhere}/ instead" in capsys.readouterr().out
+    assert load_fit(elsewhere) and (elsewhere / "report.html").is_file() and (elsewhere / "checkpoint.pt").is_file()
+
+
+def test_a_damaged_checkpoint_is_made_good_by_the_one_before(small_capture, tmp_path, monkeypatch, capsys):
+    """As in a deterministic fit that nobody disturbed."""
+    quick = [*QUICK, "--deterministic"]
+    assert fit.main([str(small_capture), "--out", str(tmp_path / "whole"), "--iterations", "6", *quick]) == 0
+    folder = tmp_path / "run"
+    monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "6", *quick]) == 0
+    path = folder / "checkpoint.pt"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "6", *quick, "--resume"]) == 0
+    assert f"{path}: not a checkpoint, or damaged; going on from the one before" in capsys.readouterr().out
+    assert (folder / "mesh.ply").read_bytes() == (tmp_path / "whole" / "mesh.ply").read_bytes()
+
+
+def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path):
+    folder = tmp_path / "run"
+    options = ["--out", str(folder), "--iterations", "200", *SPHERE]
+    call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), *options]
+    process = begun(call, folder)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 130, output
@@ -487,7 +562,7 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
             [str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *SPHERE, "--batch", "5"]
         )
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
-    torch.save(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
+    files.write_state(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint of this version"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
@@ -542,6 +617,7 @@ def test_fits_on_one_thread_read_an_exr_one_after_the_other(broken_capture, tmp_
     replace("images/000.png", "images/000.exr")
     code = """
 import sys
+import tempfile
 from mi_ring import fit
 for out in "ab":
     assert fit.main([*sys.argv[1:], "--out", out, "--iterations", "1", "--threads", "1"]) == 0

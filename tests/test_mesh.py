@@ -13,6 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.system.files import write_state
 
 CENTER, RADIUS = [40.0, -15.0, 9.0], 12.5
 
@@ -285,3 +286,21 @@ def test_files_of_versions_that_are_not_read_are_named(tmp_path):
         with pytest.raises(InputError, match=words):
             load_fit(tmp_path / "other.pt")
     assert ring_state(ring)["mi_ring"] == mi_ring.__version__
+
+
+def test_no_bit_of_a_saved_fit_may_change(tmp_path):
+    """Those of the zip file's own records, which it does not check itself, included; without a seal it checks some."""
+    ring = Ring([0.0, 0.0, 0.0], 1.0)
+    path = tmp_path / "ring.pt"
+    write_state(ring_state(ring), path)
+    whole, random = path.read_bytes(), np.random.default_rng(3)
+    load_fit(path)
+    for place in [*random.integers(0, len(whole), 60), *random.integers(len(whole) - 3000, len(whole), 60)]:
+        content = bytearray(whole)
+        content[place] ^= 1 << random.integers(8)
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"ring\.pt: not a saved fit, or damaged"):
+            load_fit(path)
+    path.write_bytes(whole[:-50])
+    with pytest.raises(InputError, match=r"ring\.pt: not a saved fit, or damaged"):
+        load_fit(path)

@@ -1,6 +1,8 @@
 """Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
 
+import contextlib
 import hashlib
+import os
 from pathlib import Path
 
 from mi_ring.capture.capture import Capture
@@ -11,14 +13,26 @@ from mi_ring.ring.saved import read_state
 from mi_ring.system.files import relative_to, write_state
 
 NAME = "checkpoint.pt"
+BEFORE = "checkpoint.before.pt"  #: the one before it, in case that it is damaged
 FORMAT = 2  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
-    """The state a fit stopped at. Raises InputError if there is none or if it was made with other settings."""
+    """The state a fit stopped at; if its checkpoint is damaged, that of the one before, of which a line is printed.
+
+    Raises InputError if there is none or if it was made with other settings.
+    """
     path = folder / NAME
-    state = read_state(path, "a checkpoint", ADVICE)
+    try:
+        state = read_state(path, "a checkpoint", ADVICE)
+    except InputError as error:
+        try:
+            state = read_state(folder / BEFORE, "a checkpoint", ADVICE)
+        except InputError:
+            raise error from None
+        path = folder / BEFORE
+        print(f"{str(error).rpartition(';')[0]}; going on from the one before, {path}")
     if state.get("format") != FORMAT:
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
@@ -39,8 +53,13 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
-    """Write what `--resume` needs; `files` are the `digests` of the capture's."""
+    """Write what `--resume` needs, and keep what was there before; `files` are the `digests` of the capture's.
+
+    Raises InputError if it cannot be written.
+    """
     state = {"format": FORMAT, "settings": fit.config.settings(), "files": files, "fit": fit.state()}
+    with contextlib.suppress(OSError):  # there is none
+        os.replace(folder / NAME, folder / BEFORE)
     write_state(state, folder / NAME)
 
 

@@ -1,7 +1,10 @@
-"""A fit from its first iteration to its results: progress, log, checkpoints, Ctrl-C."""
+"""A fit from its first iteration to its results: progress, log, checkpoints, signals, a disk that is full."""
 
 import contextlib
+import math
+import shutil
 import signal
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,47 +12,91 @@ from pathlib import Path
 import trimesh
 from tqdm import tqdm
 
+from mi_ring.errors import InputError
 from mi_ring.fitting.budget import Costs, measure
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.iteration import Iteration
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
 from mi_ring.system.optional import installed
-from mi_ring.system.progress import progress
+from mi_ring.system.progress import outliving_readers, progress
 
 CHECKPOINT_SECONDS = 30.0
 TELLING = 60  #: iterations: shorter fits do without measuring how long theirs take
 
 
-@contextlib.contextmanager
-def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether Ctrl-C was pressed. A second Ctrl-C ends the program at once."""
-    pressed: list[int] = []
+#: Signals that end a fit early: Ctrl-C, `kill` and schedulers, a terminal that is closed (not on Windows).
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
-    def press(number: int, frame: object) -> None:
-        pressed.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Callable[[], int]]:
+    """Yields a function that tells which signal has come that ends a fit, 0: none. A second one ends it at once."""
+    come: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        come.append(number)
+        restore()
         tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
 
-    before = signal.signal(signal.SIGINT, press)
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
+    before = {number: signal.signal(number, note) for number in heard}
     try:
-        yield lambda: bool(pressed)
+        yield lambda: come[0] if come else 0
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
 
 
-def train(fit: Fit, folder: Path, interrupted: Callable[[], bool], costs: Costs | None) -> None:
-    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints in `folder`."""
+class Keeper:
+    """Writes into the folder of a fit what tells how far it is; what cannot be written now is tried again later."""
+
+    def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
+        self.fit, self.folder, self.prepare = fit, folder, prepare
+        self.files = digests(fit.capture, fit.config)
+        self.saved, self.failed = -math.inf, False
+
+    def note(self, it: Iteration) -> None:
+        """Write log and checkpoint where they are due after this iteration: the first, each stage's last, in time."""
+        log = self.fit.log
+        if log and log[-1]["iteration"] == it.number:
+            self.attempt(lambda: results.add_to_log(self.folder, log[-1]))
+        if it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS:
+            self.attempt(self.checkpoint)
+            self.saved = time.monotonic()
+
+    def checkpoint(self) -> None:
+        """Write one now. Raises InputError if it cannot be written."""
+        if not self.folder.is_dir():  # somebody has removed it
+            self.prepare()
+            results.write_log(self.folder, self.fit.log)
+        write_checkpoint(self.fit, self.files, self.folder)
+
+    def attempt(self, write: Callable[[], None]) -> None:
+        """A fit does not end for it."""
+        try:
+            write()
+        except InputError as error:
+            if not self.failed:
+                tqdm.write(f"{error}. Going on, and trying again")
+            self.failed = True
+
+
+def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
+    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
     if costs is None and fit.iterations - fit.iteration >= TELLING:
         costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration])
     work = [(costs or {}).get((s.level, s.width), 1.0) for s in fit.stages for _ in range(s.first, s.last)]
-    saved, files = time.monotonic(), digests(fit.capture, fit.config)
     bar = progress(
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
-    results.write_log(folder, fit.log)
+    results.write_log(keeper.folder, fit.log)
     with bar:
         while fit.iteration < fit.iterations and not interrupted():
             it = fit.step()
@@ -58,12 +105,8 @@ def train(fit: Fit, folder: Path, interrupted: Callable[[], bool], costs: Costs 
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
-            if fit.log[-1:] and fit.log[-1]["iteration"] == it.number:
-                results.add_to_log(folder, fit.log[-1])
-            if time.monotonic() - saved > CHECKPOINT_SECONDS:
-                write_checkpoint(fit, files, folder)
-                saved = time.monotonic()
-    write_checkpoint(fit, files, folder)
+            keeper.note(it)
+    keeper.checkpoint()
 
 
 def start_of(fit: Fit) -> str:
@@ -76,13 +119,14 @@ def start_of(fit: Fit) -> str:
     return f"a surface of genus {genus(trimesh.Trimesh(domain.points, domain.faces, process=False))} about {place}"
 
 
-def run_session(fit: Fit, folder: Path, costs: Costs | None = None) -> bool:
-    """Run a fit in a folder that has been prepared and write its results, whatever ends it. Was it interrupted?
+def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Costs | None = None) -> int:
+    """Run a fit in a folder and write its results, whatever ends it.
 
-    `costs`: of its iterations, if they have been measured already.
+    Returns the signal that it was interrupted by, or 0. `prepare` makes the folder anew, should it vanish. `costs`: of
+    iterations, if they have been measured already.
     """
     fitted_scene = results.fitted_scene(fit, folder)
-    with interruptible() as interrupted:
+    with interruptible() as interrupted, outliving_readers():
         print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
         if fit.config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
@@ -94,9 +138,28 @@ def run_session(fit: Fit, folder: Path, costs: Costs | None = None) -> bool:
             print(f"Start: {start_of(fit)}")
             results.write_inputs(folder / "inputs.png", fit)
         try:
-            train(fit, folder, interrupted, costs)
+            train(fit, Keeper(fit, folder, prepare), interrupted, costs)
         except Exception:
-            results.write(folder, fit, fitted_scene)
+            write_somewhere(fit, folder, fitted_scene)
             raise
+        write_somewhere(fit, folder, fitted_scene)
+    return interrupted() if fit.iteration < fit.iterations else 0
+
+
+def write_somewhere(fit: Fit, folder: Path, fitted_scene: bytes) -> None:
+    """Write the results; if not where they were to go, then into a new folder among the system's temporary ones.
+
+    Raises InputError, even then, if they cannot be written where they were to go.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
         results.write(folder, fit, fitted_scene)
-    return fit.iteration < fit.iterations
+    except (InputError, OSError):
+        elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{folder.name}-"))
+        try:
+            results.write(elsewhere, fit, results.fitted_scene(fit, elsewhere))
+            write_checkpoint(fit, digests(fit.capture, fit.config), elsewhere)
+            print(f"{folder}/: cannot be written; the results are in {elsewhere}/ instead")
+        except (InputError, OSError):
+            shutil.rmtree(elsewhere, ignore_errors=True)
+        raise

@@ -84,7 +84,8 @@ class Domain:
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """The surface in about 20 · 4^level triangles."""
         if level > FINEST:
-            return trimesh.remesh.subdivide(*self.sample(level - 1))
+            points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
+            return self.project(points), faces
 
         vertices, faces = (self.points, self.faces) if level == FINEST else self.sample(level + 1)
         mesh = trimesh.Trimesh(np.asarray(vertices), faces)
@@ -94,7 +95,7 @@ class Domain:
             points, faces = package.remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
             remeshed = trimesh.Trimesh(points, faces)
             if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
-                return points, faces
+                return self.project(points), faces
         except ValueError:  # the surface touches itself in an edge
             pass
         points, faces = self.points, self.faces  # else too coarse for the surface's handles

@@ -23,6 +23,7 @@ from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, relative_to, write_file, write_state, writing
 
+PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
 VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
 
 
@@ -47,7 +48,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
     if folder in scene.resolve().parents:
         raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
     with writing(f"{folder}: --out"):
-        if not resume and any((folder / name).exists() for name in ("ring.pt", "checkpoint.pt")):
+        if not resume and any((folder / name).exists() for name in PRECIOUS):
             aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
             folder.rename(aside)
             print(f"The results that were in {folder}/ are now in {aside}/")

@@ -183,9 +183,10 @@ def draw(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Like `render`, of the surface as last written, without gradients, in the processor's memory.
 
-    `indirect`: with interreflection, of so many `paths` for each pixel of a picture 128 pixels wide; the light of the photographs' room is always part of them. However many pixels
-    and samples, it takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures
-    themselves take; `indirect` or a room add about 100 MB for each photograph.
+    `indirect`: with interreflection, of so many `paths` for each pixel of a picture 128 pixels wide; the light of the
+    photographs' room is always part of them. However many pixels and samples, it takes about a gigabyte
+    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take; `indirect` or a room add
+    about 100 MB for each photograph.
     """
     parts = []
     for pixels in photographs.chunks(spp):

@@ -1,6 +1,9 @@
 """`ring.pt`: a reconstructed object as a file, its networks by their registered names."""
 
+import io
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -8,6 +11,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets.registry import architecture_of, build
 from mi_ring.ring.ring import Ring
+from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
 
 FORMAT = 4  #: version of the file
@@ -49,9 +53,15 @@ def migrated(state: dict) -> dict:
 
 
 def read_state(path: Path, kind: str, advice: str) -> dict:
-    """What `torch.save` wrote. Raises InputError if there is no such file, or if it is not of this `kind`."""
+    """What `write_state` wrote. Raises InputError if there is no such file, if it is damaged or not of this `kind`.
+
+    Files of before had no seal; they have but the checks of zip files.
+    """
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        content = path.read_bytes()
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        if not is_sealed(content):
+            require_unsealed(content, state)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {advice}") from None
     except OSError as error:
@@ -62,6 +72,15 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
     if not isinstance(state, dict):
         raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")
     return state
+
+
+def require_unsealed(content: bytes, state: Any) -> None:
+    """Raise ValueError unless this is a whole file of the time before there were seals."""
+    if isinstance(state, dict) and state.get("sealed"):
+        raise ValueError("the seal is broken")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if damaged := archive.testzip():
+            raise ValueError(f"{damaged} is damaged")
 
 
 def load_fit(path: str | Path) -> Ring:

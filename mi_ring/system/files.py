@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import hashlib
 import io
 import os
 import secrets
@@ -13,6 +14,10 @@ import filelock
 import torch
 
 from mi_ring.errors import InputError
+
+SEAL = b"blake2b "  #: begins the comment at the end of an archive that says what its bytes are
+DIGEST = 32  #: hexadecimal digits of it
+END, COMMENT = b"PK\x05\x06", 20  #: of a zip file: its last record begins so, and there has the length of a comment
 
 
 @contextlib.contextmanager
@@ -49,17 +54,45 @@ def write_file(path: Path, content: bytes | str) -> None:
     partial = partial_path(path)
     with writing(path):
         try:
-            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+            with partial.open("wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())  # else after a power cut a name may be there without its content
             os.replace(partial, path)
+            if os.name == "posix":
+                folder = os.open(path.parent, os.O_RDONLY)
+                try:
+                    os.fsync(folder)
+                finally:
+                    os.close(folder)
         finally:
             partial.unlink(missing_ok=True)
 
 
 def write_state(state: dict, path: Path) -> None:
-    """`torch.save`, whole or not at all."""
+    """`torch.save`, whole or not at all, and sealed: `read_state` notices each bit that is not as it was."""
     buffer = io.BytesIO()
-    torch.save(state, buffer)
-    write_file(path, buffer.getvalue())
+    torch.save(state | {"sealed": True}, buffer)
+    write_file(path, sealed(buffer.getvalue()))
+
+
+def sealed(archive: bytes) -> bytes:
+    """A zip file with the digest of all that comes before as its comment."""
+    end = archive.rindex(END)
+    assert end + COMMENT + 2 == len(archive), "has a comment already"
+    body = archive[: end + COMMENT] + (len(SEAL) + DIGEST).to_bytes(2, "little")
+    return body + SEAL + digest(body)
+
+
+def is_sealed(archive: bytes) -> bool:
+    """Is it a zip file as `sealed` gave it, every bit of it?"""
+    body = archive[: -len(SEAL) - DIGEST]
+    return archive[len(body) :] == SEAL + digest(body)
+
+
+def digest(content: bytes) -> bytes:
+    """Of some bytes, in hexadecimal digits."""
+    return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 
 
 @contextlib.contextmanager

@@ -1,17 +1,65 @@
 """How far something is."""
 
+import contextlib
 import io
 import math
+import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from tqdm import tqdm
 
 Progress = Callable[..., Iterable]  #: what `progress` is; another shows nothing
 PATIENCE, QUIET = 2.0, 30.0  #: seconds before something is shown, and between two lines where there is no terminal
+
+
+@contextlib.contextmanager
+def outliving_readers() -> Iterator[None]:
+    """Within it nobody need read on what is printed: `| head`, a terminal that is closed. It is dropped then."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = map(Dispensable, before)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+class Dispensable(io.TextIOBase):
+    """A stream of text; from the moment that it cannot be written it goes nowhere."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream  # None where a program has no console
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        """Write it, if that is possible."""
+        self.attempt(lambda: self.stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush it, if that is possible."""
+        self.attempt(lambda: self.stream.flush())
+
+    def attempt(self, output: Callable[[], object]) -> None:
+        """Try it; once it fails all that is written to the same file, now and later, is dropped."""
+        if self.stream is None:
+            return
+        try:
+            output()
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+
+    def isatty(self) -> bool:
+        """Is it a terminal?"""
+        return self.stream is not None and self.stream.isatty()
 
 
 class Lines(io.TextIOBase):
