@@ -1,5 +1,6 @@
 """Opens scene files: what a fit would stumble over later is said at once."""
 
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,6 +19,8 @@ from mi_ring.rendering.rooms import room_of
 from mi_ring.rendering.visibility import View
 from mi_ring.system import llvm
 from mi_ring.system.progress import progress
+
+FLATTEST = 8  #: longer side of a photograph by its shorter one
 
 
 def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
@@ -47,6 +50,11 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     shadows = getattr(scene.integrator(), "shadows", True)
     if not images:
         return Capture(path, scene, shapes[0], sensors, photographs, shadows)
+    for sensor in sensors:
+        if FLATTEST * min(sensor.size) < max(sensor.size):
+            size = "{} x {}".format(*sensor.size)
+            raise InputError(f'{path}: photograph "{sensor.id()}", film: is {size} pixels; sides of more than '
+                             f"{FLATTEST} : 1 cannot be made smaller")  # fmt: skip
     reading = progress(sensors, "reading", unit="photograph", disable=None)
     pixels = [read_photograph(s, path) for s in reading]
     linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
@@ -82,7 +90,7 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
     require_scene(path)
     try:
-        path.read_text("utf-8")
+        require_xml(path)
         scene = mi.load_file(str(path), optimize=False, parallel=False)
     except UnicodeDecodeError as error:
         what = f"is not UTF-8 at byte {error.start} ({error.reason})"
@@ -93,6 +101,25 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
     if not sensors:
         raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
     return scene, sensors
+
+
+def require_xml(path: Path) -> None:
+    """Raise InputError for what Mitsuba reads and others do not, and for what it takes to be at the origin silently."""
+    path.read_text("utf-8")
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # of XML, of an encoding that is unknown
+        raise InputError(f"{path}: is no XML ({error}); give the XML file of a scene, in UTF-8") from error
+    for sensor in root.iter("sensor"):
+        if sensor.get("type") != "photograph":
+            continue
+        name = f'{path}: photograph "{sensor.get("id", "")}"'
+        if sensor.find("*[@name='to_world']") is None:
+            raise InputError(f"{name}: to_world is missing; say where its camera is")
+        for light in sensor.findall("emitter[@type='point']"):
+            if not {"position", "to_world"} & {child.get("name") for child in light}:
+                raise InputError(f"{name}: emitter: position is missing; say where its light is, or leave the emitter "
+                                 "out if that is at the camera")  # fmt: skip
 
 
 def load_views(path: Path) -> list[View]:
@@ -120,5 +147,4 @@ def reason(error: RuntimeError) -> str:
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
         text = text.split("Error: ", 1)[-1]
-    advice = "; give the XML file of a scene" if "No document element found" in text else ""
-    return " ".join(text.split()) + advice
+    return " ".join(text.split())

@@ -19,6 +19,9 @@ from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
 
+#: Properties of plugins, Mitsuba's and ours, that name a file. A value of another one may only look like a name.
+FILES = "filename", "mask", "valid", "domain", "weights"
+
 #: What a photograph says of lens, curve and flash by one number each, and what it says by saying nothing.
 USUAL = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
 
@@ -215,6 +218,8 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 def move_names(root: Element, source: Path, folder: Path) -> None:
     """Rewrite the names of files that are relative to the folder `source` to be relative to another."""
     for element in root.iter("string"):
+        if element.get("name") not in FILES:
+            continue
         file = source / element.get("value", "")
         if element.get("value") and os.path.isfile(file):  # Path.is_file raises for what is too long for a name
             element.set("value", relative_to(folder.resolve(), file.resolve()))

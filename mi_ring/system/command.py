@@ -14,6 +14,8 @@ import tyro
 from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
+LONGEST = 800  #: message, in characters
+
 
 def parse(
     config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
@@ -92,6 +94,12 @@ def scene_name(scene: Path) -> str:
     return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
+def one_line(message: str) -> str:
+    """A message without the line breaks that a name in it may have, and without the middle of what it echoes."""
+    words = " ".join(message.split())
+    return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]} … {words[-LONGEST // 2 :]}"
+
+
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: status 2 and one line on standard error for anything the user can mend.
 
@@ -111,6 +119,6 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
         # A file that may not be read, a folder that is gone; other errors of the system are nobody's mistake but ours.
         if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
             raise
-        message = error if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
-        print(f"{program}: {message}", file=sys.stderr)
+        message = str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
+        print(f"{program}: {one_line(message)}", file=sys.stderr)
         sys.exit(2)
