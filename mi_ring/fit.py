@@ -17,18 +17,17 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture, require_scene
 from mi_ring.errors import InputError
-from mi_ring.fitting.budget import Costs, all_stages, fitting_into, measure
-from mi_ring.fitting.checkpoint import read_checkpoint, require_same_files
+from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
+from mi_ring.fitting.checkpoint import read_checkpoint, resumed
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.session import run_session
-from mi_ring.geometry.domain import Sphere
 from mi_ring.output import results
 from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
-AFTERWARDS = 20.0  #: seconds that pictures before a fit and its results after it may take
+AFTERWARDS = 30.0  #: seconds that pictures before a fit and its results after it are taken to take
 PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
 
 
@@ -45,8 +44,8 @@ class Task:
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """Settings that go together; each can be overridden. paper: the paper's own, seven hours on two cores."""
     minutes: float = 0
-    """How long the command may take, results included: the preset, unless one is given, and --iterations are chosen by
-    what iterations take on this machine. 0: as long as they take."""
+    """About how long the command may take, results included: by what iterations take on this machine --iterations are
+    chosen, and --preset unless it is given. 0: as long as they take."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Variant of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is
     one."""
@@ -86,30 +85,27 @@ def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 128 and the signal that it was interrupted by: 130 is Ctrl-C."""
     started = time.monotonic()
     config = parse_options(arguments)
-    if config.minutes and given(arguments, "--iterations"):
-        raise InputError("--minutes: chooses --iterations; give one of the two")
+    choice = choice_of(config, arguments)
     require_scene(config.scene)
     variant: Any = set_variant(config.variant)
-    config = dataclasses.replace(config, variant=variant)
+    config, *choice = (dataclasses.replace(c, variant=variant) for c in (config, *choice))
     folder = config.folder
     if config.minutes and config.resume:
-        config = planned_before(config, arguments, folder)
+        config = planned_before(config, choice, folder)
     state = read_checkpoint(folder, config) if config.resume else None
     keep_memory()
     capture = load_capture(config.scene, masks=config.masks)
-    if state:
-        require_same_files(state, capture, config, folder)
     if capture.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
     elif config.masks != "given" and all(mask is None for mask in capture.masks):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config.thread_count):
-        fit, costs = Fit(capture, config, state=state and state["fit"]), None
-        if config.minutes and not state:
-            config, costs = planned(config, arguments, fit, started)
-            fit = Fit(capture, config)
+        fit, costs = resumed(state, capture, config, folder) if state else Fit(capture, config), None
         results.fitted_scene(fit, folder)  # refuses what cannot be written later
         with locked(folder):
+            if config.minutes and not state:
+                config, costs = planned(choice, fit, started)
+                replan(fit, config)
             options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
             prepare = partial(results.prepare_folder, folder, config.scene, options)
             prepare(config.resume)
@@ -119,29 +115,41 @@ def main(arguments: Sequence[str]) -> int:
     return 128 + interrupted if interrupted else 0
 
 
-def planned(config: FitConfig, arguments: Sequence[str], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
-    """The configuration that --minutes asks for, and what iterations take. `started`: when the command was."""
-    choice = [config]
-    if not given(arguments, "--preset"):
-        choice = [parse_options([*arguments, "--preset", name]) for name in PLANNED]
-    print("Measuring what iterations take on this machine", flush=True)
-    costs = measure(fit, all_stages(fit, choice))
-    left = 60 * config.minutes - (time.monotonic() - started) - AFTERWARDS
-    if left <= 0:
-        raise InputError(f"--minutes: is {config.minutes:g}, of which start and results of this capture take all; "
-                         f"give {config.minutes + 1 - left / 60:.0f} or more")  # fmt: skip
-    chosen = fitting_into(left, choice, not isinstance(fit.ring.domain, Sphere), costs)
-    print(f"In {config.minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
+def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
+    """What --minutes chooses from: the preset that is given, else all that the other options go with."""
+    if config.minutes and given(arguments, "--iterations"):
+        raise InputError("--minutes: chooses --iterations; give one of the two")
+    choice = []
+    if config.minutes and not given(arguments, "--preset"):
+        for name in PLANNED:
+            with contextlib.suppress(InputError):
+                choice.append(parse_options([*arguments, "--preset", name]))
+    return choice or [config]
+
+
+def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
+    """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
+    minutes, costs = choice[0].minutes, measure(fit, all_stages(fit, choice))
+    spent = time.monotonic() - started + AFTERWARDS
+    if (needed := spent + fewest_seconds(choice, fit.near, costs)) > 60 * minutes:
+        raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
+                         f"{math.ceil(needed / 6) / 10:g} or more")  # fmt: skip
+    chosen = fitting_into(60 * minutes - spent, choice, fit.near, costs)
+    print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
     return chosen, costs
 
 
-def planned_before(config: FitConfig, arguments: Sequence[str], folder: Path) -> FitConfig:
-    """The configuration that --minutes has led to before, by the folder's config.json, if there is one."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path) -> FitConfig:
+    """The settings that --minutes has led to before, by the folder's config.json, if there is one."""
+    try:
         before = json.loads((folder / "config.json").read_text())
-        config = parse_options([*arguments, "--preset", before["preset"]])
-        return dataclasses.replace(config, iterations=before["iterations"])
-    return config
+        minutes, preset, iterations = before["minutes"], before["preset"], int(before["iterations"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return config  # its checkpoint tells what is wrong
+    if minutes != config.minutes:
+        raise InputError(f"{folder}: --minutes: was {minutes:g} before, is {config.minutes:g} now; give the same")
+    config = next((c for c in choice if c.preset == preset), config)
+    return dataclasses.replace(config, iterations=iterations)
 
 
 def given(arguments: Sequence[str], option: str) -> bool:

@@ -1,5 +1,6 @@
 """Which fit a given time allows."""
 
+import json
 import math
 
 import pytest
@@ -12,6 +13,8 @@ from mi_ring.fitting import budget
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.schedule import Stage
+from mi_ring.output.results import read_log
+from mi_ring.system.machine import threads_of
 
 COSTS = {(4, 128): 0.25, (5, 256): 1.0, (6, 512): 4.0}
 CHOICE = [Config.preset(name) for name in ("fast", "default", "fine")]
@@ -43,24 +46,55 @@ def test_there_is_a_least_number_of_iterations():
 
 
 def test_measuring_changes_nothing_of_the_fit(small_capture):
-    """The same random numbers, weights and log afterwards, and what was asked for is measured."""
-    config = Config(iterations=2, levels=(2,), widths=(28,), shares=(1,), domain="sphere", refine=("power",))
-    fit = Fit(load_capture(small_capture), config)
-    before, weights = fit.state(), [p.detach().clone() for p in fit.ring.parameters()]
-    costs = budget.measure(fit, [Stage(2, 28, 0, 1), Stage(3, 56, 1, 2)])
-    after = fit.state()
-    assert costs.keys() == {(2, 28), (3, 56)} and all(0 < s < math.inf for s in costs.values())
-    assert (before["random"] == after["random"]).all() and after["iteration"] == 0 and after["log"] == []
-    assert all(map(torch.equal, weights, fit.ring.parameters()))
+    """With it or without, a deterministic fit has the same weights after some iterations."""
+    config = Config(iterations=4, levels=(2,), widths=(28,), shares=(1,), domain="sphere", deterministic=True)
+    weights = []
+    for measured in (True, False):
+        capture = load_capture(small_capture)
+        with threads_of(1):
+            fit = Fit(capture, config)
+            if measured:
+                costs = budget.measure(fit, [Stage(2, 28, 0, 1), Stage(3, 56, 1, 2)])
+                assert costs.keys() == {(2, 28), (3, 56)} and all(0 < s < math.inf for s in costs.values())
+            for _ in range(3):
+                fit.step()
+        assert fit.iteration == 3 and fit.log == []
+        weights.append(list(fit.ring.parameters()))
+    assert all(map(torch.equal, *weights))
+
+
+SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--domain", "sphere"]
+
+
+def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):
+    """Of 60 s 30 are for start and results; at 0.5 s an iteration some 60 are left, whatever this machine does."""
+    monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
+    call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
+    assert command.main(call) == 0
+    options = json.loads((tmp_path / "run/config.json").read_text())
+    assert 40 < options["iterations"] <= 60 and options["minutes"] == 1
+    assert read_log(tmp_path / "run")[-1]["iteration"] == options["iterations"]
+    assert f"--preset {options['preset']} --iterations {options['iterations']}" in capsys.readouterr().out
+    assert command.main([*call, "--resume"]) == 0
+    with pytest.raises(InputError, match="--minutes: was 1 before, is 2 now"):
+        command.main([*call[:-1], "2", "--resume"])
+    with pytest.raises(InputError, match="--batch: was 8 before, is 3 now"):
+        command.main([*call, "--resume", "--batch", "3"])
+
+
+def test_presets_that_do_not_go_with_the_other_options_are_no_choice(small_capture):
+    arguments = [str(small_capture), "--minutes", "5", "--shares", "1", "1", "1"]  # fast has two stages
+    choice = command.choice_of(command.parse_options(arguments), arguments)
+    assert [c.preset for c in choice] == ["default", "fine"]
 
 
 @pytest.mark.parametrize(("options", "complaint"), [
     (["--minutes", "-1"], "--minutes: is -1.0, must be 0 or more"),
     (["--minutes", "1", "--deterministic"], "--deterministic: does not go with --minutes"),
     (["--minutes", "1", "--iterations", "9"], "--minutes: chooses --iterations; give one of the two"),
-    (["--minutes", "0.01"], "of which start and results of this capture take all; give "),
+    (["--minutes", "0.01"], "too few for a fit of this capture on this machine; give "),
 ])  # fmt: skip
 def test_mistakes_are_told(small_capture, tmp_path, options, complaint):
     with pytest.raises(InputError, match=complaint.replace(".", r"\.")):
-        command.main([str(small_capture), "--out", str(tmp_path / "run"), "--domain", "sphere", *options])
+        command.main([str(small_capture), "--out", str(tmp_path / "run"), *SMALL, *options])
     assert not (tmp_path / "run").exists()

@@ -1,5 +1,7 @@
 """The machine that all runs on: cores, threads, files, and how a command ends."""
 
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -11,7 +13,7 @@ import torch
 
 from mi_ring.errors import InputError
 from mi_ring.nets import chunks
-from mi_ring.system import command, files, machine
+from mi_ring.system import command, files, machine, progress
 
 
 def write(path, text):
@@ -178,3 +180,33 @@ def test_a_reader_that_goes_away_is_no_mistake():
     process.stdout.close()
     assert b"Traceback" not in process.stderr.read()
     process.wait()
+
+
+class Stream(io.StringIO):
+    """Standard output as a file that now and then cannot be written."""
+
+    encoding, trouble = "utf-8", None
+
+    def write(self, text):
+        if self.trouble:
+            raise OSError(self.trouble, "as if")
+        return super().write(text)
+
+
+def test_what_nobody_reads_is_dropped(tmp_path, monkeypatch):
+    """After a full disk the rest is written; after a closed pipe nothing is, not even at the interpreter's end."""
+    stream = Stream()
+    with (tmp_path / "pipe").open("w") as pipe:
+        monkeypatch.setattr(stream, "fileno", pipe.fileno)
+        monkeypatch.setattr(sys, "stdout", stream)
+        with progress.outliving_readers():
+            assert sys.stdout.encoding == "utf-8" and not sys.stdout.isatty()
+            print("one")
+            stream.trouble = errno.ENOSPC
+            print("two")
+            stream.trouble = None
+            print("three")
+            stream.trouble = errno.EPIPE
+            print("four")
+            assert os.path.samestat(os.fstat(pipe.fileno()), os.stat(os.devnull))
+        assert sys.stdout is stream and stream.getvalue() == "one\nthree\n"

@@ -304,3 +304,43 @@ def test_no_bit_of_a_saved_fit_may_change(tmp_path):
     path.write_bytes(whole[:-50])
     with pytest.raises(InputError, match=r"ring\.pt: not a saved fit, or damaged"):
         load_fit(path)
+
+
+BALL = trimesh.creation.icosphere(subdivisions=1)
+
+
+def changed(*path, to):
+    """A function that changes one value in a state."""
+
+    def change(state):
+        *folders, last = path
+        for key in folders:
+            state = state[key]
+        state[last] = to
+
+    return change
+
+
+@pytest.mark.parametrize("change", [
+    changed("networks", "radius", to=torch.tensor(float("nan"))), changed("networks", "radius", to=torch.tensor(-1.0)),
+    changed("networks", "center", to=torch.tensor([0.0, float("inf"), 0.0])), changed("subdivisions", to=30),
+    changed("subdivisions", to=-1), changed("subdivisions", to="6"), changed("shape_net", "arguments", "steps", to=-1),
+    changed("shape_net", "arguments", "steps", to=10**9), changed("shape_net", "arguments", to=None),
+    changed("brdf_net", "arguments", "parameters", to=[("diffuse", 10**9, 0.0, 1.0)]), changed("metres", to=-1.0),
+    changed("domain", to={"points": torch.tensor(BALL.vertices), "faces": torch.tensor(BALL.faces[1:])}),
+    changed("domain", to={"points": torch.tensor(BALL.vertices[1:]), "faces": torch.tensor(BALL.faces)}),
+    changed("domain", to={"points": torch.tensor(BALL.vertices * np.nan), "faces": torch.tensor(BALL.faces)}),
+    changed("domain", "points", to=torch.zeros(5)), changed("domain", to=[1]), changed("up", to=[1.0]),
+    changed("networks", "ground", to=torch.zeros(7)), changed("bsdf", to=3), changed("networks", to=None),
+    changed("shape_net", "name", to=["shapenet"]),
+])  # fmt: skip
+def test_what_no_fit_has_is_refused(change, tmp_path):
+    domain = Domain(BALL.vertices, BALL.faces)
+    state = ring_state(Ring([0.0, 0.0, 0.0], 1.0, domain=domain, ground=torch.tensor([[0.0, 0, -1], [0, 0, 1]])))
+    path = tmp_path / "ring.pt"
+    write_state(state, path)
+    load_fit(path)
+    change(state)
+    write_state(state, path)
+    with pytest.raises(InputError, match=r"ring\.pt: damaged, or of other networks than it says"):
+        load_fit(path)

@@ -9,7 +9,7 @@ from typing import TypeVar
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.schedule import Stage, stages_of
-from mi_ring.geometry.domain import Sphere
+from mi_ring.system.machine import release_memory
 
 FEWEST = 40  #: iterations: with fewer nothing is to be expected
 
@@ -22,24 +22,25 @@ def measure(fit: Fit, stages: Iterable[Stage]) -> Costs:
 
     They are those of another fit, which goes on from the state of this one and is dropped.
     """
-    refine = tuple(name for name in fit.config.refine if name != "masks")  # which a few iterations find anew
-    config = dataclasses.replace(fit.config, holdout=0, refine=refine or ("none",))
-    trial = Fit(fit.capture, config, terms=fit.terms, state=fit.state())
-    costs: Costs = {}
+    print("Measuring what iterations take on this machine", flush=True)
+    trial = Fit(fit.capture, fit.config, terms=fit.terms, state=fit.state())
+    trial.ring.domain = fit.ring.domain  # with the samplings, which the fit needs in any case
+    random, costs = trial.random.get_state(), {}
     for stage in stages:
         trial.stages = [stage._replace(first=0, last=trial.iterations)]
         for _ in range(2):
-            trial.iteration = trial.iterations - 1
+            trial.random.set_state(random)  # the same photographs, which are remembered, as later in a fit
+            trial.iteration = max(0, trial.iterations - 2)  # the last one does more
             started = time.perf_counter()
             trial.step()
             costs[stage.level, stage.width] = time.perf_counter() - started
+    release_memory()
     return costs
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
     """The stages of fits with these settings, from where this one starts, each level and width once."""
-    near = not isinstance(fit.ring.domain, Sphere)
-    stages = [stage for config in configs for stage in stages_of(config, near)]
+    stages = [stage for config in configs for stage in stages_of(config, fit.near)]
     return list({(stage.level, stage.width): stage for stage in stages}.values())
 
 
@@ -54,6 +55,18 @@ def fitting_into(seconds: float, configs: Sequence[Settings], near: bool, costs:
     return dataclasses.replace(config, iterations=max(FEWEST, int(config.iterations * seconds / own[nearest])))
 
 
+def fewest_seconds(configs: Sequence[Config], near: bool, costs: Costs) -> float:
+    """What the shortest of fits with these settings takes."""
+    return min(seconds_of(dataclasses.replace(config, iterations=FEWEST), near, costs) for config in configs)
+
+
 def seconds_of(config: Config, near: bool, costs: Costs) -> float:
     """What the iterations of a fit take."""
     return sum((s.last - s.first) * costs[s.level, s.width] for s in stages_of(config, near))
+
+
+def replan(fit: Fit, config: Config) -> None:
+    """Have a fit that has not begun take settings that differ in stages, iterations, level or regulariser alone."""
+    fit.config, fit.ring.subdivisions = config, config.subdivisions
+    fit.stages = stages_of(config, fit.near)
+    fit.iterations = fit.stages[-1].last

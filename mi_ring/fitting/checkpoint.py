@@ -1,8 +1,7 @@
 """Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
 
-import contextlib
 import hashlib
-import os
+import math
 from pathlib import Path
 
 from mi_ring.capture.capture import Capture
@@ -10,7 +9,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.ring.saved import read_state
-from mi_ring.system.files import relative_to, write_state
+from mi_ring.system.files import is_sealed, relative_to, write_state
 
 NAME = "checkpoint.pt"
 BEFORE = "checkpoint.before.pt"  #: the one before it, in case that it is damaged
@@ -27,13 +26,14 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
     try:
         state = read_state(path, "a checkpoint", ADVICE)
     except InputError as error:
+        before = folder / BEFORE
         try:
-            state = read_state(folder / BEFORE, "a checkpoint", ADVICE)
+            state = read_state(before, "a checkpoint", ADVICE)
         except InputError:
             raise error from None
-        path = folder / BEFORE
-        print(f"{str(error).rpartition(';')[0]}; going on from the one before, {path}")
-    if state.get("format") != FORMAT:
+        print(f"{path}: is damaged or gone; going on from the one before, {before}")
+        path = before
+    if state.get("format") != FORMAT or not {"settings", "files", "fit"} <= state.keys():
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     for name, value in config.settings().items():
         if state["settings"].get(name) != value:
@@ -52,15 +52,31 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
                              "without --resume")  # fmt: skip
 
 
+def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
+    """The fit that a checkpoint is of. Raises InputError if it does not hold one, or if its files have changed."""
+    require_same_files(state, capture, config, folder)
+    try:
+        fit = Fit(capture, config, state=state["fit"])
+        if not (0 <= fit.iteration <= fit.iterations and 0 <= fit.seconds < math.inf):
+            raise ValueError(f"iteration {fit.iteration} after {fit.seconds} s")
+        for entry in fit.log:
+            _ = entry["iteration"], entry["seconds"]
+    except InputError:
+        raise
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{folder / NAME}: holds no fit that could go on ({error!r}); {ADVICE}") from error
+    return fit
+
+
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
     """Write what `--resume` needs, and keep what was there before; `files` are the `digests` of the capture's.
 
     Raises InputError if it cannot be written.
     """
     state = {"format": FORMAT, "settings": fit.config.settings(), "files": files, "fit": fit.state()}
-    with contextlib.suppress(OSError):  # there is none
-        os.replace(folder / NAME, folder / BEFORE)
-    write_state(state, folder / NAME)
+    path = folder / NAME
+    whole = path.is_file() and is_sealed(path.read_bytes())  # what is damaged must not replace what is not
+    write_state(state, path, folder / BEFORE if whole else None)
 
 
 def digests(capture: Capture, config: Config) -> dict[str, str]:

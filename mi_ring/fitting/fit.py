@@ -105,7 +105,7 @@ class Fit:
         self.ring.to(self.device)
         self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
-        near = not isinstance(self.ring.domain, Sphere)
+        self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
         self.calibration: Calibration | None = None
         self.poses: GaussNewton | None = None
         if refined := refined_of(seen, self.config, self.albedo):
@@ -113,10 +113,10 @@ class Fit:
             self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
             self.optimizers += self.calibration.optimizers()
             if "cameras" in refined:
-                self.poses = GaussNewton(self.calibration, near, self.terms)
+                self.poses = GaussNewton(self.calibration, self.near, self.terms)
                 self.optimizers.append(self.poses)
             self.calibration.room.to(self.device)
-        self.stages = stages_of(self.config, near)
+        self.stages = stages_of(self.config, self.near)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
         #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.

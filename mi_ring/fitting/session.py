@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import shutil
 import signal
 import tempfile
 import time
@@ -24,33 +23,33 @@ from mi_ring.system.optional import installed
 from mi_ring.system.progress import outliving_readers, progress
 
 CHECKPOINT_SECONDS = 30.0
-TELLING = 60  #: iterations: shorter fits do without measuring how long theirs take
-
+WORTH_MEASURING = 60  #: iterations: shorter fits do without knowing how long theirs take
 
 #: Signals that end a fit early: Ctrl-C, `kill` and schedulers, a terminal that is closed (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[Callable[[], int]]:
-    """Yields a function that tells which signal has come that ends a fit, 0: none. A second one ends it at once."""
+def heeding_signals() -> Iterator[Callable[[], int]]:
+    """Yields a function that tells which signal has come that ends a fit, 0: none. A second Ctrl-C ends it at once.
+
+    Shells, schedulers and the kernel send the others more than once.
+    """
     come: list[int] = []
 
-    def note(number: int, frame: object) -> None:
+    def hear(number: int, frame: object) -> None:
         come.append(number)
-        restore()
-        tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if len(come) == 1:
+            tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
 
     heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
-    before = {number: signal.signal(number, note) for number in heard}
+    before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield lambda: come[0] if come else 0
     finally:
-        restore()
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Keeper:
@@ -59,37 +58,61 @@ class Keeper:
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
         self.fit, self.folder, self.prepare = fit, folder, prepare
         self.files = digests(fit.capture, fit.config)
-        self.saved, self.failed = -math.inf, False
+        self.saved, self.failing = -math.inf, False
 
-    def note(self, it: Iteration) -> None:
+    def follow(self, it: Iteration) -> None:
         """Write log and checkpoint where they are due after this iteration: the first, each stage's last, in time."""
         log = self.fit.log
         if log and log[-1]["iteration"] == it.number:
             self.attempt(lambda: results.add_to_log(self.folder, log[-1]))
-        if it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS:
+        due = it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS
+        if due and it.number < self.fit.iterations:  # else it is written in any case
             self.attempt(self.checkpoint)
             self.saved = time.monotonic()
 
     def checkpoint(self) -> None:
-        """Write one now. Raises InputError if it cannot be written."""
+        """Write one now, and the whole log. Raises InputError or OSError if that is not possible."""
         if not self.folder.is_dir():  # somebody has removed it
             self.prepare()
-            results.write_log(self.folder, self.fit.log)
+        results.write_log(self.folder, self.fit.log)
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
         """A fit does not end for it."""
         try:
             write()
-        except InputError as error:
-            if not self.failed:
-                tqdm.write(f"{error}. Going on, and trying again")
-            self.failed = True
+        except (InputError, OSError) as error:
+            if not self.failing:
+                tqdm.write(f"{str(error).partition(';')[0]}; the fit goes on and tries again")
+            self.failing = True
+        else:
+            self.failing = False
+
+    def finish(self, fitted_scene: bytes) -> None:
+        """Write the results; if not where they were to go, then into a new folder among the system's temporary ones.
+
+        Raises InputError, even then, if they cannot be written where they were to go.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            results.write(self.folder, self.fit, fitted_scene)
+        except (InputError, OSError) as error:
+            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue()}") from error
+
+    def rescue(self) -> str:
+        """Write results and checkpoint elsewhere. Returns where they are, in words."""
+        try:
+            elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
+            results.save_fit(elsewhere, self.fit)
+            write_checkpoint(self.fit, self.files, elsewhere)
+        except (InputError, OSError):
+            return "what the last checkpoint there has is left, for --resume; make room or choose another place"
+        return f"the results are in {elsewhere} instead"
 
 
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
     """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
-    if costs is None and fit.iterations - fit.iteration >= TELLING:
+    if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration])
     work = [(costs or {}).get((s.level, s.width), 1.0) for s in fit.stages for _ in range(s.first, s.last)]
     bar = progress(
@@ -105,7 +128,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
-            keeper.note(it)
+            keeper.follow(it)
     keeper.checkpoint()
 
 
@@ -126,7 +149,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     iterations, if they have been measured already.
     """
     fitted_scene = results.fitted_scene(fit, folder)
-    with interruptible() as interrupted, outliving_readers():
+    with heeding_signals() as interrupted, outliving_readers():
         print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
         if fit.config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
@@ -137,29 +160,11 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
             results.write_inputs(folder / "inputs.png", fit)
+        keeper = Keeper(fit, folder, prepare)
         try:
-            train(fit, Keeper(fit, folder, prepare), interrupted, costs)
+            train(fit, keeper, interrupted, costs)
         except Exception:
-            write_somewhere(fit, folder, fitted_scene)
+            keeper.finish(fitted_scene)
             raise
-        write_somewhere(fit, folder, fitted_scene)
+        keeper.finish(fitted_scene)
     return interrupted() if fit.iteration < fit.iterations else 0
-
-
-def write_somewhere(fit: Fit, folder: Path, fitted_scene: bytes) -> None:
-    """Write the results; if not where they were to go, then into a new folder among the system's temporary ones.
-
-    Raises InputError, even then, if they cannot be written where they were to go.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        results.write(folder, fit, fitted_scene)
-    except (InputError, OSError):
-        elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{folder.name}-"))
-        try:
-            results.write(elsewhere, fit, results.fitted_scene(fit, elsewhere))
-            write_checkpoint(fit, digests(fit.capture, fit.config), elsewhere)
-            print(f"{folder}/: cannot be written; the results are in {elsewhere}/ instead")
-        except (InputError, OSError):
-            shutil.rmtree(elsewhere, ignore_errors=True)
-        raise

@@ -85,9 +85,12 @@ def add_to_log(folder: Path, entry: dict) -> None:
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The entries of log.jsonl; a line that was cut off when the process was killed is none."""
-    lines = (folder / "log.jsonl").read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("}\n")]
+    """The entries of log.jsonl; a line that was cut off, when the process was killed or the disk was full, is none."""
+    entries = []
+    for line in (folder / "log.jsonl").read_text().splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            entries.append(json.loads(line))
+    return entries
 
 
 def write_inputs(path: Path, fit: Any) -> None:

@@ -1,11 +1,13 @@
 """`ring.pt`: a reconstructed object as a file, its networks by their registered names."""
 
 import io
+import math
 import zipfile
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
+import trimesh
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
@@ -15,11 +17,12 @@ from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
 
 FORMAT = 4  #: version of the file
+FINEST, MOST_STEPS = 8, 10_000  #: level, Euler steps
 ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: Ring, config: dict | None = None) -> dict:
-    """What `ring.pt` holds, to be written by `torch.save`. Raises ValueError for networks that are not registered."""
+    """What `ring.pt` holds, to be written by `write_state`. Raises ValueError for networks that are not registered."""
     domain = None
     if not isinstance(ring.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
         domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
@@ -32,15 +35,47 @@ def ring_state(ring: Ring, config: dict | None = None) -> dict:
 
 
 def ring_of(state: dict) -> Ring:
-    """The inverse of `ring_state`. Raises InputError for networks that are not registered here."""
+    """The inverse of `ring_state`.
+
+    Raises InputError for networks that are not registered here; KeyError, RuntimeError, TypeError or ValueError for
+    what no `ring_state` can be.
+    """
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
+    for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
+        require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
     ring = Ring(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
         subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
+    require_sound(ring)
     return ring
+
+
+def require_sound(ring: Ring) -> None:
+    """Raise ValueError for an object that no fit has."""
+    for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
+        require(bool(value.isfinite().all()), f"{name} is not finite")
+    require(float(ring.radius) > 0, f"the radius is {float(ring.radius):.4g}")
+    require(type(ring.subdivisions) is int and 0 <= ring.subdivisions <= FINEST, f"level {ring.subdivisions}")
+    steps = getattr(ring.shape_net, "steps", 1)
+    require(type(steps) is int and 1 <= steps <= MOST_STEPS, f"{steps} steps")
+    require(ring.metres is None or 0 < ring.metres < math.inf, f"a unit of {ring.metres} m")
+    require(ring.ground is None or ring.ground.shape == (2, 3), "ground is no place and normal")
+    require(ring.up is None or (len(ring.up) == 3 and all(map(math.isfinite, ring.up))), "up is no direction")
+    require(isinstance(ring.bsdf, str), "the BSDF is no XML")
+    points, faces = ring.domain.points, ring.domain.faces
+    require(points.shape[1:] == faces.shape[1:] == (3,) and bool(np.isfinite(points).all()), "the domain is no mesh")
+    require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")
+    closed = trimesh.Trimesh(points, faces, process=False, validate=False).is_watertight
+    require(closed, "the domain is no closed surface")
+
+
+def require(condition: bool, otherwise: str) -> None:
+    """Raise ValueError unless it holds."""
+    if not condition:
+        raise ValueError(otherwise)
 
 
 def migrated(state: dict) -> dict:
@@ -59,9 +94,12 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
     """
     try:
         content = path.read_bytes()
+        whole = is_sealed(content)
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        if not is_sealed(content):
-            require_unsealed(content, state)
+        if isinstance(state, dict) and state.pop("sealed", False) and not whole:
+            raise ValueError("the seal is broken")
+        if not whole:
+            require_intact(content)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {advice}") from None
     except OSError as error:
@@ -74,10 +112,8 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
     return state
 
 
-def require_unsealed(content: bytes, state: Any) -> None:
-    """Raise ValueError unless this is a whole file of the time before there were seals."""
-    if isinstance(state, dict) and state.get("sealed"):
-        raise ValueError("the seal is broken")
+def require_intact(content: bytes) -> None:
+    """Raise ValueError if a part of a zip file is not as it was, as far as that tells."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if damaged := archive.testzip():
             raise ValueError(f"{damaged} is damaged")
@@ -102,5 +138,5 @@ def load_fit(path: str | Path) -> Ring:
         return ring_of(migrated(state) if version == 3 else state)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (AttributeError, IndexError, KeyError, TypeError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: damaged, or of other networks than it says ({error!r})") from error

@@ -49,31 +49,47 @@ def partial_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
-def write_file(path: Path, content: bytes | str) -> None:
-    """Write a file so that it is there whole or not at all. Raises InputError if it cannot be written."""
+def write_file(path: Path, content: bytes | str, durable: bool = False, keep: Path | None = None) -> None:
+    """Write a file so that it is there whole or not at all. Raises InputError if it cannot be written.
+
+    `durable`: even after a power cut, which takes a while. `keep`: what was there before goes there.
+    """
     partial = partial_path(path)
     with writing(path):
         try:
             with partial.open("wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
-                file.flush()
-                os.fsync(file.fileno())  # else after a power cut a name may be there without its content
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            if keep:
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(path, keep)
             os.replace(partial, path)
-            if os.name == "posix":
-                folder = os.open(path.parent, os.O_RDONLY)
-                try:
-                    os.fsync(folder)
-                finally:
-                    os.close(folder)
+            if durable:
+                sync_folder(path.parent)
         finally:
             partial.unlink(missing_ok=True)
 
 
-def write_state(state: dict, path: Path) -> None:
-    """`torch.save`, whole or not at all, and sealed: `read_state` notices each bit that is not as it was."""
+def sync_folder(folder: Path) -> None:
+    """Have its names outlive a power cut, where the system can: not on Windows, nor on all that is mounted."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
+    """`torch.save`, whole or not at all, and sealed: `read_state` notices each bit that is not as it was.
+
+    `keep`: what was there before goes there.
+    """
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
-    write_file(path, sealed(buffer.getvalue()))
+    write_file(path, sealed(buffer.getvalue()), durable=True, keep=keep)
 
 
 def sealed(archive: bytes) -> bytes:
@@ -81,16 +97,16 @@ def sealed(archive: bytes) -> bytes:
     end = archive.rindex(END)
     assert end + COMMENT + 2 == len(archive), "has a comment already"
     body = archive[: end + COMMENT] + (len(SEAL) + DIGEST).to_bytes(2, "little")
-    return body + SEAL + digest(body)
+    return body + SEAL + fingerprint(body)
 
 
 def is_sealed(archive: bytes) -> bool:
     """Is it a zip file as `sealed` gave it, every bit of it?"""
     body = archive[: -len(SEAL) - DIGEST]
-    return archive[len(body) :] == SEAL + digest(body)
+    return archive[len(body) :] == SEAL + fingerprint(body)
 
 
-def digest(content: bytes) -> bytes:
+def fingerprint(content: bytes) -> bytes:
     """Of some bytes, in hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 

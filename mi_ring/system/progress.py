@@ -1,6 +1,7 @@
 """How far something is."""
 
 import contextlib
+import errno
 import io
 import math
 import os
@@ -20,20 +21,20 @@ PATIENCE, QUIET = 2.0, 30.0  #: seconds before something is shown, and between t
 def outliving_readers() -> Iterator[None]:
     """Within it nobody need read on what is printed: `| head`, a terminal that is closed. It is dropped then."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(Dispensable, before)  # type: ignore[assignment]
+    sys.stdout, sys.stderr = (stream and Dispensable(stream) for stream in before)  # None: there is no console
     try:
         yield
     finally:
-        for stream in (sys.stdout, sys.stderr):
+        for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()
         sys.stdout, sys.stderr = before
 
 
-class Dispensable(io.TextIOBase):
-    """A stream of text; from the moment that it cannot be written it goes nowhere."""
+class Dispensable:
+    """A stream of text, of which what cannot be written is dropped; all from then on, if nobody is there any more."""
 
     def __init__(self, stream: Any) -> None:
-        self.stream = stream  # None where a program has no console
+        self.stream = stream
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
@@ -45,21 +46,16 @@ class Dispensable(io.TextIOBase):
 
     def flush(self) -> None:
         """Flush it, if that is possible."""
-        self.attempt(lambda: self.stream.flush())
+        self.attempt(self.stream.flush)
 
     def attempt(self, output: Callable[[], object]) -> None:
-        """Try it; once it fails all that is written to the same file, now and later, is dropped."""
-        if self.stream is None:
-            return
+        """Try it."""
         try:
             output()
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
-
-    def isatty(self) -> bool:
-        """Is it a terminal?"""
-        return self.stream is not None and self.stream.isatty()
+        except OSError as error:
+            if error.errno in (errno.EPIPE, errno.EIO):  # else what is left to be written fails again at the very end
+                with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
+                    os.dup2(nowhere.fileno(), self.stream.fileno())
 
 
 class Lines(io.TextIOBase):
