@@ -27,7 +27,13 @@ def main(arguments: Sequence[str]) -> None:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in FORMATS:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
-    frames = list(source.frames())
+    try:
+        frames = list(source.frames())
+    except InputError:
+        raise
+    except Exception as error:  # whatever files of strangers do to those who read them
+        what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise InputError(f"{source.src}: SRC: is damaged, or not of this format ({what})") from error
     if source.left_out and not frames:
         raise InputError(f"{source.src}: SRC: none of {len(source.left_out)} photographs has a pose")
     require_frames(frames, source.src)

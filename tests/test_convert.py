@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from mi_ring import convert, images
 from mi_ring.capture import loading
 from mi_ring.errors import InputError
+from mi_ring.importers import colmap as importer
 from mi_ring.rendering import pinhole
 from mi_ring.system import command
 
@@ -315,6 +316,25 @@ def test_colmap(colmap, tmp_path, model):
     np.testing.assert_allclose(lights.rgb()[:, 0], [0.5, 1.0, 1.5], rtol=1e-5)
     assert (tmp_path / "scan/images/sub_1.jpg").read_bytes() == (colmap / "images/sub/1.jpg").read_bytes()
     assert (scene.masks[2] == disc()[..., 0]).all()
+
+
+def test_a_model_that_keeps_its_reader_busy_for_ever_is_refused(colmap, tmp_path, monkeypatch):
+    """The number of frames, with a bit too many: COLMAP's own reader goes through 2^40 of them."""
+    path = next(colmap.rglob("frames.bin"))
+    content = bytearray(path.read_bytes())
+    content[5] = 1
+    path.write_bytes(content)
+    monkeypatch.setattr(importer, "PATIENCE", 3.0)
+    with pytest.raises(InputError, match="not a COLMAP model, or damaged"):
+        convert.main(["colmap", str(path.parent), str(tmp_path / "scan.xml"), "--images", str(colmap / "images")])
+    assert not (tmp_path / "scan.xml").exists()
+
+
+def test_what_strangers_files_do_to_their_readers_is_one_line(colmap, tmp_path, monkeypatch):
+    for error in (OverflowError("int too large"), KeyError(3), UnicodeDecodeError("utf-8", b"x", 0, 1, "bad")):
+        monkeypatch.setattr(importer.Colmap, "posed", lambda self, error=error: (_ for _ in ()).throw(error))
+        with pytest.raises(InputError, match=f"SRC: is damaged, or not of this format .{type(error).__name__}"):
+            convert.main(["colmap", str(colmap), str(tmp_path / "scan.xml")])
 
 
 def test_colmap_without_masks_and_exif(colmap, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.images import contrasted, linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.plugins.properties import LARGEST
 
 
 def decode(
@@ -57,8 +58,8 @@ def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
     if pixels.shape[1::-1] != sensor.size:
         found, expected = ("{} x {}".format(*size) for size in (pixels.shape[1::-1], sensor.size))
         raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
-    if not np.isfinite(pixels).all():
-        raise InputError(f"{path}: {field}: contains NaN or infinite pixels")
+    if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
+        raise InputError(f"{path}: {field}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
 
 

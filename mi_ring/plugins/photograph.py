@@ -11,6 +11,7 @@ from mi_ring.plugins.properties import beside_scene, number
 from mi_ring.rendering.pinhole import camera_ray
 
 SHUTTER = -1.0  #: time of a photograph's rays, by which the flash knows them from those of other sensors (0 and later)
+FARTHEST = 50  #: sizes of the film from which a principal point may be
 
 
 class Photograph(mi.Sensor):
@@ -117,6 +118,10 @@ class Photograph(mi.Sensor):
         width, height = (int(s) for s in self.film().size())
         self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))
         self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
+        if (far := np.abs(np.ravel(self.centre) / [width, height])).max() > FARTHEST:
+            name = ("cx", "cy")[int(far.argmax())]
+            raise ValueError(f'photograph "{props.id()}": {name} is {number(props, name):g}, which is more than '
+                             f"{FARTHEST} times its film away; is it in pixels?")  # fmt: skip
         self.distortion = mi.Float(number(props, "distortion", 0.0))
         least, most = distortion_range(np.ravel(self.focal), np.ravel(self.centre), np.array([width, height]))
         if not least <= self.bend <= most:

@@ -11,12 +11,19 @@ def beside_scene(name: str) -> Path:
     return Path(str(mi.file_resolver()[0])) / name
 
 
+LARGEST = 1e18  #: number whose square is finite in float32, in which all is computed
+
+
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """A property of a plugin that is a finite number. Raises ValueError, which names it, if it is anything else."""
+    """A property of a plugin that is a finite number, and so are its square and, if it must be positive, its inverse.
+
+    Raises ValueError, which names it, if it is anything else.
+    """
     value = props.get(name, default)
-    if isinstance(value, int | float) and np.isfinite(value) and (value > 0 or not positive):
+    least = 1 / LARGEST if positive else -LARGEST
+    if isinstance(value, int | float) and least <= value <= LARGEST:
         return float(value)
-    wanted = "a positive number" if positive else "a number"
+    wanted = f"a positive number, {1 / LARGEST:g} to {LARGEST:g}" if positive else "a number"
     raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {value}, must be {wanted}')
 
 
@@ -40,6 +47,6 @@ def number_list(props, name: str, count: int) -> list[float]:
         values = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         values = []
-    if len(values) == count and np.isfinite(values).all():
+    if len(values) == count and (np.abs(values) <= LARGEST).all():
         return values
     raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is "{text[:60]}", must be {count} numbers')
