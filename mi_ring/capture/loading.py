@@ -105,14 +105,13 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
 
 def require_xml(path: Path) -> None:
     """Raise InputError for what Mitsuba reads and others do not, and for what it takes to be at the origin silently."""
-    path.read_text("utf-8")
+    content = path.read_bytes()
+    content.decode("utf-8")
     try:
-        root = ElementTree.parse(path).getroot()
+        root = ElementTree.fromstring(content)
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # of XML, of an encoding that is unknown
         raise InputError(f"{path}: is no XML ({error}); give the XML file of a scene, in UTF-8") from error
-    for sensor in root.iter("sensor"):
-        if sensor.get("type") != "photograph":
-            continue
+    for sensor in root.iterfind(".//sensor[@type='photograph']"):
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:
             raise InputError(f"{name}: to_world is missing; say where its camera is")

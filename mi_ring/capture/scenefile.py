@@ -192,7 +192,7 @@ def remasked_xml(scene: bytes, sensors: Sequence, masks: Mapping[int, str]) -> b
 
 def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]]:
     """The photographs of a scene file, each with the index of its sensor: by name; unnamed ones in order."""
-    elements = [element for element in root.iter("sensor") if element.get("type") == "photograph"]
+    elements = root.findall(".//sensor[@type='photograph']")
     named = {sensor.id(): k for k, sensor in enumerate(sensors)}
     numbered = zip(elements, range(len(sensors)), strict=True)
     return [(element, named.get(element.get("id", ""), k)) for element, k in numbered]
