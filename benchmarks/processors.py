@@ -1,10 +1,10 @@
-"""Print, as Markdown, what an iteration of each stage takes on this processor, and as if it had AVX2 alone.
+"""Print, as Markdown, what an iteration of each stage takes on this processor, and as if it had less of one.
 
     python benchmarks/processors.py [SCENE.xml]
 
 The stages are those of the default preset; the first line is the floor, 642 vertices and photographs 128 pixels wide.
 As far as PyTorch goes a server then behaves like a laptop; Dr.Jit's kernels stay as they are. Each line is a process of
-its own, the two kinds in turn; speed is that of a float32 product of 4096³ in the same process.
+its own, the kinds in turn; speed is that of a float32 product of 4096³ in the same process.
 """
 
 import argparse
@@ -19,7 +19,9 @@ from mi_ring.fitting.config import Config
 
 STAGES = (3, 128), (4, 128), (5, 256), (6, 512)  #: level and width
 AVX2 = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
-KINDS: dict[str, dict[str, str]] = {"as it is": {}, "AVX2 alone": AVX2}
+KINDS: dict[str, dict[str, str]] = {
+    "as it is": {}, "without AMX": {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE"}, "AVX2 alone": AVX2,
+}  # fmt: skip
 
 
 def one(scene: Path, settings: dict, variables: dict[str, str]) -> dict:

@@ -19,6 +19,17 @@ from mi_ring.doctor import OPTIONAL
 SHARED = Path(__file__).parents[2] / "shared"
 
 
+def pytest_addoption(parser):
+    parser.addoption("--variant", help="of Mitsuba, another than llvm_ad_rgb: for tests of rendering on a GPU")
+
+
+def pytest_configure(config):
+    if variant := config.getoption("--variant"):
+        import mitsuba as mi
+
+        mi.set_variant(variant)
+
+
 @pytest.fixture(autouse=True)
 def no_scenes_of_other_tests():
     """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others."""

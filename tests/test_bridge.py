@@ -1,6 +1,8 @@
 """Gradients of `bridge.render` against central finite differences with the same seed."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -13,6 +15,7 @@ import trimesh
 from mi_ring.rendering import bridge, photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.ring import Ring
+from mi_ring.system import machine
 
 WIDTH, HEIGHT, COUNT = 35, 25, 2  # [px], photographs
 CENTER = np.array([0.3, -0.2, 0.15])
@@ -79,7 +82,7 @@ class Setting:
 
 
 def tensor(array):
-    return torch.tensor(np.asarray(array), dtype=torch.float32)
+    return torch.tensor(np.asarray(array), dtype=torch.float32, device=machine.device())
 
 
 #: Motions (V, 3) of the vertices at domain points s [units per step].
@@ -135,7 +138,7 @@ def test_long_edges_seen_from_a_slant():
     ico = trimesh.creation.icosphere(subdivisions=0)
     vertices = tensor(CENTER + ico.vertices * [0.5, 0.5, 1.9])
     setting.surface.set_faces(ico.faces)
-    full = torch.full
+    full = partial(torch.full, device=machine.device())
     setting.material = {"diffuse": full((12, 3), 0.4), "specular": full((12,), 0.1), "roughness": full((12,), 0.4)}
     motion = tensor(ico.vertices[:, 2:] * [0.3, 0.4, 1])  # most for the vertices nearest to the camera and farthest
     gradients, differences = [], []
@@ -197,7 +200,7 @@ def test_pictures_do_not_depend_on_whether_gradients_are_wanted():
     drawn = bridge.draw(*args, 4, 9)
     for a, b, c in zip(with_gradients, plain, drawn):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(b, c, rtol=0, atol=0)
+        torch.testing.assert_close(b.cpu(), c, rtol=0, atol=0)
     rgb, alpha = drawn
     assert rgb.shape == (COUNT, HEIGHT, WIDTH, 3) and alpha.shape == (COUNT, HEIGHT, WIDTH)
     assert 0.1 < alpha.mean() < 0.9
@@ -219,7 +222,7 @@ def test_new_faces_come_with_new_vertices_and_attributes():
     pictures = []
     for level in (3, 5):
         ico = trimesh.creation.icosphere(subdivisions=level)
-        full, count = torch.full, len(ico.vertices)
+        full, count = partial(torch.full, device=machine.device()), len(ico.vertices)
         setting.surface.set_faces(ico.faces)
         material = {"diffuse": full((count, 3), 0.4), "specular": full((count,), 0.1), "roughness": full((count,), 0.4)}
         args = setting.surface, setting.photographs, tensor(CENTER + 0.8 * ico.vertices), material
@@ -312,3 +315,14 @@ def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
     ours, theirs = (np.array(mi.render(scene, sensor=1, integrator=mi.load_dict({"type": "direct"}), spp=4))
                     for scene in (surface.scene, setting.scene))  # fmt: skip
     assert np.abs(ours - theirs).max() > 0.1 and ours.max() > 0.1  # another ball, lit by the same light
+
+
+def test_the_backward_pass_may_be_taken_by_another_thread():
+    """As torch does on a GPU: always by the same one, for which Dr.Jit counts scopes of its own."""
+    setting, gradients, other = Setting(OFF_CAMERA, shadows=True), [], ThreadPoolExecutor(1)
+    for run in (lambda backward: backward(), *[lambda backward: other.submit(backward).result()] * 2):
+        vertices = setting.vertices.clone().requires_grad_()
+        run(setting.losses(vertices, setting.material, 4, 3)[0].backward)
+        gradients.append(vertices.grad)
+    for gradient in gradients[1:]:
+        torch.testing.assert_close(gradient, gradients[0], rtol=1e-4, atol=1e-3)

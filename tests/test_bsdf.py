@@ -11,6 +11,7 @@ from scipy.special import erf
 
 from mi_ring.plugins.cooktorrance import CookTorrance
 from mi_ring.rendering.attributes import require_attributes
+from mi_ring.system import machine
 
 CONTEXT = mi.BSDFContext()
 DISTRIBUTIONS = ["ggx", "beckmann"]
@@ -241,7 +242,9 @@ def test_specular_part_is_four_times_roughconductor(r, distribution):
     i, o = pairs(r, distribution, 5)
     stock = mi.load_dict({"type": "roughconductor", "distribution": distribution, "material": "none", "alpha": r})
     bsdf = cooktorrance([0, 0, 0], 0.15, r, distribution)
-    np.testing.assert_allclose(evaluate(bsdf, i, o), 4 * 0.15 * evaluate(stock, i, o), rtol=1e-5, atol=1e-7)
+    # Stock Fresnel of a mirror is sqrt(0) off 1: on a GPU, at 45 degrees, the root of a rounding error.
+    rtol = 1e-5 if machine.device().type == "cpu" else 1e-3
+    np.testing.assert_allclose(evaluate(bsdf, i, o), 4 * 0.15 * evaluate(stock, i, o), rtol=rtol, atol=1e-7)
     np.testing.assert_allclose(density(bsdf, i, o), density(stock, i, o), rtol=1e-5, atol=1e-7)
 
 
@@ -299,7 +302,7 @@ def test_white_furnace(r, distribution):
         assert (reflected <= 4 * specular * (1 + 1e-5)).all()
         if angle < 90:
             weight = np.array(draw(both, o, 40_000)[1]).T
-            assert (weight.mean(0) <= bound + 4 * weight.std(0) / 200).all()
+            assert (weight.mean(0) <= (bound + 4 * weight.std(0) / 200) * (1 + 1e-6)).all()
         if angle == 0 and r < 0.1:
             assert (reflected >= 4 * specular * 0.99).all()
 

@@ -22,7 +22,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GP
 
 
 def test_seam_copies_nothing():
-    tensor = torch.arange(15.0).reshape(5, 3)
+    tensor = torch.arange(15.0, device=machine.device()).reshape(5, 3)
     array = bridge.to_drjit(tensor)
     assert bridge.to_torch(array).data_ptr() == tensor.data_ptr()
     assert bridge.to_torch(array).tolist() == tensor.flatten().tolist()
@@ -48,13 +48,20 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
     assert all(p.grad.is_meta for p in (*net.parameters(), *brdf_net.parameters(), images, masks))
 
 
-@pytest.mark.parametrize("amx", [True, False])
-def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, monkeypatch):
+@pytest.mark.parametrize(
+    "amx, told, expected",
+    [(True, None, True), (False, None, False), (True, "AVX512_CORE", False), (True, "avx512_core_amx", True)],
+)
+def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, told, expected, monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
-    for precision, expected in (("auto", amx), ("bfloat16", True), ("float32", False)):
+    if told:
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
+    else:
+        monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    for precision, used in (("auto", expected), ("bfloat16", True), ("float32", False)):
         with machine.autocast(precision, torch.device("cpu"))():
-            assert torch.is_autocast_enabled("cpu") == expected
+            assert torch.is_autocast_enabled("cpu") == used
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")
@@ -65,6 +72,7 @@ def test_without_a_gpu_the_fit_says_so_and_goes_on(small_capture, tmp_path, caps
     assert '"variant": "llvm_ad_rgb"' in (tmp_path / "run" / "config.json").read_text()
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")
 def test_without_a_working_gpu_driver_the_fit_goes_on(monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(dr, "has_backend", lambda backend: False)

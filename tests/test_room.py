@@ -17,6 +17,7 @@ from mi_ring.rendering import bridge, indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_photographs
 from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, frames_of, room_of
+from mi_ring.system import machine
 
 LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value": i}}
           for p, i in zip([[0.9, 0.5, 2.0], [-0.6, 0.3, 1.2]], INTENSITY.tolist())]  # fmt: skip
@@ -157,9 +158,9 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     path = mi.load_dict({"type": "path", "max_depth": 5, "rr_depth": 100})
     observed = np.stack([np.array(mi.render(lit, sensor=k, integrator=path, spp=256, seed=k))[..., :3] for k in (0, 1)])
     observed[:, ::9, ::7] *= 30
-    observed = torch.from_numpy(observed)
-    direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0)))
-    room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames)
+    observed = torch.from_numpy(observed).to(machine.device())
+    direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0))).to(machine.device())
+    room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None)
     for seed in range(12):
         around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=True)

@@ -160,7 +160,7 @@ def framed(camera: Camera, ring: Ring, up: np.ndarray) -> tuple[Camera, np.ndarr
     """
     s = ring.domain.sample(3)[0].numpy()
     points = np.concatenate([flowed(ring, s, time) for time in (0.0, 1.0)]).astype(float)
-    points = ring.center.numpy() + float(ring.radius) * points
+    points = ring.center.cpu().numpy() + float(ring.radius) * points
     middle = (points[len(s) :].min(0) + points[len(s) :].max(0)) / 2
     to_world = camera.to_world.astype(float)
     distance = np.linalg.norm(camera.position - middle)

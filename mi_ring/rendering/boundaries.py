@@ -52,8 +52,10 @@ def boundary(scene, photographs, curve: Curve, seed, shadows, window):
         view = dr.gather(mi.UInt32, curve.view, pair)
         pixel = dr.gather(mi.Point2f, q, pair) + sign * dr.gather(mi.Vector2f, shift, pair)
         ray = mi.Ray3f(*camera_ray(*photographs.camera(view), pixel))
+        # Where there is no edge rays may not be finite, which OptiX must not meet.
+        meant = dr.gather(mi.Bool, active, pair)
         # The same random numbers on both sides: only what jumps must differ.
-        sides = trace(scene, ray, view, photographs, shadows, next_2d(seed, 2 * n, pair))
+        sides = trace(scene, ray, view, photographs, shadows, next_2d(seed, 2 * n, pair), meant)
         dr.eval(sides)
         before = 2 * dr.arange(mi.UInt32, n)
         jumps = [dr.gather(mi.Float, s, before, active) - dr.gather(mi.Float, s, before + 1, active) for s in sides]

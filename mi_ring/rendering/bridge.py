@@ -1,5 +1,6 @@
 """The one seam between torch and Dr.Jit: from torch tensors to photographs, and the gradients back."""
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -132,6 +133,7 @@ class _Render(torch.autograd.Function):
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows, edges)
         dr.eval(channels)
         ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *tensors)])
+        ctx.thread = threading.get_ident()
         return pictures([to_torch(channel) for channel in channels], photographs)
 
     @staticmethod
@@ -143,6 +145,8 @@ class _Render(torch.autograd.Function):
         if surface.written != written:
             raise RuntimeError("the surface was written again since this picture: call backward before the next one")
         ctx.save = None  # Dr.Jit's graph is used up
+        if ctx.thread != threading.get_ident():  # torch has one of its own for a GPU
+            dr.detail.new_scope(dr.backend_v(mi.Float))
         for channel, grad in zip(channels, (*rgb_grad.unbind(-1), alpha_grad)):
             if dr.grad_enabled(channel):
                 dr.set_grad(channel, to_drjit(grad))

@@ -70,11 +70,11 @@ def next_2d(seed, lanes, stream=None):
     return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-def trace(scene, ray, view, photographs, shadows, next_2d):
-    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph."""
+def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
+    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph; zero where not `active`."""
     shadows = shadows and not photographs.colocated
-    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     dr.eval(hit)  # one traversal serves the image and its gradient
-    si = hit.compute_surface_interaction(ray)
+    si = hit.compute_surface_interaction(ray, active=active)
     radiance = shade(scene, si, lambda si: photographs.light(view, si), next_2d, shadows)
     return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]

@@ -32,9 +32,10 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    # With AVX512-BF16 alone it is half as fast as float32. PyTorch can be told to do without what there is.
-    told = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
-    return told and torch.cpu._is_amx_tile_supported()
+    # With AVX512-BF16 alone it is half as fast as float32. PyTorch and oneDNN can be told to do without what there is.
+    told = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
+    allowed = torch.backends.cpu.get_cpu_capability().startswith("AVX512") and (told == "DEFAULT" or "AMX" in told)
+    return allowed and torch.cpu._is_amx_tile_supported()
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
