@@ -61,7 +61,7 @@ def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
     np.testing.assert_allclose(np.array(si.t), 1, rtol=1e-5)
     srgb = np.array([10, 250, 90]) / 255
     linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(np.array(table.bsdf().eval_diffuse_reflectance(si)).ravel(), linear, atol=2e-3)
+    np.testing.assert_allclose(np.array(table.bsdf().eval_diffuse_reflectance(si)).ravel(), linear, atol=4e-3)
 
 
 @pytest.mark.parametrize("more", ["", ROOM], ids=["dark", "room"])
