@@ -30,7 +30,7 @@ from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.lights import Lights
 
-REFINED = "cameras", "light", "power", "curve", "contrast"
+WRONG = "cameras", "light", "power", "curve", "contrast"
 CURVES = {"curve": "gamma", "contrast": "contrast"}  #: as photographs call them
 #: The paper's Table 3, its bunny with a poor calibration: normals, depth, and PSNR of photographs, it says not which.
 PAPER = {"wrong": "10.3°, 1.34 %, 25.6 dB", "refined": "6.60°, 0.65 %, 32.9 dB"}
@@ -71,7 +71,7 @@ def write(capture, path: Path) -> None:
     root = ElementTree.parse(capture.path).getroot()
     move_names(root, capture.path.parent, path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.sensors))
+    path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.sensors, capture.photographs.room))
 
 
 def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list[str]) -> dict:
@@ -115,7 +115,7 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("captures", nargs="+", type=scene_file)
-    parser.add_argument("--wrong", choices=REFINED, required=True)
+    parser.add_argument("--wrong", choices=WRONG, required=True)
     parser.add_argument("--by", type=float, default=0.5)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--fits", nargs="+", choices=tuple(FITS), default=list(FITS))
@@ -128,17 +128,18 @@ def main() -> None:
         for seed in options.seeds:
             folder = options.out / f"{name}_{options.wrong}_{options.by}_{seed}"
             wrong = perturbed(true, options.wrong, options.by, seed)
-            write(true, folder / "exact.xml")
+            exact = options.out / f"{name}_exact.xml"
+            write(true, exact)
             write(wrong, folder / "wrong.xml")
             cells, found = [f"{name}, seed {seed}"], wrong
             for fit in options.fits:
                 is_wrong, is_refined = FITS[fit]
                 # Of exact calibration there is one fit, whatever else is wrong.
                 out = folder / fit if fit != "exact" else options.out / f"{name}_exact_{seed}"
-                scene = folder / ("wrong.xml" if is_wrong else "exact.xml")
+                scene = folder / "wrong.xml" if is_wrong else exact
                 refine = [options.wrong] if is_refined else ["none"]
                 numbers = fitted(scene, out, truth, refine, [*rest, "--seed", str(seed)])
-                cells.append("{normal_mean:.2f}°, {depth_mean:.2f} %, {psnr_novel:.1f} dB".format(**numbers))
+                cells.append("{normal_mean:.2f}°, {depth_mean:.3f} %, {psnr_novel:.1f} dB".format(**numbers))
                 if fit == "refined":
                     found = mi_ring.load_capture(out / "scene.xml", images=False)
             cells.append(f"{left(true, wrong, options.wrong):.3f}")

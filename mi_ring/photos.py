@@ -211,6 +211,9 @@ def make(config: PhotosConfig, scene: Path) -> None:
     flash = flash_of(pictures, motion, found, offset, sheet) if sheet else None
     if flash:
         print(flash_report(flash, motion, found))
+    if not flash and not offset.any() and len({picture.held for picture in pictures}) > 1:
+        print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
+              "about where it is: --flash-offset")  # fmt: skip
     taken = shots(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")

@@ -1,5 +1,6 @@
 """Cameras, lights and curve as unknowns: their gradients, what they do to a capture, and whether fits find them."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -331,6 +332,40 @@ def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_ca
             calibration.light[0] = tensor([0.5, -0.3, 0.2])
     upright, held = (calibration().places.detach().numpy() for calibration in both)
     np.testing.assert_allclose(held, upright, rtol=1e-5, atol=1e-4)
+    for calibration in both:  # where the flash is said to be
+        np.testing.assert_allclose(calibration.level, FLASH, atol=1e-3)
+
+
+def test_powers_of_the_photographs_that_are_fitted_have_the_mean_one(small_capture):
+    """Of the others nobody knows: they must not take part in what keeps brightness and albedo apart."""
+    capture, fitted = mi_ring.load_capture(small_capture), np.array([0, 1, 3, 4, 5, 6, 8, 9, 10, 11])
+    calibration, random = Calibration(capture, ("power",), CENTER, 0.3, fitted=fitted), np.random.default_rng(2)
+    found = random.normal(2, 1, (12, 3))
+    found[[2, 7]] = 0  # as without a gradient
+    with torch.no_grad():
+        calibration.power.copy_(tensor(found))
+    factors = (calibration().strengths / calibration.base.strengths).detach().numpy()
+    np.testing.assert_allclose(np.exp(np.log(factors[fitted]).mean(0)), 1, rtol=1e-5)
+    np.testing.assert_allclose(factors[[2, 7]], 1, rtol=1e-6)
+    np.testing.assert_allclose(factors[3] / factors[0], np.exp(0.1 * (found[3] - found[0])), rtol=1e-4)
+
+
+def test_names_of_unknowns_are_checked_from_python_too():
+    for wrong in (("pose",), "cameras", ("none", "light")):
+        with pytest.raises(InputError, match=r"--refine: is .*, must be "):
+            Config(refine=wrong)
+
+
+def test_a_light_that_is_referred_to_is_replaced(small_capture):
+    """Also one that has all of it in attributes of its own, which as XML has no children."""
+    capture = mi_ring.load_capture(small_capture, images=False)
+    root = ElementTree.fromstring(small_capture.read_bytes())
+    sensor = root.find("sensor")
+    sensor.remove(sensor.find("emitter"))
+    ElementTree.SubElement(root, "emitter", type="flash", id="lamp")
+    ElementTree.SubElement(sensor, "ref", id="lamp")
+    written = ElementTree.fromstring(recalibrated_xml(ElementTree.tostring(root), capture.sensors)).find("sensor")
+    assert len(written.findall("emitter")) == 1 and written.find("ref") is None
 
 
 def test_prior_expects_one_half_of_each_unknown(small_capture):
@@ -382,12 +417,12 @@ def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(
     capture = mi_ring.load_capture(small_capture)
     calibration = Calibration(capture, ("curve",), CENTER, 0.3)
     radiance, ones = torch.tensor([[0.0, 1e-6, 0.01, 0.3, 0.7]], requires_grad=True), torch.ones(1)
-    np.testing.assert_allclose(calibration.curved(radiance, ones).detach(), radiance.detach())
+    np.testing.assert_allclose(calibration.curve_now.curved(radiance, ones).detach(), radiance.detach())
     with torch.no_grad():
         calibration.curve.fill_(-1.5)
     gamma = np.exp(-1.5 * 0.2)
     expected = 0.3 * (np.array([0.01, 0.3, 0.7]) / 0.3) ** gamma
-    recorded = calibration.curved(radiance, ones)
+    recorded = calibration.curve_now.curved(radiance, ones)
     np.testing.assert_allclose(recorded[0, 2:].detach(), expected, rtol=1e-5)
     recorded.sum().backward()
     assert radiance.grad.isfinite().all()
@@ -421,12 +456,30 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
     odds = (v / (1 - v)) ** (1.2 * contrast)
     np.testing.assert_allclose(linear_to_srgb(file), odds / (1 + odds), rtol=1e-4)
     as_given, _ = decode(file.astype(np.float32), True, 2.0, 1.3, 1.2)
-    curved = calibration.curved(tensor(radiance)[None], torch.tensor([1.3]))
+    curved = calibration.curve_now.curved(tensor(radiance)[None], torch.tensor([1.3]))
     np.testing.assert_allclose(curved[0].detach(), as_given, rtol=1e-4)
-    np.testing.assert_allclose(calibration.straight(curved.detach(), torch.tensor([1.3]))[0], radiance, rtol=1e-4)
+    straight = calibration.curve_now.straight(curved.detach(), torch.tensor([1.3]))
+    np.testing.assert_allclose(straight[0], radiance, rtol=1e-4)
     many = torch.tensor([[0.0, 1e-8, 1e-3, 0.4, 0.99, 1.0, 1.7]], requires_grad=True)
-    calibration.curved(many, torch.tensor([1.3])).sum().backward()
+    calibration.curve_now.curved(many, torch.tensor([1.3])).sum().backward()
     assert many.grad.isfinite().all() and (many.grad > 0).all() and calibration.contrast.grad.isfinite()
+
+
+@pytest.mark.parametrize("name", ["curve", "contrast", "vignetting"])
+def test_gradients_of_what_is_recorded_equal_finite_differences(small_capture, name):
+    calibration = Calibration(mi_ring.load_capture(small_capture), (name,), CENTER, 0.3)
+    random = np.random.default_rng(4)
+    radiance, weights = (tensor(random.uniform(0.02, 0.9, (2, 40, 56, 3))) for _ in range(2))
+    unknown = getattr(calibration, name)
+
+    def loss(value):
+        with torch.no_grad():
+            unknown.fill_(value)
+        return (weights * calibration.recorded(radiance, [3, 1], 1)).double().sum()
+
+    loss(0.4).backward()
+    difference = (loss(0.5) - loss(0.3)).item() / 0.2
+    assert abs(difference) > 1 and unknown.grad.item() == pytest.approx(difference, rel=5e-3)
 
 
 def test_calibration_survives_the_scene_file(small_capture, tmp_path):
@@ -499,6 +552,24 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
     monkeypatch.setattr(holdout, "unexplained", unexplained)
     assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": ["curve"]}
     assert state() == (1.0, 0.0)
+    # What was not found is not put back.
+    assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": []}
+
+
+def test_a_fit_says_what_photographs_that_are_kept_out_say(small_capture, tmp_path):
+    """To its end, with what is shared, what is of each photograph, and what is solved for; and without any of it."""
+    tiny = ["--iterations", "10", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2",
+            "--holdout", "5"]  # fmt: skip
+    for refine in (["light", "power", "scale", "ambient"], ["none"]):
+        out = tmp_path / refine[0]
+        assert fit.main([str(small_capture), "--out", str(out), *tiny, "--refine", *refine]) == 0
+        record = json.loads((out / "calibration.json").read_text())
+        assert 0 < record["held_out"]["unexplained"] < 1
+        assert set(record["held_out"]["put_back"]) <= {"light", "scale", "ambient"}
+        assert ("before" in record["held_out"]) == (refine != ["none"])
+        assert "of the object&#39;s light in them is unexplained" in (out / "report.html").read_text()
+        lit = [name for name, entry in record["photographs"].items() if "power" in entry]
+        assert len(lit) == (10 if "power" in refine else 0) and not {"002", "007"} & set(lit)
 
 
 def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_capture, tmp_path):

@@ -343,13 +343,18 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
     assert report.shift(blob(0, 0), 0 * blob(0, 0), inside) is None
 
 
+def panel(fit, k):
+    """The row of photograph `k` in the report."""
+    return report.panel_of(fit, fit.capture, k, report.predicted(fit, fit.capture, k))[0]
+
+
 def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capture, broken_capture, monkeypatch):
-    good = [report.panel_of(fitted, fitted.capture, k)[0] for k in range(12)]
+    good = [panel(fitted, k) for k in range(12)]
     assert not report.fit_findings(good, 50, 50)
     path, edit = broken_capture
     edit('name="cx" value="30.5"', 'name="cx" value="32.5"', count=-1)
     monkeypatch.setattr(fitted, "capture", load_capture(path))
-    moved = [report.panel_of(fitted, fitted.capture, k)[0] for k in range(12)]
+    moved = [panel(fitted, k) for k in range(12)]
     found = [found for found in report.fit_findings(moved, 50, 50) if "cx and cy" in found]
     assert len(found) == 1 and re.search(r"(1\.[5-9]|2\.[0-5]) px to the left and 0\.[0-2] px", found[0])
 
@@ -363,7 +368,7 @@ def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monk
     image[tuple(inside[: len(inside) // 4].T)] = 255
     Image.fromarray(image).save(path.parent / "images" / "003.png")
     monkeypatch.setattr(fitted, "capture", load_capture(path))
-    assert report.panel_of(fitted, fitted.capture, 3)[0].saturated == pytest.approx(0.25, abs=0.01)
+    assert panel(fitted, 3).saturated == pytest.approx(0.25, abs=0.01)
 
 
 def test_the_bundle_is_whole_small_as_stated_and_can_be_embedded():

@@ -219,10 +219,13 @@ def test_a_scene_says_in_which_axes_its_room_is(frames):
     assert frames_of(load(LIGHTS)) == {"world"}
 
 
-def test_a_turntable_stays_one_though_its_room_is_dark(small_capture):
-    """It is told by a room of zeros in the camera's axes."""
+@pytest.mark.parametrize("light", [0.0, 0.3])
+def test_a_turntable_stays_one_though_its_room_is_dark_or_alike_from_all_sides(small_capture, light):
+    """It is told by a room in the camera's axes."""
     sensors = load_capture(small_capture, images=False).sensors
     root = ElementTree.fromstring(small_capture.read_bytes())
     root.append(room_element("camera", np.zeros((COUNT, 3))))
-    fitted = ElementTree.fromstring(recalibrated_xml(scene_bytes(root), sensors, np.zeros((BASIS, 3))))
+    room = np.zeros((BASIS, 3))
+    room[0] = light
+    fitted = ElementTree.fromstring(recalibrated_xml(scene_bytes(root), sensors, room))
     assert [string.get("value") for string in fitted.findall("emitter/string[@name='frame']")] == ["camera"]

@@ -3,7 +3,7 @@
 import math
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -165,7 +165,8 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
         )  # fmt: skip
         fields = {child.get("name"): child for child in new if child.tag in ("float", "transform")}
         for child in list(old):
-            lit = child.tag == "emitter" or (child.tag == "ref" and root.find(f".//emitter[@id='{child.get('id')}']"))
+            known = f".//emitter[@id='{child.get('id')}']"
+            lit = child.tag == "emitter" or (child.tag == "ref" and root.find(known) is not None)
             if lit or child.get("name") in {*USUAL, *fields}:
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
@@ -175,7 +176,7 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
         frames.add("world" if frame is None else frame.get("value", ""))
         root.remove(emitter)
     if room is not None:
-        root.extend(room_elements(room) or [room_element(frame, np.zeros((COUNT, 3))) for frame in sorted(frames)])
+        root.extend(room_elements(room, frames))
     return scene_bytes(root)
 
 
@@ -198,13 +199,17 @@ def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]
     return [(element, named.get(element.get("id", ""), k)) for element, k in numbered]
 
 
-def room_elements(room: np.ndarray) -> list[Element]:
-    """The light of a room as XML: what is fixed in the world, and what is in the camera, where there is something."""
+def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
+    """The light of a room as XML: what is fixed in the world, and what is in the camera, where there is something.
+
+    `frames`: of rooms that there were; they are kept, even without light.
+    """
     world, camera = room[:COUNT], np.vstack([np.zeros_like(room[:1]), room[COUNT:]])
-    if camera.any() and not world[1:].any():  # what is alike from all sides belongs to it, too
+    # What is alike from all sides is of both.
+    if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
         world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[COUNT:])])
-    frames = {"world": world, "camera": camera}
-    return [room_element(frame, harmonics) for frame, harmonics in frames.items() if harmonics.any()]
+    parts = {"world": world, "camera": camera}
+    return [room_element(frame, part) for frame, part in parts.items() if part.any() or frame in frames]
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:

@@ -21,9 +21,9 @@ from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.curve import Curve
 from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
-from mi_ring.images import contrasted
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
 from mi_ring.rendering.scenes import has_table
@@ -51,8 +51,6 @@ UNKNOWNS: dict[str, dict[str, float]] = {
 AUTO = "light", "power", "ambient"
 ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
-BLACK = 1e-6  #: radiance, in units of the file's, below which an S goes on straight
-DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is a straight line
 START = 0.2  #: progress of the fit when refinement begins
 LIT = 0.15  #: and when that of the room's light does
 RATE = 0.1  #: of Adam, in standard deviations an iteration
@@ -103,11 +101,13 @@ class Calibration(nn.Module):
     base: Calibrated
 
     def __init__(
-        self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0
-    ) -> None:
+        self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0,
+        fitted: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
 
-        `power`: a factor of what the capture says of the lights' intensities, to begin with.
+        `power`: a factor of what the capture says of the lights' intensities, to begin with; `fitted`: indices of the
+        photographs that are not kept out, by default all.
         """
         super().__init__()
         self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
@@ -127,6 +127,7 @@ class Calibration(nn.Module):
         #: (P, 3, 3) turns of the cameras' axes, of photographs that are held on their side
         self.held = quarter_turns(inside, RIGID * self.distance)
         level = (self.held.mT @ inside[..., None])[..., 0]
+        self.level = level.mean(0)  #: (3,) where the flash is in the axes of a camera that is held upright
         #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
         spread = float((level.amax(0) - level.amin(0)).max())
         self.flash = inside if self.finite.all() and spread < RIGID * self.distance else None
@@ -142,6 +143,7 @@ class Calibration(nn.Module):
         places = places if self.flash is None else np.zeros_like(places)
         self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
         count = len(cameras)
+        self.fitted = torch.arange(count) if fitted is None else torch.from_numpy(fitted)
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
                   "principal": (int(lenses.max()) + 1, 2), "distortion": (int(lenses.max()) + 1,),
                   "falloff": (), "vignetting": (),
@@ -184,10 +186,16 @@ class Calibration(nn.Module):
         else:
             moved = places + offset * torch.where(self.finite, self.distance, 1.0)
             places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
-        power = self.value("power")
         scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
-        strengths = strengths * (scale + power - (power.mean(0) if power.ndim else 0)).exp()
+        strengths = strengths * (scale + self.powers()).exp()
         return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"), distortion)
+
+    def powers(self) -> Tensor:
+        """(P, 3) logarithms of the factors of photographs' lights, of mean 0; 0 of those that are kept out."""
+        power = self.value("power").expand(len(self.lens), 3)
+        result = torch.zeros_like(power)
+        result[self.fitted] = power[self.fitted] - power[self.fitted].mean(0)
+        return result
 
     def scaled(self, scale: int) -> Calibrated:
         """For photographs `scale` times smaller."""
@@ -213,11 +221,6 @@ class Calibration(nn.Module):
         scale = self.value("scale").to(interreflection)
         return interreflection * (scale.detach() - scale).exp()
 
-    @property
-    def gamma(self) -> Tensor:
-        """The exponent of the camera's curve: a file's value, decoded, goes like radiance to its power."""
-        return self.value("curve").exp()
-
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """(N, H, W, 1) of the angles between the optical axis and the rays of photographs, `scale` times smaller."""
         width, height = (size // scale for size in self.sizes[index[0]])
@@ -230,72 +233,36 @@ class Calibration(nn.Module):
             distance2 = distance2 * straightening(at.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
+    @property
+    def curve_now(self) -> Curve:
+        """What lens and curve make of radiance by now."""
+        exponent, contrast, vignetting = (
+            self.value(name) if name in self.widths else None for name in ("curve", "contrast", "vignetting")
+        )
+        return Curve(exponent, contrast, vignetting, self.gammas, self.dimmed, self.exposure)
+
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Radiance (N, H, W, 3) as lens and curve record it, decoded by what the capture says of both.
-
-        The curve's exponent leaves the mean of the object as it is. `index`, `scale`: which photographs, how much
-        smaller.
-        """
-        if self.shading:
-            cosines, given = self.cosines(index, scale).to(radiance), self.dimmed[index].to(radiance)
-            given = cosines ** given[:, None, None, None]
-            dimmed = radiance * given * cosines ** self.value("vignetting").to(radiance)
-            return self.curved(dimmed, self.gammas[index]) / given
-        return self.curved(radiance, self.gammas[index])
-
-    def curved(self, radiance: Tensor, gammas: Tensor) -> Tensor:
-        """Radiance (N, ...) as the curve records it; `gammas` (N,): as the capture has them."""
-        if not {"curve", "contrast"} & set(self.refined):
-            return radiance
-        relative = radiance / self.exposure
-        slope = relative.clamp(min=DARKEST) ** (self.gamma.to(radiance) - 1)
-        return self.contrasted(radiance * slope, self.value("contrast").exp(), gammas)
-
-    @staticmethod
-    def contrasted(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
-        """What the curve's S makes of values (N, ...) that a capture decodes with these `gammas` (N,).
-
-        An S of one steepness after another is one of their product's: that of the capture need not be known.
-        """
-        gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
-        lit = values.clamp(min=BLACK)  # below it goes on straight
-        return contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas) * (values / lit)
+        """`Curve.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
+        curve = self.curve_now
+        return curve.recorded(radiance, index, self.cosines(index, scale) if curve.shading else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Radiance of what lens and curve recorded, the inverse of `recorded`; without gradients."""
-        if self.shading:
-            cosines, given = self.cosines(index, scale).to(recorded), self.dimmed[index].to(recorded)
-            given = cosines ** given[:, None, None, None]
-            straight = self.straight(recorded * given, self.gammas[index])
-            return straight / given / cosines ** self.value("vignetting").to(recorded)
-        return self.straight(recorded, self.gammas[index])
-
-    @torch.no_grad()
-    def straight(self, recorded: Tensor, gammas: Tensor) -> Tensor:
-        """Radiance (N, ...) of what the curve recorded; `gammas` (N,): as the capture has them."""
-        if not {"curve", "contrast"} & set(self.refined):
-            return recorded
-        recorded = self.contrasted(recorded, (-self.value("contrast")).exp(), gammas)
-        relative, gamma = recorded / self.exposure, float(self.gamma)
-        return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
-
-    @property
-    def shading(self) -> bool:
-        """Does the curve record what the lens has dimmed, or is that dimming unknown?"""
-        return "vignetting" in self.refined or bool(self.dimmed.any())
+        """The inverse of `recorded`, without gradients."""
+        curve = self.curve_now
+        return curve.linear(recorded, index, self.cosines(index, scale) if curve.shading else None)
 
     def roomlight(self) -> Tensor:
         """(BASIS, 3) harmonics of the room's light as they are by now; what a scene says goes with `scale`."""
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.reflecting
 
-    def room_share(self) -> Tensor:
-        """(3,) the room's light on the object, mean over all directions, by that of the flash where it faces it."""
+    def room_share(self, harmonics: Tensor) -> Tensor:
+        """(3,) a room's light on the object, mean over all directions, by that of the flash where it faces it."""
         with torch.no_grad():
             now = self()
             distance2 = torch.where(self.finite, (now.places - self.center).square().sum(-1, keepdim=True), 1.0)
-            mean = self.room.harmonics[0].cpu() / math.sqrt(4 * math.pi)
+            mean = harmonics[0].cpu() / math.sqrt(4 * math.pi)
             return math.pi * mean / (now.strengths / distance2).median(0).values
 
     def prior(self) -> Tensor:
@@ -320,7 +287,7 @@ class Calibration(nn.Module):
         """The capture with cameras, lights and curve as they are by now."""
         with torch.no_grad():
             matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in self())
-            gamma, vignetting = float(self.gamma), float(self.value("vignetting"))
+            gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
             contrast = float(self.value("contrast").exp())
         # The curve's fixed point is the exposure here, full scale in a scene file.
         strengths = strengths * self.exposure ** ((1 - gamma) / gamma)

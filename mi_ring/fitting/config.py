@@ -72,7 +72,7 @@ class Config:
     muon_rate: float = 3e-2
     """Learning rate of Muon."""
     decay: float = 0.1
-    """The learning rates fall exponentially to this share; those of cameras to less."""
+    """The learning rates fall exponentially to this share; those of cameras to a half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer
     GPUs)."""
@@ -102,6 +102,9 @@ class Config:
             if not condition:
                 raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
 
+        require(not isinstance(self.refine, str), "refine", "a tuple of names")
+        known = get_args(get_args(next(f for f in dataclasses.fields(Config) if f.name == "refine").type)[0])
+        require(set(self.refine) <= set(known), "refine", f"of {', '.join(known)}")
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")
 
         for f in dataclasses.fields(Config):  # from Python nobody else has checked them

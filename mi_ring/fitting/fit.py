@@ -109,8 +109,8 @@ class Fit:
         self.calibration: Calibration | None = None
         self.poses: GaussNewton | None = None
         if refined := refined_of(seen, self.config, self.albedo):
-            power = overall(refined, self.albedo)
-            self.calibration = Calibration(capture, refined, self.ring.center.cpu().numpy(), self.exposure, power)
+            power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
+            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted)
             self.optimizers += self.calibration.optimizers()
             if "cameras" in refined:
                 self.poses = GaussNewton(self.calibration, self.near, self.terms)

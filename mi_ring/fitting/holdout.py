@@ -1,4 +1,8 @@
-"""Photographs that are kept out of a fit: does what was refined explain them better?"""
+"""Photographs that are kept out of a fit: does what was refined explain them better?
+
+Surface and material stay as they were fitted, together with what was refined: that is a judgement of them all, and what
+is put back is not made up for.
+"""
 
 import copy
 from typing import TYPE_CHECKING
@@ -41,8 +45,8 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
 def confirm(fit: "Fit") -> dict:
     """Put back what was refined for all photographs and explains those that were kept out no better than before.
 
-    Returns what is unexplained of them (`unexplained`; `before`: with all unknowns as they began) and what was
-    `put_back`.
+    Returns what is unexplained of them (`unexplained`; `before`: with all unknowns as they began, but this surface) and
+    what was `put_back`.
     """
     calibration = fit.calibration
 
@@ -58,6 +62,8 @@ def confirm(fit: "Fit") -> dict:
     for name in [name for name in calibration.refined if name in SHARED]:
         unknown, given = calibration.unknown(name)
         found = unknown.detach().clone()
+        if torch.equal(found, given):  # nothing was found that could be put back
+            continue
         with torch.no_grad():
             unknown.copy_(given)
             without = unexplained_now()

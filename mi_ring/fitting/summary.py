@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
-    """What was refined: of each unknown `before`, `after` and `std`, its standard deviation given the surface.
+    """What was refined: of each unknown `before`, `after` and, but for the room's light, `std`, given the surface.
 
     `photographs`: of each how far its picture of the object moved [px]; if cameras were refined how far it was turned
     and moved, if powers were, the factor of each colour. `refined`: the capture with all of it; `deviations`: as
@@ -23,7 +23,9 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     with torch.no_grad():
         now = {name: calibration.value(name).double().numpy(force=True) for name in calibration.widths}
         gain = calibration.strengthened
-        share = calibration.room_share().tolist()
+        room = calibration.room
+        given, share = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics))
+        powers = calibration.powers().double().exp().numpy()
     unknowns: dict[str, dict[str, Any]] = {}
 
     def add(name: str, what: str, before: Any, after: Any, std: Any) -> None:
@@ -34,7 +36,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     lenses = np.unique(calibration.lens.numpy(), return_index=True)[1]
     focal = np.stack([new[k].camera.focal for k in lenses])
     if "light" in now and calibration.flash is not None:
-        flash, unit = calibration.flash.mean(0).numpy(), calibration.distance
+        flash, unit = calibration.level.numpy(), calibration.distance
         add("light", "place of the flash in the cameras' axes: to the left, up, ahead [scene units]", flash,
             flash + unit * now["light"][0], unit * deviations["light"][0])  # fmt: skip
     elif "light" in now:
@@ -71,7 +73,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
     if "ambient" in calibration.refined:
         what = "light of the room on the object, as shares of the flash's: red, green, blue"
-        unknowns["ambient"] = {"what": what, "after": share, "harmonics": calibration.room.harmonics.tolist()}
+        unknowns["ambient"] = {"what": what, "before": given, "after": share, "harmonics": room.harmonics.tolist()}
 
     center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
     corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
@@ -87,8 +89,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
             if name in now:
                 entry[key] = float(unit * np.linalg.norm(now[name][k]))
                 std[key] = float(unit * np.linalg.norm(deviations[name][k]))
-        if "power" in now:
-            factor = np.exp(now["power"][k] - now["power"].mean(0))
-            entry["power"], std["power"] = factor.tolist(), (factor * deviations["power"][k]).tolist()
+        if "power" in now and k not in fit.held_out:  # of those nobody knows
+            entry["power"], std["power"] = powers[k].tolist(), (powers[k] * deviations["power"][k]).tolist()
         photographs[fit.capture.names[k]] = entry | {"std": std}
     return {"refined": list(calibration.refined), "unknowns": unknowns, "photographs": photographs}

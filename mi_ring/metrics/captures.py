@@ -14,6 +14,7 @@ from mi_ring.geometry.hull import WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 
 CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares beyond which something is said
+ODD = 3.0  #: a photograph whose light a fit finds so many times as strong as the others', or as weak
 FAR, LEAST_FAR = 4.0, 2.0  #: a photograph that a fit moves so many times as far as half of them, and so far [px]
 
 
@@ -22,6 +23,12 @@ def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
+
+
+def lit_otherwise(photographs: dict[str, dict[str, Any]]) -> str:
+    """Of which photographs a fit has found the light much stronger or weaker than of the others; empty if of none."""
+    powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
+    return ", ".join(f"{name} ({power:.2g} times)" for name, power in powers.items() if not 1 / ODD < power < ODD)
 
 
 @dataclass
@@ -142,13 +149,15 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     record = capture.path.parent / "calibration.json"  # of the fit that found this calibration
     try:
         moved = {k: v for k, v in json.loads(record.read_text("utf-8"))["photographs"].items() if k in capture.names}
-        few = moved_far(moved)
+        few, odd = moved_far(moved), lit_otherwise(moved)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):  # there is none, or it is another tool's
-        few = ""
+        few = odd = ""
     if few:
         found.append(
             f"{few}: the fit has moved the camera much farther than the others': out of focus, or another scene?"
         )
+    if odd:
+        found.append(f"{odd}: so strong is the light that the fit has found, by the others': did the flash fire?")
     found += filter(None, [units(capture, center)])
     received = capture.photographs.lights.irradiance(center).mean(1)
     lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind

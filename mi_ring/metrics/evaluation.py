@@ -75,6 +75,8 @@ def evaluation_table(numbers: dict[str, float]) -> str:
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
         if found:
             lines.append(f"{words:36}" + "".join(f"{value:>10}  {what:6}" for what, value in found.items()).rstrip())
+    if any(key.startswith("aligned") for key in numbers):
+        lines.append("All but those of the input photographs are after this alignment.")
     return "\n".join(lines)
 
 

@@ -18,14 +18,13 @@ class Panel(NamedTuple):
 
     rows: list[tuple[str, str, str, str]]  #: what, before, after, standard deviation
     chart: str  #: a data URI
-    held_out: str  #: what the photographs that were kept out say of it; empty if there are none
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     """`refined`: a fit's `summary`, of what has made the one capture the other."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
     rows += [row(entry) for entry in of_photographs(refined["photographs"])]
-    return Panel(rows, chart(before, after, refined["photographs"]), held_out_text(refined.get("held_out", {})))
+    return Panel(rows, chart(before, after, refined["photographs"]))
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
@@ -54,22 +53,24 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
         if key in entries[0]:
             middle, spread = (np.median([e[key] for e in side]) for side in (entries, [e["std"] for e in entries]))
             result.append({"what": what, "before": 0, "after": middle, "std": spread})
-    if "power" in entries[0]:
-        off = np.median([np.abs(np.log(e["power"])).mean() for e in entries])
-        spread = np.median([np.divide(e["std"]["power"], e["power"]).mean() for e in entries])
+    if lit := [entry for entry in entries if "power" in entry]:
+        off = np.median([np.abs(np.log(e["power"])).mean() for e in lit])
+        spread = np.median([np.divide(e["std"]["power"], e["power"]).mean() for e in lit])
         result.append({"what": "power of photographs, off the mean, median [%]", "before": 0, "after": 100 * off,
                        "std": 100 * spread})  # fmt: skip
     return result
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """How much better photographs that were kept out are explained."""
-    if "before" not in held_out:
-        return ""
-    back = ", ".join(held_out["put_back"])
-    return "Of the object's light in the photographs that were kept out {:.1%} is unexplained, {:.1%} before.{}".format(
-        held_out["unexplained"], held_out["before"], f" What did not help was put back: {back}." if back else ""
-    )
+    """How well photographs that were kept out are explained, as `mi_ring.fitting.holdout` has it."""
+    if not held_out:
+        return "not asked, for the fit ended early"
+    text = f"{held_out['unexplained']:.1%} of the object's light in them is unexplained"
+    if "before" in held_out:
+        text += f", {held_out['before']:.1%} by this surface with calibration as it was"
+    if held_out["put_back"]:
+        text += f"; what did not help was put back, the surface as it is: {', '.join(held_out['put_back'])}"
+    return text
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
@@ -85,12 +86,12 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     plan.set_aspect("equal", "datalim")
     plan.set_title("cameras and lights (•), along the vertical", fontsize=9)
     moved = [entry["moved_px"] for entry in photographs.values()]
-    if max(moved) > 0 or "power" not in next(iter(photographs.values())):
+    power = np.array([entry.get("power", [np.nan] * 3) for entry in photographs.values()])
+    if max(moved) > 0 or np.isnan(power).all():
         bars.bar(range(len(moved)), moved, color=AFTER)
         bars.set_ylabel("pixels")
         bars.set_title("how far the object has moved in each photograph", fontsize=9)
     else:
-        power = np.array([entry["power"] for entry in photographs.values()])
         for channel, colour in zip(power.T, ("tab:red", "tab:green", "tab:blue")):
             bars.plot(channel, ".", color=colour)
         bars.axhline(1, color=BEFORE, linewidth=1)

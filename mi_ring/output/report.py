@@ -5,8 +5,9 @@ import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -26,6 +27,7 @@ from mi_ring.output.figures import svg_uri
 from mi_ring.rendering import bridge
 from mi_ring.ring.ring import Ring
 from mi_ring.system.command import scene_name
+from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
 
 REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
@@ -56,11 +58,8 @@ def report_html(
     `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
     """
     capture, ring = fit.calibrated(), fit.ring
-    rows, errors = [], []
-    for k in capture.spread():
-        row, error = panel_of(fit, capture, k)
-        rows.append(row)
-        errors.append(error)
+    drawn = in_turn(partial(predicted, fit, capture), partial(panel_of, fit, capture), capture.spread())
+    rows, errors = map(list, zip(*drawn))
     masked = [row.iou for row in rows if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
@@ -75,6 +74,7 @@ def report_html(
         ),
         "Iterations": f"{fit.iteration} of {fit.iterations}",
         "Fit time": f"{fit.seconds:.0f} s",
+        **({"Photographs kept out": calibration_panel.held_out_text(fit.confirmed)} if len(fit.held_out) else {}),
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
         "Made by": f"mi_ring {__version__}",
@@ -163,21 +163,34 @@ def sides(x: float, y: float) -> str:
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
-def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float]:
+class Prediction(NamedTuple):
+    """What a photograph should look like."""
+
+    rgb: np.ndarray  #: (H, W, 3) linear radiance
+    coverage: np.ndarray  #: (H, W), in [0, 1]
+    maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
+
+
+def predicted(fit: Any, capture: Capture, k: int) -> Prediction:
+    """Photograph `k` of the calibrated capture, as the surface that is shown predicts it."""
+    rgb, coverage = bridge.draw(
+        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=8
+    )
+    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
+    maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
+    return Prediction(rgb[0].numpy(), coverage[0].numpy(), {name: values[0] for name, values in maps.items()})
+
+
+def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
     """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
-    seen = capture.observe([k])
+    seen, maps = capture.observe([k]), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
-    predicted, coverage = (t[0].numpy() for t in bridge.draw(
-        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=8
-    ))  # fmt: skip
     sensor = capture.sensors[k]
-    photo, guess = (linear_to_srgb(recorded(linear, sensor)) for linear in (observed, predicted * valid[..., None]))
-    found = (coverage > 0.5) & valid
+    shown = prediction.rgb * valid[..., None]
+    photo, guess = (linear_to_srgb(recorded(linear, sensor)) for linear in (observed, shown))
+    found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
-    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
-    parameters = fit.ring.brdf_net.bsdf_parameters
-    maps = {key: m[0] for key, m in bridge.maps(fit.surface, small, parameters).items()}
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
     pictures = {
         "photograph": photo,
@@ -185,7 +198,7 @@ def panel_of(fit: Any, capture: Capture, k: int) -> tuple[PhotographPanel, float
         "4 × difference": 4 * np.abs(photo - guess),
         "normals": normal,
     }
-    for p in parameters:
+    for p in fit.ring.brdf_net.bsdf_parameters:
         if math.isinf(p.high):
             pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(fit.ring.brdf_net.scale)))
         else:
@@ -212,7 +225,7 @@ def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[flo
     a, b = (picture[rows, columns].mean(-1) for picture in (photo, guess))
     scale = -(-max(a.shape) // REGISTERED)
     a, b = (block_reduce(picture, scale, np.mean) for picture in (a, b))
-    down, right = scale * phase_cross_correlation(a, b, upsample_factor=20, normalization=None)[0]
+    down, right = scale * phase_cross_correlation(a, b, upsample_factor=10, normalization=None)[0]
     return float(right), float(down)
 
 
@@ -221,7 +234,7 @@ def data_uri(picture: np.ndarray) -> str:
     image = Image.fromarray(to_bytes(picture))
     image.thumbnail((PICTURE, PICTURE))
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", quality=85)
+    image.save(buffer, "WEBP", quality=85, method=2)  # faster, hardly larger
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 

@@ -133,10 +133,10 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)
-    refined = None
-    if fit.calibration:
-        refined = fit.summary(capture) | ({"held_out": fit.confirmed} if fit.confirmed else {})
-        write_file(folder / "calibration.json", json.dumps(refined, indent=1))
+    refined = fit.summary(capture) if fit.calibration else None
+    if refined or fit.confirmed:
+        record = refined or {"refined": [], "unknowns": {}, "photographs": {}}
+        write_file(folder / "calibration.json", json.dumps(record | {"held_out": fit.confirmed}, indent=1))
     write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 

@@ -138,7 +138,9 @@ def views_of(capture: Capture, ring: Ring, config: RenderConfig) -> list[View]:
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        views.append(View(load_element(photograph_element("view", "none", seen_from, lit_from)), name, time))
+        cone = 0.0 if config.light_orbit else sensor.cone  # about the axis of a camera that the light goes with
+        element = photograph_element("view", "none", seen_from, lit_from, falloff=cone)
+        views.append(View(load_element(element), name, time))
     return views
 
 

@@ -287,6 +287,7 @@ def maps(
     attributes, parts = {f"vertex_{p.name}": p.channels for p in parameters}, []
     for pixels in photographs.chunks(1):
         channels = render_maps(surface.scene, photographs, attributes, pixels)
+        dr.eval(channels)  # together: each would otherwise trace the rays again
         parts.append(np.stack([np.array(c) for c in channels], -1))
     channels = np.concatenate(parts).reshape(len(photographs), height, width, -1)
     result, first = {"normal": channels[..., :3]}, 3

@@ -16,6 +16,8 @@ import torch
 from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
+Thing = TypeVar("Thing")
+Part = TypeVar("Part")
 Result = TypeVar("Result")
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 
@@ -82,6 +84,21 @@ def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[R
     """`map`, each in a thread, as many at once as there are cores; for what leaves Python's lock alone."""
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(function, *things)
+
+
+def in_turn(
+    first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
+) -> Iterator[Result]:
+    """`second(thing, first(thing))` of each; in a thread of its own, while this one has the `first` of the next."""
+    with ThreadPoolExecutor(1) as pool:
+        before = None
+        for thing in things:
+            part = first(thing)
+            if before:
+                yield before.result()
+            before = pool.submit(second, thing, part)
+        if before:
+            yield before.result()
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
