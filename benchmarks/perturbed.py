@@ -80,7 +80,8 @@ def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list
     module = [sys.executable, "-m"]
     fit = [str(a) for a in (*module, "mi_ring.fit", scene, "--out", out, "--refine", *refine, *options)]
     if not (result.exists() and words.exists() and words.read_text() == " ".join(fit)):
-        subprocess.run(fit, check=True, stdout=sys.stderr)
+        if status := subprocess.run(fit, stdout=sys.stderr).returncode:
+            sys.exit(status)  # it has said why
         evaluate = [*module, "mi_ring.evaluate", out, "--mesh", truth / "mesh.ply", "--novel", truth / "scene.xml",
                     "--align", "rigid", "--spp", 4]  # fmt: skip
         done = subprocess.run([str(a) for a in evaluate], check=True, stdout=subprocess.PIPE)
@@ -113,7 +114,7 @@ def left(true, found, wrong: str) -> float:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=scene_file)
     parser.add_argument("--wrong", choices=WRONG, required=True)
     parser.add_argument("--by", type=float, default=0.5)

@@ -95,6 +95,8 @@ def main(arguments: Sequence[str]) -> int:
     state = read_checkpoint(folder, config) if config.resume else None
     keep_memory()
     capture = load_capture(config.scene, masks=config.masks)
+    if capture.shape.ring is not None:
+        print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
     elif config.masks != "given" and all(mask is None for mask in capture.masks):

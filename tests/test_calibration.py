@@ -351,7 +351,7 @@ def test_powers_of_the_photographs_that_are_fitted_have_the_mean_one(small_captu
 
 
 def test_names_of_unknowns_are_checked_from_python_too():
-    for wrong in (("pose",), "cameras", ("none", "light")):
+    for wrong in (("pose",), "cameras", ("none", "light"), ()):
         with pytest.raises(InputError, match=r"--refine: is .*, must be "):
             Config(refine=wrong)
 
@@ -582,4 +582,6 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
     unknown = mi_ring.load_capture(small_capture)
     assert Fit(unknown).calibration.refined == ("light", "power", "ambient")
     assert Fit(unknown, Config(refine=("none",))).calibration is None
-    assert fit.parse_options(["scene.xml", "--refine", "light", "cameras"]).refine == ("light", "cameras")
+    # In whatever order: it is the same fit, which may be resumed.
+    for words in ("light cameras", "cameras light", "cameras light cameras"):
+        assert fit.parse_options(["scene.xml", "--refine", *words.split()]).refine == ("cameras", "light")

@@ -12,6 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -280,10 +281,33 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
 def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_path, monkeypatch):
     genuine = terms.rgb_loss
     monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
-    with pytest.raises(InputError, match="diverged at iteration 9"):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "20", *QUICK])
+    with pytest.raises(InputError, match="diverged at iteration 17"):
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "40", *QUICK])
     ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
     assert all(tensor.isfinite().all() for tensor in ring.values())
+
+
+def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(small_capture, monkeypatch):
+    """Of weights at once, of losses when there are three in a row; a single one is left out."""
+    broken = Fit(load_capture(small_capture), Config(iterations=40, levels=(2,), widths=(28,), shares=(1,)))
+    genuine = terms.rgb_loss
+    wrong = {3, 20, 21, 22}
+    monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * (np.nan if broken.iteration in wrong else 1))
+    weights = broken.ring.brdf_net.output.weight
+    for it in broken:
+        if it.number == 12:
+            kept = weights.detach().clone()
+            with torch.no_grad():
+                weights[0, 0] = np.inf
+        if it.number == 13:  # as it was after the tenth step
+            assert weights.isfinite().all() and 0 < (weights - kept).norm() < 0.1 * kept.norm()
+        expected = 0.3 ** (broken.caution.retreats)
+        if it.number in (1, 5, 13, 24, 30):
+            assert broken.caution.retreats == {1: 0, 5: 0, 13: 1, 24: 2, 30: 2}[it.number]
+        assert broken.caution.factor == pytest.approx(expected)
+    (group,) = broken.optimizers[0].param_groups[:1]
+    assert group["lr"] == pytest.approx(0.09 * group["initial_lr"] * broken.config.decay ** (39 / 40))
+    assert Fit(broken.capture, broken.config, state=broken.state()).caution.retreats == 2
 
 
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
@@ -456,9 +480,12 @@ def test_results_never_go_onto_the_scene_itself(finished, broken_capture):
     assert path.read_bytes() == before
 
 
-def test_a_finished_fit_is_not_silently_fitted_anew(finished, tmp_path):
-    with pytest.raises(InputError, match="weights: is for finished fits"):
-        fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), *QUICK])
+def test_a_finished_fit_is_fitted_anew_and_not_silently(finished, tmp_path, capsys):
+    assert fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK]) == 0
+    said = "surface and material of the fit that it holds are not taken, but found anew"
+    assert f"{finished / 'scene.xml'}: {said}" in capsys.readouterr().out
+    weights = ElementTree.parse(tmp_path / "run" / "scene.xml").findall("shape/string[@name='weights']")
+    assert [element.get("value") for element in weights] == ["ring.pt"]
 
 
 @pytest.fixture

@@ -240,8 +240,8 @@ def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -
     move_names(tree.getroot(), source.parent, folder)
     shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
     for element in list(shape):
-        if element.get("name") in ("weights", "to_world"):
-            raise InputError(f"{source}: shapenet, {element.get('name')}: is for finished fits; remove it to fit anew")
+        if element.get("name") == "to_world":
+            raise InputError(f"{source}: shapenet, to_world: is for finished fits; remove it to fit anew")
         if element.get("name") in ("weights", "subdivisions", *FOR_FITS):
             shape.remove(element)
     shape.remove(old_bsdf)

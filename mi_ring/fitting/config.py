@@ -104,7 +104,8 @@ class Config:
 
         require(not isinstance(self.refine, str), "refine", "a tuple of names")
         known = get_args(get_args(next(f for f in dataclasses.fields(Config) if f.name == "refine").type)[0])
-        require(set(self.refine) <= set(known), "refine", f"of {', '.join(known)}")
+        require(bool(self.refine) and set(self.refine) <= set(known), "refine", f"some of {', '.join(known)}")
+        object.__setattr__(self, "refine", tuple(name for name in known if name in self.refine))  # in one order
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")
 
         for f in dataclasses.fields(Config):  # from Python nobody else has checked them

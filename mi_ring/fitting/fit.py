@@ -15,6 +15,7 @@ from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
 from mi_ring.fitting.averages import Averages
 from mi_ring.fitting.calibration import LIT, Calibration, overall, refined_of
+from mi_ring.fitting.caution import Caution
 from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm
@@ -40,7 +41,6 @@ LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
 RAMP = 0.05  #: over how much of a fit refinement sets in
-FAILURES = 10  #: losses or gradients in a row that are not finite, after which a fit gives up
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
 
@@ -92,6 +92,9 @@ class Fit:
         #: Photographs that are kept out, and all others.
         self.held_out = np.arange(several)[every // 2 :: every] if every else np.arange(0)
         self.fitted = np.setdiff1d(np.arange(several), self.held_out)
+        if every and not 0 < len(self.held_out) < several:
+            raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(self.held_out)} of {several} "
+                             f"photographs out; give 2 to {2 * several - 1}")  # fmt: skip
         seen = capture.part(self.fitted) if every else capture
         self.exposure = seen.exposure()
         self.ring = ring_of(state["ring"]) if state else starting_ring(seen, self.config, self.exposure, networks)
@@ -126,9 +129,10 @@ class Fit:
         self.restraint = Restraint()
         self.averages = Averages()
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
-        self.failures = 0  # losses or gradients in a row that were not finite
         if state:
             self.restore(state)
+        fitted = [self.ring, self.calibration] if self.calibration else [self.ring]
+        self.caution = Caution(fitted, self.optimizers, state and state["caution"])
 
     def __iter__(self) -> Iterator[Iteration]:
         """The iterations that are left, each as it is done."""
@@ -276,16 +280,15 @@ class Fit:
         # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
         healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
-        self.failures = 0 if healthy else self.failures + 1
-        if self.failures >= FAILURES:
-            rate = "--muon-rate" if self.config.optimizer == "muon" else "--learning-rate"
-            raise InputError(f"{self.capture.path}: diverged at iteration {self.iteration}; try a lower {rate}")
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                begun = min(1.0, max(0.0, (progress - group.get("start", -1.0)) / RAMP))
+                begun = self.caution.factor * min(1.0, max(0.0, (progress - group.get("start", -1.0)) / RAMP))
                 group["lr"] = group["initial_lr"] * group.get("decay", self.config.decay) ** progress * begun
             if healthy:
                 optimizer.step()
+        if not self.caution.note(healthy):
+            option = "--muon-rate" if self.config.optimizer == "muon" else "--learning-rate"
+            raise InputError(f"{self.capture.path}: diverged at iteration {self.iteration}; try a lower {option}")
 
     def summary(self, refined: Capture) -> dict:
         """What was refined besides surface and material, as `mi_ring.fitting.summary` has it; the surface is shown.
@@ -328,6 +331,7 @@ class Fit:
             "seconds": self.seconds,
             "log": self.log,
             "restraint": vars(self.restraint),
+            "caution": self.caution.state(),
             "calibration": self.calibration and self.calibration.state_dict(),
             "averages": self.averages.pictures,
             "confirmed": self.confirmed,

@@ -122,7 +122,11 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     results.write_log(keeper.folder, fit.log)
     with bar:
         while fit.iteration < fit.iterations and not interrupted():
+            retreats = fit.caution.retreats
             it = fit.step()
+            if fit.caution.retreats > retreats:
+                bar.write(f"Iteration {it.number}: loss, gradient or weights were not finite; going on from the last "
+                          "ones that were, by smaller steps")  # fmt: skip
             stage = fit.stages.index(it.stage) + 1
             where = f"stage {stage}/{len(fit.stages)}, iteration {it.number}/{fit.iterations}"
             bar.set_description_str(where, refresh=False)
@@ -151,6 +155,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     fitted_scene = results.fitted_scene(fit, folder)
     with heeding_signals() as interrupted, outliving_readers():
         print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
+        if fit.calibration:
+            print(f"Refined besides surface and material: {', '.join(fit.calibration.refined)}")
         if fit.config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
                   f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
     """What was refined: of each unknown `before`, `after` and, but for the room's light, `std`, given the surface.
 
-    `photographs`: of each how far its picture of the object moved [px]; if cameras were refined how far it was turned
-    and moved, if powers were, the factor of each colour. `refined`: the capture with all of it; `deviations`: as
-    `mi_ring.fitting.certainty` has them.
+    `photographs`: of each that was not kept out how far its picture of the object moved [px]; if cameras were refined
+    how far it was turned and moved, if powers were, the factor of each colour. `refined`: the capture with all of it;
+    `deviations`: as `mi_ring.fitting.certainty` has them.
     """
     calibration = fit.calibration
     assert calibration is not None
@@ -78,7 +78,8 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)
     corners = center + radius * np.concatenate([np.eye(3), -np.eye(3)])
     photographs: dict[str, dict[str, Any]] = {}
-    for k, (before, after) in enumerate(zip(old, new)):
+    for k in fit.fitted:  # of those that are kept out nobody knows
+        before, after = old[k], new[k]
         shift = after.camera.project(corners)[0] - before.camera.project(corners)[0]
         entry: dict[str, Any] = {"moved_px": float(np.linalg.norm(shift, axis=1).mean())}
         std: dict[str, Any] = {}
@@ -89,7 +90,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
             if name in now:
                 entry[key] = float(unit * np.linalg.norm(now[name][k]))
                 std[key] = float(unit * np.linalg.norm(deviations[name][k]))
-        if "power" in now and k not in fit.held_out:  # of those nobody knows
+        if "power" in now:
             entry["power"], std["power"] = powers[k].tolist(), (powers[k] * deviations["power"][k]).tolist()
         photographs[fit.capture.names[k]] = entry | {"std": std}
     return {"refined": list(calibration.refined), "unknowns": unknowns, "photographs": photographs}

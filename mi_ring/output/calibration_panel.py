@@ -42,14 +42,16 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
 
 def numbers(value: Any, digits: int) -> str:
     """A few of them."""
-    return ", ".join(f"{v:.{digits}g}" for v in np.ravel(value))
+    values = np.ravel(value)
+    least = 1e-6 * np.abs(values).max()  # below it is rounding
+    return ", ".join(f"{0.0 if abs(v) < least else v:.{digits}g}" for v in values)
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """The unknowns of photographs, in the median."""
     entries = list(photographs.values())
     result = []
-    for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved [scene units]")):
+    for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved, median [scene units]")):
         if key in entries[0]:
             middle, spread = (np.median([e[key] for e in side]) for side in (entries, [e["std"] for e in entries]))
             result.append({"what": what, "before": 0, "after": middle, "std": spread})
@@ -75,8 +77,11 @@ def held_out_text(held_out: dict[str, Any]) -> str:
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
     """Cameras and lights from above, and how far each photograph's picture or power has moved."""
-    figure = Figure(figsize=(9, 3.4), layout="constrained")
-    plan, bars = figure.subplots(1, 2)
+    moved = [entry["moved_px"] for entry in photographs.values()]
+    power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
+    told = max(moved) > 0 or len(power)  # else nothing of single photographs is
+    figure = Figure(figsize=(9 if told else 4.5, 3.4), layout="constrained")
+    plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]
     up = before.up
     right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     plane = np.stack([right / np.linalg.norm(right), np.cross(up, right / np.linalg.norm(right))])
@@ -84,19 +89,18 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     draw_plan(plan, after, plane, AFTER, "after")
     plan.legend(fontsize=8)
     plan.set_aspect("equal", "datalim")
-    plan.set_title("cameras and lights (•), along the vertical", fontsize=9)
-    moved = [entry["moved_px"] for entry in photographs.values()]
-    power = np.array([entry.get("power", [np.nan] * 3) for entry in photographs.values()])
-    if max(moved) > 0 or np.isnan(power).all():
-        bars.bar(range(len(moved)), moved, color=AFTER)
-        bars.set_ylabel("pixels")
-        bars.set_title("how far the object has moved in each photograph", fontsize=9)
-    else:
-        for channel, colour in zip(power.T, ("tab:red", "tab:green", "tab:blue")):
-            bars.plot(channel, ".", color=colour)
-        bars.axhline(1, color=BEFORE, linewidth=1)
-        bars.set_title("power of the light of each photograph, by colour", fontsize=9)
-    bars.set_xlabel("photograph")
+    plan.set_title("cameras and lights (•) from above [scene units]", fontsize=9)
+    for bars in others:
+        if max(moved) > 0:
+            bars.bar(range(len(moved)), moved, color=AFTER)
+            bars.set_ylabel("pixels")
+            bars.set_title("how far the object has moved in each photograph", fontsize=9)
+        else:
+            for channel, colour in zip(power.T, ("tab:red", "tab:green", "tab:blue")):
+                bars.plot(channel, ".", color=colour)
+            bars.axhline(1, color=BEFORE, linewidth=1)
+            bars.set_title("power of the light of each photograph, by colour", fontsize=9)
+        bars.set_xlabel("photograph that was not kept out")
     return svg_uri(figure)
 
 

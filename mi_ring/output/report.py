@@ -48,6 +48,7 @@ class PhotographPanel:
     saturated: float  # share of the object's pixels
     shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
     pictures: dict[str, str]
+    kept_out: bool = False  # of the fit: what is wrong with it, its pose for instance, is not told
 
 
 def report_html(
@@ -60,13 +61,15 @@ def report_html(
     capture, ring = fit.calibrated(), fit.ring
     drawn = in_turn(partial(predicted, fit, capture), partial(panel_of, fit, capture), capture.spread())
     rows, errors = map(list, zip(*drawn))
-    masked = [row.iou for row in rows if row.iou is not None]
+    fitted = [row for row in rows if not row.kept_out]
+    seen = np.mean([error for row, error in zip(rows, errors) if not row.kept_out])
+    masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, {pixels}, 4 samples each)",
+        "PSNR of the photographs": f"{-10 * np.log10(seen):.2f} dB (sRGB, {pixels}, 4 samples each)",
         "Silhouettes": (
             f"{np.mean(masked):.4f} intersection over union with the masks"
             if masked
@@ -85,7 +88,7 @@ def report_html(
     return template.render(
         name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
         settings=fit.config.settings(),
-        findings=fit_findings(rows, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
+        findings=fit_findings(fitted, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
         refined=refined and calibration_panel.panel(fit.capture, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         saturated=SATURATED, viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
@@ -212,6 +215,7 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
         shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
+        kept_out=k in fit.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )
     return row, error

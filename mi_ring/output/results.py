@@ -14,7 +14,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
-from mi_ring.output import gltf, report
+from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
 from mi_ring.rendering.visibility import View
@@ -135,8 +135,12 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     print("Writing the report", flush=True)
     refined = fit.summary(capture) if fit.calibration else None
     if refined or fit.confirmed:
+        names = [capture.names[k] for k in fit.held_out]
         record = refined or {"refined": [], "unknowns": {}, "photographs": {}}
-        write_file(folder / "calibration.json", json.dumps(record | {"held_out": fit.confirmed}, indent=1))
+        record |= {"held_out": {"photographs": names, **fit.confirmed}} if names else {}
+        write_file(folder / "calibration.json", json.dumps(record, indent=1))
+    if len(fit.held_out):
+        print(f"Photographs kept out: {calibration_panel.held_out_text(fit.confirmed)}")
     write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 

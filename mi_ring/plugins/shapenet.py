@@ -123,6 +123,7 @@ class ShapeNetMesh(mi.Mesh):
         self.ring = load_fit(beside_scene(given["weights"])) if "weights" in given else None
         if self.ring is not None:
             self.up, self.metres = self.ring.up, self.ring.metres
+            self.ground = None if self.ring.ground is None else self.ring.ground.numpy(force=True).astype(float)
 
         material = {"diffuse": torch.tensor([0.5, 0.5, 0.5]), "specular": torch.tensor(0.0),
                     "roughness": torch.tensor(0.5)}  # fmt: skip
