@@ -536,6 +536,10 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
     config = Config(iterations=4, levels=(2,), widths=(56,), shares=(1,), refine=("light", "curve"), holdout=5)
     running = Fit(capture, config)
     assert running.held_out.tolist() == [2, 7]
+    for every, out in ((24, 0), (1000, 0)):
+        words = f"--holdout: is {every}, which keeps {out} of 12 photographs out; give 2 to 23"
+        with pytest.raises(InputError, match=words):
+            Fit(capture, Config(holdout=every))
     drawn = {k for _ in range(20) for k in running.choose()[0]}
     assert drawn == set(range(12)) - {2, 7}
     with torch.no_grad():

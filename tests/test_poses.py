@@ -68,7 +68,7 @@ def posed(capture, **changes):
         return it
 
     predicted, fit.predict = fit.predict, predict
-    fit.optimizers = [fit.poses] if fit.poses else fit.calibration.optimizers()  # the surface stays as it is
+    fit.optimizers = fit.lookers or fit.calibration.optimizers()  # the surface stays as it is
     return fit, index
 
 
@@ -150,3 +150,17 @@ def test_cameras_begin_when_there_is_a_shape(small_capture, domain, start):
         fit.iteration = round(progress * fit.iterations)
         fit.step()
         assert (not torch.equal(fit.calibration.move, before)) == moved
+
+
+def test_powers_go_where_photographs_were_lit(small_capture):
+    """Of those that were seen, and of no others."""
+    fit, index = posed(small_capture, refine=("power",))
+    calibration, random = fit.calibration, torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        calibration.power += 1.5 * torch.randn(calibration.power.shape, generator=random)
+    others = np.setdiff1d(np.arange(len(fit.capture)), index)
+    wrong, before = calibration.powers()[index].abs().max(), calibration.power[others].clone()
+    for _ in range(25):
+        fit.step()
+    assert wrong > 0.1 and calibration.powers()[index].abs().max() < 0.01
+    assert torch.equal(calibration.power[others], before)

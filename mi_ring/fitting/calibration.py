@@ -271,8 +271,8 @@ class Calibration(nn.Module):
         return total / 2 / len(self.lens)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """Adam, whose groups say when they begin, for all but cameras; none if there is nothing for it to find."""
-        found = [UNKNOWNS[group] for group in self.refined if group != "cameras"]
+        """Adam, whose groups say when they begin, for all but cameras and powers; none if nothing is left to find."""
+        found = [UNKNOWNS[group] for group in self.refined if group not in ("cameras", "power")]
         groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE, "start": START}
                   for names in found if names]  # fmt: skip
         return [torch.optim.Adam(groups, lr=RATE)] if groups else []

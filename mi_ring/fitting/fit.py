@@ -18,11 +18,11 @@ from mi_ring.fitting.calibration import LIT, Calibration, overall, refined_of
 from mi_ring.fitting.caution import Caution
 from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.holdout import confirm
+from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
-from mi_ring.fitting.poses import GaussNewton
+from mi_ring.fitting.powers import Looker, lookers_of
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import starting_ring
@@ -88,14 +88,9 @@ class Fit:
             recompute_normals(capture.scene)
         self.random = torch.Generator().manual_seed(self.config.seed)
         torch.manual_seed(self.config.seed)
-        every, several = self.config.holdout, len(capture)
-        #: Photographs that are kept out, and all others.
-        self.held_out = np.arange(several)[every // 2 :: every] if every else np.arange(0)
-        self.fitted = np.setdiff1d(np.arange(several), self.held_out)
-        if every and not 0 < len(self.held_out) < several:
-            raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(self.held_out)} of {several} "
-                             f"photographs out; give 2 to {2 * several - 1}")  # fmt: skip
-        seen = capture.part(self.fitted) if every else capture
+        self.held_out = kept_out(capture, self.config.holdout)
+        self.fitted = np.setdiff1d(np.arange(len(capture)), self.held_out)  #: all other photographs
+        seen = capture.part(self.fitted) if len(self.held_out) else capture
         self.exposure = seen.exposure()
         self.ring = ring_of(state["ring"]) if state else starting_ring(seen, self.config, self.exposure, networks)
         regularised = self.terms.get("velocity") is default_terms["velocity"] and self.config.weights["velocity"]
@@ -110,14 +105,12 @@ class Fit:
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
         self.calibration: Calibration | None = None
-        self.poses: GaussNewton | None = None
+        self.lookers: list[Looker] = []  #: optimisers that see iterations
         if refined := refined_of(seen, self.config, self.albedo):
             power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
             self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted)
-            self.optimizers += self.calibration.optimizers()
-            if "cameras" in refined:
-                self.poses = GaussNewton(self.calibration, self.near, self.terms)
-                self.optimizers.append(self.poses)
+            self.lookers = lookers_of(self.calibration, self.near, self.terms)
+            self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
         self.stages = stages_of(self.config, self.near)
         self.iterations = self.stages[-1].last
@@ -151,8 +144,8 @@ class Fit:
             self.take_outlines(find_outlines(self))
         it = self.predict()
         loss = self.weigh(it)
-        if self.poses:
-            self.poses.look(it)
+        for optimizer in self.lookers:
+            optimizer.look(it)
         self.descend(loss, it.progress)
         self.follow_power()
         it.loss = float(loss.detach())

@@ -12,6 +12,7 @@ import torch
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
+from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import UNKNOWNS
 from mi_ring.rendering import bridge
 
@@ -21,6 +22,19 @@ if TYPE_CHECKING:
 #: Of all photographs; what is of one is not known where it is out.
 SHARED = set(UNKNOWNS) - {"cameras", "power"}
 WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
+
+
+def kept_out(capture: Capture, every: int) -> np.ndarray:
+    """Indices of one photograph of so many, from the middle of the first so many on; none if `every` is 0.
+
+    Raises InputError if that is none or all of them.
+    """
+    several = len(capture)
+    found = np.arange(several)[every // 2 :: every] if every else np.arange(0)
+    if every and not 0 < len(found) < several:
+        raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(found)} of {several} photographs "
+                         f"out; give 2 to {2 * several - 1}")  # fmt: skip
+    return found
 
 
 def unexplained(fit: "Fit", capture: Capture) -> float:

@@ -1,0 +1,60 @@
+"""The power of each photograph's light, by what an iteration sees of it.
+
+It is a factor, so that one look says all of it: how much brighter the object was than predicted. Adam's steps, of a
+size that does not depend on how far off it is, came to 2 % of powers that were off by 15 %.
+"""
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from mi_ring.fitting.calibration import Calibration
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.poses import GaussNewton
+from mi_ring.fitting.terms import Term
+
+RATE, DECAY = 0.5, 0.2  #: share of what an iteration says that is believed at first, and what that falls to
+PULL = 0.01  #: toward what the scene says, by that
+START = 0.2  #: progress of the fit when they begin
+BRIGHT = 0.3  #: radiance from which pixels tell, in units of the exposure
+ENOUGH = 30  #: pixels
+
+
+class Powers(torch.optim.Optimizer):
+    """Steps of the photographs that an iteration has seen, and of no others: `look` at it, then `step`."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.power, self.width = calibration.unknown("power")[0], calibration.widths["power"]
+        super().__init__([{"params": [self.power], "initial_lr": RATE, "decay": DECAY, "start": START}], {"lr": RATE})
+        self.seen: list[tuple[int, Tensor]] = []  # which photographs, and logarithms (3,) of how much brighter
+
+    @torch.no_grad()
+    def look(self, it: Iteration) -> None:
+        """Take note of how much brighter photographs are than predicted: in the median of the object's pixels."""
+        self.seen = []
+        if it.progress < START:
+            return
+        least = BRIGHT * it.fit.exposure
+        telling = it.surely() & ~it.clipped.any(-1) & (torch.minimum(it.observed, it.predicted) > least).all(-1)
+        for n, k in enumerate(it.index.tolist()):
+            if int(telling[n].sum()) >= ENOUGH:
+                brighter = (it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log()
+                self.seen.append((k, brighter.median(0).values.cpu()))
+
+    @torch.no_grad()
+    def step(self) -> None:  # type: ignore[override]
+        """One; none if it has not begun."""
+        (group,) = self.param_groups
+        for k, brighter in self.seen:
+            self.power[k] += group["lr"] * (brighter / self.width - PULL * self.power[k])
+
+
+Looker: TypeAlias = GaussNewton | Powers  #: an optimiser that goes by more of an iteration than its gradients
+
+
+def lookers_of(calibration: Calibration, near: bool, given: Mapping[str, Term]) -> list[Looker]:
+    """Those of what is unknown of each photograph; `near` and `given` as of `GaussNewton`."""
+    found: list[Looker] = [Powers(calibration)] if "power" in calibration.refined else []
+    return found + ([GaussNewton(calibration, near, given)] if "cameras" in calibration.refined else [])
