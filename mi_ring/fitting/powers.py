@@ -15,7 +15,7 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.poses import GaussNewton
 from mi_ring.fitting.terms import Term
 
-RATE, DECAY = 0.5, 0.2  #: share of what an iteration says that is believed at first, and what that falls to
+RATE, DECAY = 0.5, 0.1  #: share of what an iteration says that is believed at first, and what that falls to
 PULL = 0.01  #: toward what the scene says, by that
 START = 0.2  #: progress of the fit when they begin
 BRIGHT = 0.3  #: radiance from which pixels tell, in units of the exposure
@@ -32,16 +32,21 @@ class Powers(torch.optim.Optimizer):
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
-        """Take note of how much brighter photographs are than predicted: in the median of the object's pixels."""
+        """Take note of how much brighter photographs are than predicted: in the median of the object's pixels.
+
+        By all that were seen together: what is common to them is the reflectance's, which changes in each iteration.
+        """
         self.seen = []
         if it.progress < START:
             return
         least = BRIGHT * it.fit.exposure
         telling = it.surely() & ~it.clipped.any(-1) & (torch.minimum(it.observed, it.predicted) > least).all(-1)
-        for n, k in enumerate(it.index.tolist()):
-            if int(telling[n].sum()) >= ENOUGH:
-                brighter = (it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log()
-                self.seen.append((k, brighter.median(0).values.cpu()))
+        told = [n for n in range(len(it.index)) if int(telling[n].sum()) >= ENOUGH]
+        if len(told) < 2:
+            return
+        ratios = [(it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log().median(0).values for n in told]
+        brighter = torch.stack(ratios).cpu()
+        self.seen = list(zip(it.index[told].tolist(), brighter - brighter.mean(0)))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
