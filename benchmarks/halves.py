@@ -55,7 +55,7 @@ def main() -> None:
         half(arguments.scene, which, arguments.out / f"{which}.xml")
         found.append(fitted(arguments.out / f"{which}.xml", out, options))
 
-    capture = mi_ring.load_capture(arguments.scene, images=False)
+    capture = mi_ring.load_capture(arguments.scene)
     (one, _), (other, _) = (load_true_mesh(out / "mesh.ply") for out in outs)
     center = other.bounds.mean(0)
     distance = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors])

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.fitting.calibration import Calibration
+from mi_ring.fitting.terms import perceived
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
 
@@ -128,11 +129,8 @@ def compare(
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
         roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
 
-    def perceived(linear: Tensor) -> Tensor:
-        return (4 * linear / fit.exposure).clamp(min=-0.5).log1p()
-
     def picture(lit: Tensor, bounced: Tensor = bounced) -> Tensor:
-        return perceived(calibration.recorded(lit + bounced + roomlight, index, scale))
+        return perceived(calibration.recorded(lit + bounced + roomlight, index, scale), fit.exposure, "log")
 
     slopes, unknowns = [], entries.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
     for name, k, places in unknowns:
@@ -155,7 +153,7 @@ def compare(
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
     changing, covering = (torch.stack(part) for part in zip(*slopes))
     own = np.stack([places for *_, places in unknowns], 1)
-    error, off = picture(lit) - perceived(seen.rgb), coverage - seen.mask
+    error, off = picture(lit) - perceived(seen.rgb, fit.exposure, "log"), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
     outlined = (covering.abs().amax(0) > 0) | (off != 0)  # beside and amid the object nothing can be wrong
