@@ -71,7 +71,7 @@ def cameras(sparse: Path, picture: Path) -> None:
 
 
 def results(out: Path) -> np.ndarray:
-    """Photographs held out, beside what the fit predicts, its normals and its diffuse colour."""
+    """Photographs held out, beside what the fit predicts, the difference, its normals and its diffuse colour."""
     capture, ring, surface = opened(out / "fit_default")
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     rows = []
@@ -83,9 +83,11 @@ def results(out: Path) -> np.ndarray:
         rgb, coverage = bridge.draw(surface, shot, spp=64, indirect=ring.indirect)
         seen = coverage[0].numpy()[..., None] > 0.5
         diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
+        observed = linear_to_srgb(capture.observe([k], scale).rgb[0].numpy())
+        predicted = linear_to_srgb(rgb[0].numpy())
         rows.append(labelled({
-            f"photograph {name}": linear_to_srgb(capture.observe([k], scale).rgb[0].numpy()),
-            "prediction": linear_to_srgb(rgb[0].numpy()), "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
+            f"photograph {name}": observed, "prediction": predicted,
+            "4 x difference": np.where(seen, 4 * np.abs(predicted - observed), 0), "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
             "diffuse": linear_to_srgb(np.where(seen, diffuse, 0)),
         }))  # fmt: skip
     return np.concatenate(rows)

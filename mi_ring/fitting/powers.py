@@ -1,7 +1,7 @@
 """The power of each photograph's light, by what an iteration sees of it.
 
 It is a factor, so that one look says all of it: how much brighter the object was than predicted. Adam's steps, of a
-size that does not depend on how far off it is, came to 2 % of powers that were off by 15 %.
+size that does not depend on how far off it is, came to 2.1 % of powers that were off by 15 %, these to 1.2 %.
 """
 
 from collections.abc import Mapping
