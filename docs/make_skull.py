@@ -87,7 +87,8 @@ def results(out: Path) -> np.ndarray:
         predicted = linear_to_srgb(rgb[0].numpy())
         rows.append(labelled({
             f"photograph {name}": observed, "prediction": predicted,
-            "4 x difference": np.where(seen, 4 * np.abs(predicted - observed), 0), "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
+            "4 x difference": np.where(seen, 4 * np.abs(predicted - observed), 0),
+            "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
             "diffuse": linear_to_srgb(np.where(seen, diffuse, 0)),
         }))  # fmt: skip
     return np.concatenate(rows)
