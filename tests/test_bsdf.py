@@ -302,7 +302,8 @@ def test_white_furnace(r, distribution):
         assert (reflected <= 4 * specular * (1 + 1e-5)).all()
         if angle < 90:
             weight = np.array(draw(both, o, 40_000)[1]).T
-            assert (weight.mean(0) <= (bound + 4 * weight.std(0) / 200) * (1 + 1e-6)).all()
+            rounding = 0 if machine.device().type == "cpu" else 1e-6
+            assert (weight.mean(0) <= (bound + 4 * weight.std(0) / 200) * (1 + rounding)).all()
         if angle == 0 and r < 0.1:
             assert (reflected >= 4 * specular * 0.99).all()
 

@@ -17,6 +17,7 @@ from mi_ring.photogrammetry.table import Ground, Plane, reflectance
 from mi_ring.photogrammetry.views import camera_of
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light
+from mi_ring.system import machine
 
 TURNED = mi.ScalarTransform4f().translate([0.3, -0.2, -1.1]).rotate([1, 0.4, 0], 12).scale([6, 4, 1])
 ROOM = '<emitter type="room"><string name="harmonics" value="0.4 0.3 0.2 {}"/></emitter>'.format("0 " * 24)
@@ -61,7 +62,8 @@ def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
     np.testing.assert_allclose(np.array(si.t), 1, rtol=1e-5)
     srgb = np.array([10, 250, 90]) / 255
     linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(np.array(table.bsdf().eval_diffuse_reflectance(si)).ravel(), linear, atol=4e-3)
+    atol = 2e-3 if machine.device().type == "cpu" else 4e-3  # a GPU's textures are interpolated with 8 bits
+    np.testing.assert_allclose(np.array(table.bsdf().eval_diffuse_reflectance(si)).ravel(), linear, atol=atol)
 
 
 @pytest.mark.parametrize("more", ["", ROOM], ids=["dark", "room"])

@@ -13,6 +13,13 @@ from mi_ring.errors import InputError
 WEIGHTS = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3}
 
 
+#: What `Config.refine` may have.
+Unknown = Literal[
+    "auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "falloff", "vignetting", "curve",
+    "contrast", "scale", "ambient", "masks",
+]  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """The settings of a fit: all that defines its result but the photographs.
@@ -78,8 +85,7 @@ class Config:
     GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
-    refine: tuple[Literal["auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "falloff",
-                          "vignetting", "curve", "contrast", "scale", "ambient", "masks"], ...] = ("auto",)  # fmt: skip
+    refine: tuple[Unknown, ...] = ("auto",)
     """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point
     of each lens; distortion: how much each lens bends lines, its first radial one; light: where a flash is that moves
     with the camera, else the place or direction of each light; power: strength and colour of the light, photograph by
@@ -103,7 +109,7 @@ class Config:
                 raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
 
         require(not isinstance(self.refine, str), "refine", "a tuple of names")
-        known = get_args(get_args(next(f for f in dataclasses.fields(Config) if f.name == "refine").type)[0])
+        known = get_args(Unknown)
         require(bool(self.refine) and set(self.refine) <= set(known), "refine", f"some of {', '.join(known)}")
         object.__setattr__(self, "refine", tuple(name for name in known if name in self.refine))  # in one order
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")

@@ -10,14 +10,13 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from mi_ring.fitting.calibration import Calibration
+from mi_ring.fitting.calibration import START, Calibration
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.poses import GaussNewton
 from mi_ring.fitting.terms import Term
 
 RATE, DECAY = 0.5, 0.1  #: share of what an iteration says that is believed at first, and what that falls to
 PULL = 0.01  #: toward what the scene says, by that
-START = 0.2  #: progress of the fit when they begin
 BRIGHT = 0.3  #: radiance from which pixels tell, in units of the exposure
 ENOUGH = 30  #: pixels
 

@@ -59,17 +59,17 @@ def report_html(
     `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
     """
     capture, ring = fit.calibrated(), fit.ring
-    drawn = in_turn(partial(predicted, fit, capture), partial(panel_of, fit, capture), capture.spread())
-    rows, errors = map(list, zip(*drawn))
-    fitted = [row for row in rows if not row.kept_out]
-    seen = np.mean([error for row, error in zip(rows, errors) if not row.kept_out])
+    panels = list(in_turn(partial(predicted, fit, capture), partial(panel_of, fit, capture), capture.spread()))
+    rows = [row for row, _ in panels]
+    # Of many photographs those that are shown may all be kept out.
+    fitted, errors = zip(*([panel for panel in panels if not panel[0].kept_out] or panels))
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(seen):.2f} dB (sRGB, {pixels}, 4 samples each)",
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, {pixels}, 4 samples each)",
         "Silhouettes": (
             f"{np.mean(masked):.4f} intersection over union with the masks"
             if masked
@@ -103,7 +103,7 @@ def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
 
 
 def fit_findings(
-    rows: list[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
+    rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
     """What stands out, each in one sentence that says what to do.
