@@ -99,7 +99,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
-    elif config.masks != "given" and all(mask is None for mask in capture.masks):
+    elif config.masks != "given" and not any(capture.masks.given):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config.thread_count):
         fit, costs = resumed(state, capture, config, folder) if state else Fit(capture, config), None

@@ -78,6 +78,18 @@ def read_image(path: Path) -> np.ndarray:
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
 
 
+def read_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image file by its header, if it has one that is read alone. Raises as `read_image`."""
+    suffix = path.suffix.lower()
+    if suffix in (".jpg", ".jpeg", ".png"):
+        with Image.open(path) as image:
+            return image.size
+    if suffix in (".tif", ".tiff"):
+        with tifffile.TiffFile(path) as file:
+            return file.pages.first.imagewidth, file.pages.first.imagelength
+    return read_image(path).shape[1::-1]
+
+
 def blur(images: Tensor, sigma: float) -> Tensor:
     """Gaussian blur by `sigma` > 0 [px] of (..., H, W) images, zero outside."""
     radius = int(3 * sigma + 0.5)

@@ -17,6 +17,7 @@ from test_poses import posed
 import mi_ring
 from mi_ring import InputError, fit
 from mi_ring.capture.decoding import decode, recorded
+from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import holdout
 from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotations
@@ -39,6 +40,11 @@ def edited(scene, folder, edit):
         edit(element)
     tree.write(path)
     return path
+
+
+def one(array):
+    """What a capture has of a single photograph."""
+    return Pixels([None if array is None else lambda: array.astype(np.float32)])
 
 
 def move_light(element, offset):
@@ -161,7 +167,7 @@ def test_vignetting_and_curve_are_undone_in_a_file_that_they_made(small_capture)
                         for u in range(width)] for v in range(height)])[..., None]  # fmt: skip
     file = (radiance * cosine**n) ** gamma
     np.testing.assert_allclose(recorded(radiance, sensor), file, rtol=1e-4)
-    changed = replace(capture, sensors=[sensor], images=[file.astype(np.float32)], linear=[True], masks=[None])
+    changed = replace(capture, sensors=[sensor], images=one(file), masks=one(None), valid=one(None))
     np.testing.assert_allclose(changed.observe([0]).rgb[0], radiance, rtol=1e-4)
     relative = 0.3 * (radiance * cosine**n / 0.3) ** gamma
     mean = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
@@ -267,8 +273,7 @@ def test_a_lens_whose_vignetting_is_known_dims_what_the_curve_records(small_capt
     width, height = sensor.size
     radiance = np.random.default_rng(6).uniform(0.1, 0.6, size=(height, width, 3)).astype(np.float32)
     file = recorded(radiance * 0.3 ** ((1 - gamma) / gamma), sensor)  # under the lights of that scene
-    before = replace(capture, sensors=[capture.sensors[4]], images=[file.astype(np.float32)], linear=[True],
-                     masks=[None])  # fmt: skip
+    before = replace(capture, sensors=[capture.sensors[4]], images=one(file), masks=one(None), valid=one(None))
     predicted = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
     np.testing.assert_allclose(predicted[0].detach(), before.observe([0]).rgb[0], rtol=1e-4)
 

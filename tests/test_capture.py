@@ -8,9 +8,11 @@ import pytest
 import tifffile
 import torch
 from conftest import AXES, CENTER
+from PIL import Image
 
 from mi_ring import images
 from mi_ring.capture import capture, decoding, loading
+from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
@@ -153,6 +155,52 @@ def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypa
     assert decodes() == 7
 
 
+@pytest.fixture
+def opened_files(monkeypatch):
+    """Names of the photographs and masks that have been read whole."""
+    calls, read = [], decoding.read_image
+    monkeypatch.setattr(decoding, "read_image", lambda path: calls.append(path.name) or read(path))
+    return calls
+
+
+def test_of_very_many_photographs_the_headers_are_read_and_the_rest_when_it_is_needed(
+    broken_capture, monkeypatch, opened_files
+):
+    path, _ = broken_capture
+    whole = loading.load_capture(path)
+    assert len(opened_files) == 24
+    opened_files.clear()
+    monkeypatch.setattr(loading, "MANY", 12 * 56 * 40 - 1)
+    scene = loading.load_capture(path)
+    assert opened_files == ["000.png", "000.png"]  # a photograph and its mask
+    for one, other in zip(whole.observe([7, 2])[:4], scene.observe([7, 2])[:4], strict=True):
+        assert torch.equal(one, other)
+    assert len(opened_files) == 6
+    Image.new("RGB", (56, 41)).save(path.parent / "images/004.png")
+    with pytest.raises(InputError, match=r"004.png: photograph \"004\", filename: is 56 x 41 pixels.*56 x 40"):
+        loading.load_capture(path)
+    (path.parent / "images/004.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="004.png.*cannot be read as an image"):
+        loading.load_capture(path)
+
+
+def test_pixels_are_kept_as_many_as_fit_and_shared(monkeypatch):
+    read = []
+
+    def reader(value):
+        return lambda: read.append(value) or np.full((5, 7), value, np.uint8)
+
+    monkeypatch.setattr("mi_ring.capture.pixels.KEPT", 2 * 35)
+    shared = reader(3)
+    several = Pixels([reader(1), shared, None, shared, reader(4)])
+    assert several.given == [True, True, False, True, True] and not read
+    for _ in range(2):
+        assert [None if array is None else array[0, 0] for array in several] == [1, 3, None, 3, 4]
+    assert read == [1, 3, 4, 4]
+    part = several.part([4, 1]).replaced({0: reader(5)})
+    assert [array[0, 0] for array in part] == [5, 3] and read[4:] == [5]
+
+
 def test_each_photograph_is_remembered_at_its_own_scale(small_capture, decodes):
     scene = loading.load_capture(small_capture)
     for _ in range(3):
@@ -182,7 +230,7 @@ def test_no_masks_are_found_in_a_bright_room(broken_capture):
         image = np.array(mi.Bitmap(str(file)))
         mi.Bitmap(np.maximum(image, 90)).write(str(file))
     scene = loading.load_capture(path, masks="none")
-    assert scene.threshold is None and scene.masks == [None] * 12
+    assert scene.threshold is None and list(scene.masks) == [None] * 12
 
 
 def test_a_room_is_lit_where_more_is_seen_than_the_object(small_capture, broken_capture):

@@ -365,7 +365,7 @@ def test_neus(tmp_path):
     for sensor, (R, t) in zip(scene.sensors, cameras()):
         np.testing.assert_allclose(in_scene(sensor), by_hand(R, t) + 0.5, atol=0.01)  # integers are pixels' centres
     assert (scene.masks[0] == disc()[..., 0]).all()
-    assert scene.linear == [False] * 3
+    assert [image.dtype for image in scene.images] == [np.uint8] * 3  # sRGB, unless they say otherwise
 
 
 def test_wildlight(tmp_path):

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.decoding import decode, shade
+from mi_ring.capture.decoding import decode, is_linear, shade
+from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import NoParallax, nearest_point
-from mi_ring.geometry.hull import Hull, Silhouette, evenly
+from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
 from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.visibility import View
@@ -23,6 +24,7 @@ from mi_ring.rendering.visibility import View
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23
 
+SOME, COARSE = 50, 128  #: how many photographs, and pixels across them, tell how bright object and room are
 LIT = 0.01  #: brightness of the background, in that of the object, from which a room is not black
 
 
@@ -47,7 +49,7 @@ class Observation(NamedTuple):
 
 @dataclass
 class Capture:
-    """What a scene file gives to a fit. `images` hold the files' encoded pixels, decoded on demand by `observe`.
+    """What a scene file gives to a fit. `images` are the files' encoded pixels, decoded on demand by `observe`.
 
     Nothing that renders or fits a capture changes it.
     """
@@ -58,10 +60,9 @@ class Capture:
     sensors: list  #: the photographs
     photographs: Photographs  #: their cameras and lights
     shadows: bool
-    images: list[np.ndarray] = field(default_factory=list)  #: (H, W, 3) uint8, uint16 or float32 each
-    linear: list[bool] = field(default_factory=list)  #: are the encoded pixels linear radiance, or sRGB?
-    masks: list[np.ndarray | None] = field(default_factory=list)  #: (H, W) uint8, 0 background, 255 object
-    valid: list[np.ndarray | None] = field(default_factory=list)  #: (H, W) uint8, 0 where the photograph shows nothing
+    images: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W, 3) uint8, uint16 or float32 each
+    masks: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W) uint8, 0 background, 255 object
+    valid: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W) uint8, 0 where the photograph shows nothing
     threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were not
 
     def __post_init__(self) -> None:
@@ -94,9 +95,9 @@ class Capture:
 
     def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
         """The photographs of these indices alone."""
-        names = "sensors", "images", "linear", "masks", "valid"
-        lists: dict[str, Any] = {name: [values[k] for k in index] for name in names if (values := getattr(self, name))}
-        return replace(self, photographs=Photographs.of(lists["sensors"], self.photographs.room), **lists)
+        sensors = [self.sensors[k] for k in index]
+        pixels = {name: getattr(self, name).part(index) for name in ("images", "masks", "valid") if self.images}
+        return replace(self, sensors=sensors, photographs=Photographs.of(sensors, self.photographs.room), **pixels)
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
@@ -109,7 +110,7 @@ class Capture:
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
         rgb, clipped, mask, valid = zip(*(self.decoded(k, scale) for k in index))
-        masked = torch.tensor([self.masks[k] is not None for k in index])
+        masked = torch.tensor([self.masks.given[k] for k in index])
         if all(v is None for v in valid):
             return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, None)
         shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
@@ -123,7 +124,8 @@ class Capture:
                 return result
             self._remembered -= self._decoded.pop(k)[1][2].numel()
         sensor = self.sensors[k]
-        linear, saturated = decode(self.images[k], self.linear[k], sensor.saturation, sensor.gamma, sensor.contrast)
+        image = self.images[k]
+        linear, saturated = decode(image, is_linear(sensor, image), sensor.saturation, sensor.gamma, sensor.contrast)
         linear = linear / shade(sensor)
         mask, own = self.masks[k], self.valid[k]
         mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
@@ -148,11 +150,12 @@ class Capture:
     def exposure(self) -> float:
         """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks).
 
-        Of thousands of photographs a few hundred tell.
+        Of many photographs some tell.
         """
         total, count = 0.0, 0
-        for k in self.spread():
-            rgb, _, mask, masked, _ = self.observe([k], 4 if min(self.sensors[k].size) >= 16 else 1)
+        for k in self.spread(SOME):
+            side = min(self.sensors[k].size)
+            rgb, _, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
         if not total > 0:
@@ -166,8 +169,8 @@ class Capture:
         Where the room was black they say that nothing is there.
         """
         shares = []
-        for k in self.spread(50):
-            rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.sensors[k].size) // 128))
+        for k in self.spread(SOME):
+            rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.sensors[k].size) // COARSE))
             inside, outside = mask[0] > 0.99, blur(mask, 2.0)[0] < 0.01
             if valid is not None:
                 outside &= valid[0]
@@ -186,24 +189,28 @@ class Capture:
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
-    def silhouettes(self) -> list[Silhouette]:
-        """The masks with their cameras, one for all photographs that share both."""
-        once: dict[tuple, Silhouette] = {}
-        for k, (mask, sensor) in enumerate(zip(self.masks, self.sensors)):
+    def silhouettes(self, most: int | None = None) -> list[Silhouette]:
+        """The masks with their cameras, small, one for all photographs that share both; at most so many, evenly."""
+        once: dict[tuple, int] = {}
+        for k, (mask, sensor) in enumerate(zip(self.masks.readers, self.sensors)):
             if mask is not None:
-                silhouette = Silhouette(mask, sensor.camera, self.outline(k), self.valid[k])
-                once.setdefault((id(mask), sensor.camera.to_world.tobytes()), silhouette)
-        return list(once.values())
+                once.setdefault((mask, sensor.camera.to_world.tobytes()), k)
+        all_ = list(once.values())
+        chosen = [all_[i] for i in evenly(len(all_), len(all_) if most is None else most)]
+        return [
+            small_silhouette(Silhouette(self.masks[k], self.sensors[k].camera, self.outline(k), self.valid[k]))
+            for k in chosen
+        ]
 
     @property
     def views(self) -> list[View]:
         """What each photograph can show."""
-        return [View(sensor.camera, valid) for sensor, valid in zip(self.sensors, self.valid, strict=True)]
+        return views_of(self.sensors, self.valid)
 
     @functools.cached_property
     def hull(self) -> Hull | None:
         """The visual hull of the masks, if there are any and they are seen from more than one side."""
-        silhouettes = self.silhouettes()
+        silhouettes = self.silhouettes(MOST)
         try:
             return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
         except NoParallax:
@@ -225,6 +232,16 @@ class Capture:
             middle, ball = sphere_of_masks(self.hull) if self.hull else sphere_of_cameras(self)
             center, radius = middle if center is None else center, ball if radius is None else radius
         return center, radius
+
+
+def views_of(sensors: Sequence, valid: Pixels) -> list[View]:
+    """What photographs can show that have these masks of what is valid, which are made small."""
+    small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
+    for k, reader in enumerate(valid.readers):
+        if reader not in small:
+            small[reader] = shrink_mask(valid[k], WIDTH)
+    found = [small[reader] for reader in valid.readers]
+    return [View(sensor.camera.shrunk(scale), mask) for sensor, (mask, scale) in zip(sensors, found, strict=True)]
 
 
 def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:

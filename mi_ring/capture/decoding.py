@@ -1,13 +1,16 @@
 """Photographs and masks from files: encoded pixels, and the linear radiance that they mean."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.images import contrasted, linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.images import contrasted, linear_to_srgb, read_image, read_size, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
+
+Read = TypeVar("Read")
 
 
 def decode(
@@ -48,19 +51,36 @@ def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
 
     Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
     """
-    field = f'photograph "{sensor.id()}", {field}'
-    if not path.is_file():
-        raise InputError(f"{scene}: {field}: no such file: {path}")
-    try:
-        pixels = read_image(path)
-    except Exception as error:
-        raise InputError(f"{path}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
-    if pixels.shape[1::-1] != sensor.size:
-        found, expected = ("{} x {}".format(*size) for size in (pixels.shape[1::-1], sensor.size))
-        raise InputError(f"{path}: {field}: is {found} pixels, the film says {expected}")
+    pixels = opened(read_image, path, field, sensor, scene)
+    require_size(pixels.shape[1::-1], path, field, sensor)
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
-        raise InputError(f"{path}: {field}: contains pixels that are NaN, infinite or above {LARGEST:g}")
+        what = f'photograph "{sensor.id()}", {field}'
+        raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
+
+
+def require_header(path: Path, field: str, sensor: Any, scene: Path) -> None:
+    """Raise as `read_pixels` does, for what the first bytes of an image file tell."""
+    require_size(opened(read_size, path, field, sensor, scene), path, field, sensor)
+
+
+def opened(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
+    """What is read of a file. Raises InputError if there is none, or if it is no image."""
+    what = f'photograph "{sensor.id()}", {field}'
+    if not path.is_file():
+        raise InputError(f"{scene}: {what}: no such file: {path}")
+    try:
+        return read(path)
+    except Exception as error:
+        raise InputError(f"{path}: {what}: cannot be read as an image ({' '.join(str(error).split())})") from error
+
+
+def require_size(size: tuple[int, ...], path: Path, field: str, sensor: Any) -> None:
+    """Raise InputError unless a picture is as large as the film of its photograph."""
+    if size != sensor.size:
+        found, expected = ("{} x {}".format(*size) for size in (size, sensor.size))
+        what = f'photograph "{sensor.id()}", {field}'
+        raise InputError(f"{path}: {what}: is {found} pixels, the film says {expected}")
 
 
 def read_photograph(sensor: Any, scene: Path) -> np.ndarray:
@@ -84,13 +104,8 @@ def is_linear(sensor: Any, pixels: np.ndarray) -> bool:
     return sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
 
 
-def read_mask(sensor: Any, file: Path | None, field: str, scene: Path) -> np.ndarray | None:
-    """Mask (H, W) uint8 from a file that a photograph names in a `field`, None if it names none.
-
-    Of a photograph that is its own mask it is the alpha channel.
-    """
-    if file is None:
-        return None
+def read_mask(sensor: Any, file: Path, field: str, scene: Path) -> np.ndarray:
+    """Mask (H, W) uint8 from a file that a photograph names in a `field`; its alpha channel if it names itself."""
     pixels = read_pixels(file, field, sensor, scene)
     if file == sensor.filename and pixels.shape[2] not in (2, 4):
         raise InputError(f'{file}: photograph "{sensor.id()}", {field}: is the photograph itself, which has no '

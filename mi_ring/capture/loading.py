@@ -1,14 +1,18 @@
 """Opens scene files: what a fit would stumble over later is said at once."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.capture.capture import Capture
-from mi_ring.capture.decoding import is_linear, read_mask, read_photograph
+from mi_ring.capture.capture import Capture, views_of
+from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.masks import find_masks
+from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.errors import InputError, SceneError, require_file
 from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
@@ -21,6 +25,7 @@ from mi_ring.system import llvm
 from mi_ring.system.progress import progress
 
 FLATTEST = 8  #: longer side of a photograph by its shorter one
+MANY = 2**31  #: pixels of all photographs, about a minute of decoding; of more the headers must do at first
 
 
 def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
@@ -55,25 +60,32 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
             size = "{} x {}".format(*sensor.size)
             raise InputError(f'{path}: photograph "{sensor.id()}", film: is {size} pixels; sides of more than '
                              f"{FLATTEST} : 1 cannot be made smaller")  # fmt: skip
-    reading = progress(sensors, "reading", unit="photograph", disable=None)
-    pixels = [read_photograph(s, path) for s in reading]
-    linear = [is_linear(s, image) for s, image in zip(sensors, pixels)]
-    given = read_once([(s, s.mask) for s in sensors], "mask", path) if masks != "none" else [None] * len(sensors)
-    valid = read_once([(s, s.valid) for s in sensors], "valid", path)
-    capture = Capture(path, scene, shapes[0], sensors, photographs, shadows, pixels, linear, given, valid)
-    if masks != "given" and all(mask is None for mask in given):
+    pixels = Pixels([partial(read_photograph, s, path) for s in sensors])
+    given = masks_of(sensors, "mask", path) if masks != "none" else Pixels([None] * len(sensors))
+    valid = masks_of(sensors, "valid", path)
+    many = sum(width * height for width, height in (s.size for s in sensors)) > MANY
+    for k, sensor in enumerate(progress(sensors, "reading", unit="photograph", disable=None)):
+        if many and k:  # decoded as they are needed; the first tells what all are like
+            for field, file in (("filename", sensor.filename), ("mask", sensor.mask), ("valid", sensor.valid)):
+                if file and (field != "mask" or masks != "none"):
+                    require_header(file, field, sensor, path)
+        else:
+            pixels[k], given[k], valid[k]
+    capture = Capture(path, scene, shapes[0], sensors, photographs, shadows, pixels, given, valid)
+    if masks != "given" and not any(given.given):
         find_masks(capture)
     return capture
 
 
-def read_once(files: list, field: str, scene: Path) -> list:
-    """The masks (H, W) that photographs name in a field, by (sensor, file). Those that share one share its pixels."""
-    read = {}
-    for sensor, file in files:
+def masks_of(sensors: Sequence, field: str, scene: Path) -> Pixels:
+    """The masks (H, W) that photographs name in a field; those that share a file share its pixels."""
+    readers: dict[tuple, Reader] = {}
+
+    def reader(sensor: Any, file: Path | None) -> Reader | None:
         key = file, sensor.size, file == sensor.filename
-        if key not in read:
-            read[key] = read_mask(sensor, file, field, scene)
-    return [read[file, sensor.size, file == sensor.filename] for sensor, file in files]
+        return readers.setdefault(key, partial(read_mask, sensor, file, field, scene)) if file else None
+
+    return Pixels(reader(sensor, getattr(sensor, field)) for sensor in sensors)
 
 
 def require_scene(path: Path) -> None:
@@ -124,8 +136,7 @@ def require_xml(path: Path) -> None:
 def load_views(path: Path) -> list[View]:
     """What each photograph of a scene file can show, without opening it. Raises InputError if it cannot be read."""
     _, sensors = open_scene(path)
-    valid = read_once([(s, s.valid) for s in sensors], "valid", path)
-    return [View(sensor.camera, mask) for sensor, mask in zip(sensors, valid)]
+    return views_of(sensors, masks_of(sensors, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:

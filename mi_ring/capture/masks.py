@@ -1,12 +1,14 @@
 """Masks by brightness, where a scene has none and the room was dark."""
 
+from functools import partial
+
 import numpy as np
 import scipy.ndimage
 import torch
 from skimage.filters import threshold_otsu
 
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.decoding import decode
+from mi_ring.capture.decoding import decode, is_linear
 from mi_ring.images import box_filter
 
 
@@ -36,17 +38,25 @@ def find_masks(capture: Capture) -> None:
     capture.threshold = dark_threshold(capture)
     if capture.threshold is None:
         return
-    largest = []
-    for k in range(len(capture)):
-        seen = brightness(capture, k) > capture.threshold
-        pieces, _ = scipy.ndimage.label(seen)
-        sizes = np.bincount(pieces.ravel())
-        sizes[0] = 0
-        capture.masks[k] = np.where(sizes[pieces] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
-        largest.append(sizes.max() / seen.size)
-    for k, share in enumerate(largest):
-        if share <= 0.02 * np.median(largest):  # a few hot pixels: the light did not reach the object
-            capture.masks[k] = None
+    found = capture.masks.replaced({k: partial(bright, capture, k) for k in range(len(capture))})
+    largest = [pieces(mask > 0)[1].max() / mask.size for mask in found]
+    few = 0.02 * np.median(largest)  # hot pixels: the light did not reach the object
+    capture.masks = found.replaced({k: None for k, share in enumerate(largest) if share <= few})
+
+
+def bright(capture: Capture, k: int) -> np.ndarray:
+    """The mask (H, W) uint8 of what is brighter than the dark room, but for specks."""
+    assert capture.threshold is not None
+    labels, sizes = pieces(brightness(capture, k) > capture.threshold)
+    return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
+
+
+def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (H, W) of the pieces of a mask (H, W) bool, from 1 on, and how many pixels each has, of 0 none."""
+    labels, _ = scipy.ndimage.label(mask)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels, sizes
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
@@ -57,4 +67,5 @@ def small_brightness(capture: Capture, k: int) -> np.ndarray:
 
 def brightness(capture: Capture, k: int) -> np.ndarray:
     """Radiance (H, W) of the brightest colour of each pixel."""
-    return decode(capture.images[k], capture.linear[k], 1.0)[0].max(-1)
+    image = capture.images[k]
+    return decode(image, is_linear(capture.sensors[k], image), 1.0)[0].max(-1)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -65,10 +66,12 @@ def find_outlines(fit: "Fit") -> dict[int, Tensor]:
 
 def with_outlines(capture: Capture, outlines: Mapping[int, Tensor]) -> Capture:
     """The capture with these masks instead of its own, as `find_outlines` gives them."""
-    masks = list(capture.masks)
-    for k, outline in outlines.items():
-        (width, height), (rows, columns) = capture.sensors[k].size, outline.shape
+
+    def enlarged(outline: Tensor, size: tuple[int, int]) -> np.ndarray:
+        (width, height), (rows, columns) = size, outline.shape
         scale = width // columns  # what is over is less than a pixel of the outline's
         whole = cv2.resize(255 * outline.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
-        masks[k] = np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
-    return replace(capture, masks=masks)
+        return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
+
+    readers = {k: partial(enlarged, outline, capture.sensors[k].size) for k, outline in outlines.items()}
+    return replace(capture, masks=capture.masks.replaced(readers))

@@ -173,7 +173,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         share = np.median([getattr(row, name) for row in rows])
         if share > limit:
             found.append(f"{share:.0%} {text}")
-    if all(mask is None for mask in capture.masks) and dark_threshold(capture) is None:
+    if not any(capture.masks.given) and dark_threshold(capture) is None:
         found.append("no masks, and the background is not dark, for which a fit would take it: give masks, or have "
                      "them found by mi-ring photos")  # fmt: skip
     share = room_light(np.array([row.brightness for row in lit]), received[[row in lit for row in rows]])
@@ -208,8 +208,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 def drop_empty(capture: Capture) -> list[str]:
     """Forget masks with nothing in them and return the names of their photographs."""
-    given = [(k, mask) for k, mask in enumerate(capture.masks) if mask is not None]
-    empty = [k for k, mask in given if not (shrink_mask(mask, WIDTH)[0] > 127).any()]
-    for k in empty:
-        capture.masks[k] = None
+    given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
+    empty = [k for k in given if not (shrink_mask(capture.masks[k], WIDTH)[0] > 127).any()]
+    capture.masks = capture.masks.replaced(dict.fromkeys(empty))
     return [capture.names[k] for k in empty]

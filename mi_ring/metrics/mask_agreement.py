@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.hull import Hull, Silhouette, evenly, small_silhouette, thinned
+from mi_ring.geometry.hull import Hull, Silhouette, evenly, thinned
 
 CONFORMS = 0.9  #: share of a mask that the others agree to, at least
 
@@ -20,7 +20,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     """
     if not capture.hull:
         return {}, []
-    silhouettes = [small_silhouette(silhouette) for silhouette in capture.silhouettes()]
+    silhouettes = capture.silhouettes()
     pixels = max(16, 12800 // len(silhouettes))
 
     def shares(hull: Hull) -> np.ndarray:

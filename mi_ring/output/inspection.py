@@ -56,7 +56,7 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     found += capture_findings(capture, rows, center)
     page = capture_sheet(capture, rows, center, radius)
     advance()
-    given = sum(mask is not None for mask in capture.masks)
+    given = sum(capture.masks.given)
     if capture.threshold is not None:
         masks = "found by brightness, for the room was dark"
     else:

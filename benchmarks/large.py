@@ -1,0 +1,98 @@
+"""Open and fit a capture of very many large photographs, and print what it costs in time and memory.
+
+    python benchmarks/large.py CAPTURE.xml [--count 2000] [--size 3464] [--out out/large]
+
+The photographs are those of the capture, enlarged and written as JPEG, the same few again and again under other names.
+"""
+
+import argparse
+import copy
+import datetime
+import os
+import resource
+import time
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+
+import mi_ring
+from mi_ring.fitting.config import Config
+from mi_ring.images import linear_to_srgb, read_image, to_bytes
+from mi_ring.system.machine import processor
+
+STEPS = 2  #: iterations
+
+
+def enlarged(source: Path, target: Path, size: int) -> None:
+    """A photograph or mask, `size` pixels wide, its colours as sRGB."""
+    pixels = read_image(source)
+    if pixels.dtype != np.uint8:
+        pixels = to_bytes(linear_to_srgb(pixels / (65535 if pixels.dtype == np.uint16 else 1)))
+    height = round(size * pixels.shape[0] / pixels.shape[1])
+    target.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(target), cv2.resize(pixels, (size, height))[..., ::-1] if pixels.shape[2] > 1 else
+                cv2.resize(pixels, (size, height)))  # fmt: skip
+
+
+def write(path: Path, count: int, size: int, out: Path) -> Path:
+    """A scene of so many photographs."""
+    tree = ElementTree.parse(path)
+    root = tree.getroot()
+    sensors = root.findall("sensor")
+    for sensor in sensors:
+        root.remove(sensor)
+    for k in range(count):
+        sensor = copy.deepcopy(sensors[k % len(sensors)])
+        sensor.set("id", f"{k:05}")
+        for name, suffix in (("filename", ".jpg"), ("mask", ".png")):
+            element = sensor.find(f"string[@name='{name}']")
+            first = out / name / (Path(element.get("value")).stem + suffix)
+            if not first.exists():
+                enlarged(path.parent / element.get("value"), first, size)
+            link = first.with_name(f"{k:05}{suffix}")
+            if not link.exists():
+                os.link(first, link)
+            element.set("value", f"{name}/{link.name}")
+        width, height = (sensor.find(f"film/integer[@name='{side}']") for side in ("width", "height"))
+        scale = size / int(width.get("value"))
+        height.set("value", str(round(scale * int(height.get("value")))))
+        width.set("value", str(size))
+        for number in sensor.findall("float"):
+            if number.get("name") in ("fx", "fy", "cx", "cy"):
+                number.set("value", repr(scale * float(number.get("value"))))
+        root.append(sensor)
+    tree.write(out / "scene.xml")
+    return out / "scene.xml"
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--size", type=int, default=3464)
+    parser.add_argument("--out", type=Path, default=Path("out/large"))
+    options = parser.parse_args()
+    scene = write(options.capture, options.count, options.size, options.out)
+    print(f"{processor()}; {datetime.date.today()}; {options.count} photographs, {options.size} pixels wide\n")
+    print("| | wall, s | processor, s | GiB at most |\n|---|---|---|---|", flush=True)
+    wall, busy = time.perf_counter(), time.process_time()
+
+    def row(what: str) -> None:
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        print(f"| {what} | {time.perf_counter() - wall:.1f} | {time.process_time() - busy:.1f} | {memory:.1f} |",
+              flush=True)  # fmt: skip
+
+    capture = mi_ring.load_capture(scene)
+    row("opened")
+    fit = mi_ring.Fit(capture, Config.preset("fast", refine=("none",)))
+    row("hull, brightness")
+    for _ in range(STEPS):
+        fit.step()
+    row(f"{STEPS} iterations")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Pixels of many files: read when they are asked for, and kept as long as there is room."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+#: Bytes of photographs, and as many of masks, that are kept as their files decode; the others are read each time.
+KEPT = 2**30
+
+Reader = Callable[[], np.ndarray]
+
+
+class Pixels(Sequence):
+    """Arrays by place, each as its reader gives it; None where there is no reader. Places of one reader share an array.
+
+    Which photograph is next is drawn by lot: those that were read first are as good to keep as those that were last.
+    """
+
+    def __init__(self, readers: Iterable[Reader | None], kept: dict[Reader, np.ndarray] | None = None) -> None:
+        """`kept`: what has been read of them so far."""
+        self.readers = list(readers)
+        self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
+
+    def __len__(self) -> int:
+        return len(self.readers)
+
+    def __getitem__(self, k):  # type: ignore[no-untyped-def]  # int or slice, as lists have it
+        if isinstance(k, slice):
+            return self.part(range(len(self))[k])
+        reader = self.readers[k]
+        if reader is None or reader in self.kept:
+            return None if reader is None else self.kept[reader]
+        array = reader()
+        if sum(other.nbytes for other in self.kept.values()) + array.nbytes <= KEPT:
+            self.kept[reader] = array
+        return array
+
+    @property
+    def given(self) -> list[bool]:
+        """Which places have one; nothing is read."""
+        return [reader is not None for reader in self.readers]
+
+    def part(self, index: Iterable[int]) -> "Pixels":
+        """Those of these places alone."""
+        return Pixels([self.readers[k] for k in index], self.kept)
+
+    def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
+        """The same with others in some places."""
+        return Pixels([readers.get(k, reader) for k, reader in enumerate(self.readers)], self.kept)
