@@ -16,11 +16,11 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+from accuracy import processor
 
 import mi_ring
 from mi_ring.fitting.config import Config
 from mi_ring.images import linear_to_srgb, read_image, to_bytes
-from mi_ring.system.machine import processor
 
 STEPS = 2  #: iterations
 
