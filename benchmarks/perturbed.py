@@ -29,6 +29,7 @@ import mi_ring
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.lights import Lights
+from mi_ring.synthesis.degradation import miscalibrated
 
 WRONG = "cameras", "light", "power", "curve", "contrast"
 CURVES = {"curve": "gamma", "contrast": "contrast"}  #: as photographs call them
@@ -40,30 +41,12 @@ FITS = {"exact": (False, False), "again": (False, True), "wrong": (True, False),
 
 def perturbed(capture, wrong: str, by: float, seed: int):
     """The capture with other cameras or lights."""
-    random = np.random.default_rng(seed)
     center, _ = capture.sphere()
     cameras, lights = [sensor.camera for sensor in capture.sensors], list(Lights.of(capture.sensors))
-    direction = random.normal(size=3)
-    direction /= np.linalg.norm(direction)
     if wrong in CURVES:
         return with_calibration(capture, cameras, lights, **{CURVES[wrong]: 1 + by / 100})
-    for k, (camera, light) in enumerate(zip(cameras, lights)):
-        distance = np.linalg.norm(camera.position - center)
-        if wrong == "cameras":
-            to_world = camera.to_world.copy()
-            to_world[:3, :3] @= Rotation.from_rotvec(np.radians(random.normal(0, by, 3))).as_matrix()
-            shift = camera.to_world[:3, :3] @ random.normal(0, by / 100 * distance, 3)
-            to_world[:3, 3] += shift
-            cameras[k] = camera._replace(to_world=to_world)
-            # A flash stays where it is in the camera's axes.
-            own = camera.to_world[:3, :3].T @ (light.vector - camera.position)
-            lights[k] = light._replace(vector=to_world[:3, :3] @ own + to_world[:3, 3])
-        elif wrong == "light":
-            shift = camera.to_world[:3, :3] @ direction * by / 100 * distance
-            lights[k] = light._replace(vector=light.vector + shift)
-        else:
-            lights[k] = light._replace(rgb=light.rgb * np.exp(random.normal(0, by / 100)))
-    return with_calibration(capture, cameras, lights)
+    amount = {{"cameras": "turned", "light": "shifted", "power": "scaled"}[wrong]: by}
+    return with_calibration(capture, *miscalibrated(cameras, lights, center, np.random.default_rng(seed), **amount))
 
 
 def write(capture, path: Path) -> None:

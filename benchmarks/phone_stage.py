@@ -1,13 +1,12 @@
 """What simulated phone captures show and how it is lit: objects, sheet, table, room and flash; path traced by Mitsuba.
 
 Used by `phone.py`. World: that of the sheet [mm], origin in its middle, x right, y up the page, z out of the paper.
-Nothing in here shares code or model with what reconstructs it, but for the layout of a camera.
+Rays and paths are those of `mi_ring.synthesis.tracing`. Nothing in here shares code or model with what reconstructs it,
+but for the layout of a camera.
 """
 
 import sys
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "scenes"))
@@ -23,7 +22,17 @@ import numpy as np
 import trimesh
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
-from mi_ring.geometry.camera import Camera
+from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.synthesis.tracing import (
+    Shot,
+    Traced,
+    Window,
+    averaged,
+    covered,
+    flashed_along,
+    radiance_along,
+    rays_of,
+)
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -38,7 +47,7 @@ PAGE = np.array([210.0, 297.0])  #: A4 [mm]
 BOARD = (9, 13, 20.0, 15.0)  #: squares across and down, their side and that of a marker [mm]
 PAPER, INK = 0.8, 0.05  #: albedos
 TABLE, THICKNESS = np.array([1400.0, 1100.0]), 0.1  #: of the table; of the sheet above it [mm]
-FINE, STRIDE = 36, 1_000_003  #: paths per pixel where the object is, at least; between the seeds of their rounds
+FINE, ROUND = 36, 10_000_019  #: paths per pixel where the object is, at least; between the seeds of their rounds
 BACKDROP = 500.0  #: how far behind the turntable it stands [mm]
 ROOM_COLOUR = np.array([1.12, 1.0, 0.88])  #: of the light in the room; the flash is white
 
@@ -85,13 +94,8 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray, rough: np.ndarray, glos
     """The object as Mitsuba sees it, with smooth normals."""
     attributes = {"base_color": "vertex_color", "roughness": "vertex_roughness"}
     bsdf = {key: {"type": "mesh_attribute", "name": name} for key, name in attributes.items()}
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "principled", **bsdf, **gloss})
-    shape = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props, True)
-    params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(np.asarray(mesh.vertices, np.float32).ravel())
-    params["faces"] = mi.UInt32(np.asarray(mesh.faces, np.uint32).ravel())
-    params.update()
+    shape = mesh_of(mesh.vertices, mesh.faces)
+    shape.set_bsdf(mi.load_dict({"type": "principled", **bsdf, **gloss}))
     shape.add_attribute("vertex_color", 3, colours.astype(np.float32).ravel())
     shape.add_attribute("vertex_roughness", 1, rough.astype(np.float32).ravel())
     return shape
@@ -203,70 +207,6 @@ mi.register_emitter("cone_flash", ConeFlash)
 # --- photographs -----------------------------------------------------------------------------------------------------
 
 
-Window = tuple[int, int, int, int]  #: part of a picture: left, top, right, bottom [px]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A camera with its lens: `camera` without distortion, which is x ↦ x (1 + k1 r² + k2 r⁴) of tangents."""
-
-    camera: Camera
-    distortion: tuple[float, float] = (0.0, 0.0)
-    motion: tuple[float, float] = (0.0, 0.0)  #: of the picture while it is exposed [px]
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) in which points (n, 3) are seen in the middle of the exposure."""
-        x, y, z = ((points - self.camera.position) @ self.camera.to_world[:3, :3]).T
-        tangents = np.stack([-x / z, -y / z], 1)
-        r2 = (tangents**2).sum(1, keepdims=True)
-        k1, k2 = self.distortion
-        return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
-
-    def around(self, points: np.ndarray) -> "Window":
-        """The part of the picture that holds points (n, 3) and a margin."""
-        pixels, size = self.project(points), self.camera.size
-        left, top = np.clip(pixels.min(0) - 4, 0, np.array(size) - 1).astype(int).tolist()
-        right, bottom = np.clip(pixels.max(0) + 5, [left + 1, top + 1], size).astype(int).tolist()
-        return left, top, right, bottom
-
-
-def rays_of(shot: Shot, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
-    """`spp` = n² stratified rays through each pixel of a part of the picture, in consecutive lanes."""
-    left, top, right, bottom = window
-    width, height = right - left, bottom - top
-    side = round(spp**0.5)
-    lane = dr.arange(mi.UInt32, width * height * spp)
-    pixel, stratum = lane // spp, lane % spp
-    jitter = [mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, 4 * seed + k)) for k in range(3)]
-    time = (mi.Float((7 * stratum + pixel) % spp) + jitter[2]) / spp - 0.5
-    moved = [dr.opaque(mi.Float, m) * time for m in shot.motion]
-    u = dr.opaque(mi.Float, left) + mi.Float(pixel % width) + (mi.Float(stratum % side) + jitter[0]) / side + moved[0]
-    v = dr.opaque(mi.Float, top) + mi.Float(pixel // width) + (mi.Float(stratum // side) + jitter[1]) / side + moved[1]
-    (fx, fy), (cx, cy) = shot.camera.focal, shot.camera.centre
-    bent = mi.Vector2f((u - dr.opaque(mi.Float, cx)) / dr.opaque(mi.Float, fx),
-                       (v - dr.opaque(mi.Float, cy)) / dr.opaque(mi.Float, fy))  # fmt: skip
-    k1, k2 = (dr.opaque(mi.Float, k) for k in shot.distortion)
-    straight = mi.Vector2f(bent)
-    for _ in range(8):  # contracts by a tenth each time
-        r2 = dr.squared_norm(straight)
-        straight = bent / (1 + r2 * (k1 + k2 * r2))
-    pose = [[dr.opaque(mi.Float, float(value)) for value in row] for row in shot.camera.to_world[:3]]
-    direction = mi.Vector3f(*(-row[0] * straight.x - row[1] * straight.y + row[2] for row in pose))
-    return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*(row[3] for row in pose)), dr.normalize(direction)))
-
-
-def averaged(values: list, shot: Shot, window: Window, spp: int) -> np.ndarray:
-    """Means over the samples of each pixel of a part of the picture, 0 around it (H, W, channels)."""
-    left, top, right, bottom = window
-    means = [dr.block_sum(value, spp) / spp for value in values]
-    dr.eval(means)
-    picture = np.zeros((*shot.camera.size[::-1], len(values)))
-    picture[top:bottom, left:right] = np.stack([np.array(mean) for mean in means], 1).reshape(
-        bottom - top, right - left, len(values)
-    )
-    return picture
-
-
 class Stage:
     """The object, what it stands on and the light, to be photographed.
 
@@ -320,13 +260,11 @@ class Stage:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
 
         def flashed(window: Window, spp: int, seed: int) -> list:
-            direct, everything = (self.trace(self.flashed, shot, window, spp, seed, depth) for depth in (2, 4))
-            # Rare paths that meet the flash in a highlight would be white dots.
-            return [d + dr.clip(a - d, 0, self.brightest) for a, d in zip(everything, direct)]
+            return flashed_along(rays_of(shot, window, spp, seed), self.flashed, seed, 4, self.brightest)
 
         if self.bare:
             window = shot.around(self.mesh.vertices)
-            return averaged(flashed(window, spp, seed), shot, window, spp)
+            return averaged(flashed, shot, window, spp, seed)
         return self.pictured(flashed, shot, spp, seed)
 
     def room_radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
@@ -334,33 +272,30 @@ class Stage:
 
         Apart, for an integrator that chooses between two lights is much noisier.
         """
-        return self.pictured(lambda *how: self.trace(self.lit, shot, *how, 3), shot, spp, seed)
 
-    def pictured(self, traced: Callable[[Window, int, int], list], shot: Shot, spp: int, seed: int) -> np.ndarray:
+        def lit(window: Window, spp: int, seed: int) -> list:
+            return radiance_along(rays_of(shot, window, spp, seed), self.lit, seed, 3)
+
+        return self.pictured(lit, shot, spp, seed)
+
+    def pictured(self, traced: Traced, shot: Shot, spp: int, seed: int) -> np.ndarray:
         """Radiance (H, W, 3) of paths `traced`(window, spp, seed), many more where the object is.
 
         What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
         which no photograph has, and darker to all who ask for medians.
         """
-        whole, near = (0, 0, *shot.camera.size), shot.around(self.mesh.vertices)
-        picture = averaged(traced(whole, spp, seed), shot, whole, spp)
+        near = shot.around(self.mesh.vertices)
+        picture = averaged(traced, shot, shot.whole, spp, seed)
         rounds = range(-(-FINE // spp))
-        fine = np.mean([averaged(traced(near, spp, seed + k * STRIDE), shot, near, spp) for k in rounds], 0)
+        fine = np.mean([averaged(traced, shot, near, spp, seed + k * ROUND) for k in rounds], 0)
         left, top, right, bottom = near
         picture[top:bottom, left:right] = fine[top:bottom, left:right]
         return picture
 
-    def trace(self, scene: mi.Scene, shot: Shot, window: Window, spp: int, seed: int, depth: int) -> list:
-        """Radiance along the rays of a part of the picture: [R, G, B]."""
-        rays = rays_of(shot, window, spp, seed)
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, dr.width(rays))
-        path = mi.load_dict({"type": "path", "max_depth": depth})
-        return list(path.sample(scene, sampler, rays)[0])
-
     def coverage(self, shot: Shot, spp: int = 16) -> np.ndarray:
         """How much of each pixel shows the object (H, W)."""
-        window = shot.around(self.mesh.vertices)
-        hit = self.flashed.ray_intersect_preliminary(rays_of(shot, window, spp, 0))
-        mine = hit.is_valid() & (hit.shape == mi.ShapePtr(self.object))
-        return averaged([dr.select(mine, mi.Float(1), 0)], shot, window, spp)[..., 0]
+
+        def traced(window: Window, spp: int, seed: int) -> list:
+            return [covered(rays_of(shot, window, spp, seed), self.flashed, self.object)]
+
+        return averaged(traced, shot, shot.around(self.mesh.vertices), spp, 0)[..., 0]

@@ -81,20 +81,26 @@ def small_capture(tmp_path_factory):
     import trimesh
     from scipy.spatial.transform import Rotation
 
+    from mi_ring.geometry.camera import Camera
+    from mi_ring.images import linear_to_srgb, to_bytes
+    from mi_ring.rendering.lights import Light
+    from mi_ring.rendering.plain_mesh import mesh_of
+    from mi_ring.synthesis.cameras import look_at
+    from mi_ring.synthesis.stage import Stage
+    from mi_ring.synthesis.tracing import Shot
+
     folder = tmp_path_factory.mktemp("small")
     (folder / "images").mkdir()
     (folder / "masks").mkdir()
     turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     ball = trimesh.creation.icosphere(subdivisions=5)
-    mesh = mi.Mesh("ellipsoid", len(ball.vertices), len(ball.faces), mi.Properties(), True)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float((CENTER + ball.vertices * AXES @ turn.T).astype(np.float32).ravel())
-    params["faces"] = mi.UInt32(ball.faces.astype(np.uint32).ravel())
-    params.update()
+    vertices = CENTER + ball.vertices * AXES @ turn.T
+    mesh = mesh_of(vertices, ball.faces)
     bands = 0.5 + 0.5 * np.sin(3 * ball.vertices[:, :1] + 2 * ball.vertices[:, 2:])
     colour = bands * [0.6, 0.2, 0.1] + (1 - bands) * [0.3, 0.4, 0.2]
     mesh.add_attribute("vertex_color", 3, colour.astype(np.float32).ravel())
     mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}))
+    stage = Stage(mesh, vertices)
     width, height, fx, fy, cx, cy = 56, 40, 60.0, 66.0, 30.5, 18.0
     random, sensors = np.random.default_rng(5), []
     for k in range(12):
@@ -102,28 +108,13 @@ def small_capture(tmp_path_factory):
         direction /= np.linalg.norm(direction)
         origin = CENTER + random.uniform(120, 150) * direction
         target = CENTER + random.uniform(-3, 3, 3)
-        up = random.normal(size=3).tolist()
-        matrix = np.array(mi.ScalarTransform4f().look_at(origin.tolist(), target.tolist(), up).matrix)
+        matrix = look_at(origin, target, random.normal(size=3))
         light = origin + matrix[:3, :3] @ [15, 10, 0]
         intensity = 2.2 * np.linalg.norm(light - CENTER) ** 2
-        scene = mi.load_dict({
-            "type": "scene",
-            "object": mesh,
-            "light": {"type": "point", "position": light.tolist(), "intensity": float(intensity)},
-        })  # fmt: skip
-        # Rays by the README's conventions: x left, y up, z forward; 4 x 4 samples per pixel.
-        y, x = np.meshgrid((np.arange(4 * height) + 0.5) / 4, (np.arange(4 * width) + 0.5) / 4, indexing="ij")
-        local = np.stack([-(x - cx) / fx, -(y - cy) / fy, np.ones_like(x)], -1).reshape(-1, 3)
-        world = local @ matrix[:3, :3].T
-        world /= np.linalg.norm(world, axis=1, keepdims=True)
-        ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(*world.T.astype(np.float32)))
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(0, len(world))
-        radiance, hit, _ = mi.load_dict({"type": "direct"}).sample(scene, sampler, mi.RayDifferential3f(ray))
-        blocks = np.array(radiance).T.reshape(height, 4, width, 4, 3).mean((1, 3))
-        coverage = np.array(hit).reshape(height, 4, width, 4).mean((1, 3))
-        encoded = np.where(blocks <= 0.0031308, 12.92 * blocks, 1.055 * np.maximum(blocks, 1e-9) ** (1 / 2.4) - 0.055)
-        mi.Bitmap((np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)).write(str(folder / f"images/{k:03}.png"))
+        shot = Shot(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
+        radiance = stage.radiance(shot, Light("point", light, np.full(3, intensity)), 16, k, 2)
+        coverage = stage.coverage(shot, 16)
+        mi.Bitmap(to_bytes(linear_to_srgb(radiance))).write(str(folder / f"images/{k:03}.png"))
         mi.Bitmap((coverage[..., None] > 0.5).astype(np.uint8) * 255).write(str(folder / f"masks/{k:03}.png"))
         sensors.append(SENSOR.format(
             id=f"{k:03}", mask=f'\n    <string name="mask" value="masks/{k:03}.png"/>', fx=fx, fy=fy, cx=cx, cy=cy,

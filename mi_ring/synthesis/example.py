@@ -1,6 +1,5 @@
 """A small capture of the package's own making: flash photographs of a pot, path traced by stock Mitsuba."""
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,26 +8,21 @@ import numpy as np
 import trimesh
 from scipy.interpolate import CubicSpline
 
-from mi_ring.capture.scenefile import (
-    Element,
-    emitter_element,
-    load_element,
-    perspective_element,
-    photograph_element,
-    scene_bytes,
-    scene_element,
-)
+from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.synthesis.cameras import look_at
+from mi_ring.synthesis.stage import Stage
+from mi_ring.synthesis.tracing import Shot
 from mi_ring.system.progress import progress
 
 CENTER, HEIGHT = np.array([40.0, -15.0, 110.0]), 80.0  #: of the pot [mm]; y is up
 VIEWS, SIZE, FOCAL = 28, 192, 400.0  #: photographs, their pixels and focal length [px]
 DISTANCE = 230.0  #: from the camera to the pot [mm]
 FLASH = np.array([18.0, 12.0, 0.0])  #: beside the lens: to the left and above [mm]
-SPP = 64  #: samples per pixel
+SPP, DEPTH = 64, 4  #: paths per pixel, and the longest
 BRIGHTNESS = 0.9  #: linear radiance of a white surface that faces the flash, in the pictures
 
 #: Radius and height of the pot, in its height: foot, belly, shoulder, neck, lip, and a top that is closed.
@@ -71,23 +65,10 @@ def cameras() -> list[Camera]:
         y = 1 - 2 * (k + 0.5) / VIEWS
         turn = k * np.pi * (3 - np.sqrt(5))
         direction = np.array([np.cos(turn) * np.sqrt(1 - y * y), y, np.sin(turn) * np.sqrt(1 - y * y)])
-        up = [0.0, 1.0, 0.0] if abs(y) < 0.9 else [1.0, 0.0, 0.0]
-        look = mi.ScalarTransform4f().look_at((CENTER + DISTANCE * direction).tolist(), CENTER.tolist(), up)
-        result.append(Camera(np.array(look.matrix), np.full(2, FOCAL), np.full(2, SIZE / 2), (SIZE, SIZE)))
+        up = np.array([0.0, 1.0, 0.0] if abs(y) < 0.9 else [1.0, 0.0, 0.0])
+        to_world = look_at(CENTER + DISTANCE * direction, CENTER, up)
+        result.append(Camera(to_world, np.full(2, FOCAL), np.full(2, SIZE / 2), (SIZE, SIZE)))
     return result
-
-
-def photographed(mesh: mi.Mesh, corners: np.ndarray, camera: Camera, light: Light, spp: int, seed: int) -> np.ndarray:
-    """Linear radiance and coverage (H, W, 4) of a mesh with these corners by `path`, means over squares of pixels."""
-    element = perspective_element(camera, corners)
-    film = next(element.iter("film"))
-    ElementTree.SubElement(film, "string", name="pixel_format", value="rgba")
-    ElementTree.SubElement(film, "rfilter", type="box")
-    ElementTree.SubElement(element, "sampler", type="multijitter")
-    lamp, sensor = load_element(emitter_element(light)), load_element(element)
-    scene = mi.load_dict({"type": "scene", "mesh": mesh, "lamp": lamp, "sensor": sensor})
-    path = mi.load_dict({"type": "path", "max_depth": 4})
-    return np.array(mi.render(scene, integrator=path, spp=spp, seed=mi.UInt32(seed)))
 
 
 def write_example(folder: Path, spp: int = SPP) -> None:
@@ -101,14 +82,14 @@ def write_example(folder: Path, spp: int = SPP) -> None:
     for name in ("images", "masks", "truth"):
         (folder / name).mkdir()
     mesh.write_ply(str(folder / "truth" / "mesh.ply"))
-    elements: list[Element] = []
+    stage, elements = Stage(mesh, vertices), list[Element]()
     for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
         position = camera.position + camera.to_world[:3, :3] @ FLASH
         light = Light("point", position, np.full(3, np.pi * BRIGHTNESS * DISTANCE**2))
-        picture = photographed(mesh, vertices, camera, light, spp, k)
-        name = f"{k:03}"
-        write_image(to_bytes(linear_to_srgb(picture[..., :3])), folder / "images" / f"{name}.png")
-        write_image(to_bytes(picture[..., 3:] > 0.5), folder / "masks" / f"{name}.png")
+        name, shot = f"{k:03}", Shot(camera)
+        picture = stage.radiance(shot, light, spp, k, DEPTH)
+        write_image(to_bytes(linear_to_srgb(picture)), folder / "images" / f"{name}.png")
+        write_image(to_bytes(stage.coverage(shot)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
         files = f"images/{name}.png", f"masks/{name}.png"
         elements.append(photograph_element(name, files[0], camera, light, files[1], calibrated=True))
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

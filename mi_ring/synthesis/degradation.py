@@ -1,0 +1,69 @@
+"""What is wrong with photographs and their calibration: exposure, noise, bits; cameras and lights elsewhere."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.rendering.lights import Light
+
+Format = Literal["exr", "png16", "png8"]
+
+BRIGHTEST = 16.0  #: beyond, what fell onto a sensor is of no interest [full scale]
+HIGHEST = 6e4  #: that an EXR of half precision holds
+
+
+def noisy(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
+    """Linear values with the noise of a sensor that has so many `electrons` at full scale (0: no shot noise).
+
+    `read`: standard deviation of reading it [electrons of 10,000 at full scale where `electrons` is 0].
+    """
+    full = electrons or 10_000.0
+    value = np.clip(linear, 0, BRIGHTEST) * full
+    if electrons:
+        value = random.poisson(value).astype(float)
+    return (value + random.normal(0, read, value.shape)) / full
+
+
+def encoded(linear: np.ndarray, kind: Format) -> np.ndarray:
+    """Pixels (H, W, 3) as the file has them: half floats, or 16 bits, both linear; or 8 bits, sRGB."""
+    if kind == "exr":
+        return np.clip(linear, 0, HIGHEST).astype(np.float16)
+    if kind == "png16":
+        return (np.clip(linear, 0, 1) * 65535 + 0.5).astype(np.uint16)
+    return to_bytes(linear_to_srgb(linear))
+
+
+def miscalibrated(
+    cameras: Sequence[Camera], lights: Sequence[Light], center: np.ndarray, random: np.random.Generator,
+    turned: float = 0.0, shifted: float = 0.0, scaled: float = 0.0,
+) -> tuple[list[Camera], list[Light]]:  # fmt: skip
+    """Other cameras and lights, wrong by known amounts.
+
+    `turned`: each camera about each of its axes by a normal angle of so many degrees, and along each by a normal share
+    of so many per cent of its distance from the `center` (3,); its flash goes with it. `shifted`: all point lights by
+    so many per cent of that distance, in one direction of the cameras' axes. `scaled`: each light's power by a
+    lognormal factor of so many per cent.
+    """
+    cameras, lights = list(cameras), list(lights)
+    direction = random.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    for k, (camera, light) in enumerate(zip(cameras, lights, strict=True)):
+        distance, point = np.linalg.norm(camera.position - center), light.kind == "point"
+        if turned:
+            to_world = camera.to_world.copy()
+            to_world[:3, :3] @= Rotation.from_rotvec(np.radians(random.normal(0, turned, 3))).as_matrix()
+            to_world[:3, 3] += camera.to_world[:3, :3] @ random.normal(0, turned / 100 * distance, 3)
+            cameras[k] = camera._replace(to_world=to_world)
+            if point:  # a flash stays where it is in the camera's axes
+                own = camera.to_world[:3, :3].T @ (light.vector - camera.position)
+                light = light._replace(vector=to_world[:3, :3] @ own + to_world[:3, 3])
+        if shifted and point:
+            light = light._replace(vector=light.vector + camera.to_world[:3, :3] @ direction * shifted / 100 * distance)
+        if scaled:
+            light = light._replace(rgb=light.rgb * np.exp(random.normal(0, scaled / 100)))
+        lights[k] = light
+    return cameras, lights

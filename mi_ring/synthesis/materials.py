@@ -1,0 +1,120 @@
+"""What the object is made of: any BSDF of Mitsuba's, a measured material, or two of them in a pattern."""
+
+import re
+import shlex
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.capture.loading import reason
+from mi_ring.capture.scenefile import load_element, move_names
+from mi_ring.errors import InputError, require_file
+from mi_ring.images import read_image
+
+COLOURS = "vertex_color"  #: name of the mesh attribute that has the colours of the mesh's file
+COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: what a mesh with colours is made of
+PLAIN = "principled base_color=0.55,0.4,0.25 roughness=0.4"  #: and one without
+FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin and its parameters"
+
+
+class Pattern(NamedTuple):
+    """How two materials share a surface: a picture that is projected along one axis of the world, repeated or not."""
+
+    weights: np.ndarray  #: (rows, columns) share of the second material
+    uv: np.ndarray  #: (V, 2) of the vertices
+
+    def of(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
+        """Both as one BSDF."""
+        pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
+        nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
+        return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
+
+
+def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
+    """Stripes across the axis `up`, checks, or a picture's bright parts, over the bounding box of vertices (V, 3).
+
+    Texture coordinates are linear in space, so that edges are sharp however coarse the mesh is. Raises InputError,
+    which names the `field`, for a picture that cannot be read.
+    """
+    low, high = vertices.min(0), vertices.max(0)
+    across, height = (up + 1) % 3 if up != 1 else 0, high[up] - low[up]
+    v = (vertices[:, up] - low[up]) / height
+    if kind in ("stripes", "checks"):
+        u = (vertices[:, across] - low[across]) / height
+        weights = np.array([[0, 1], [1, 0]] if kind == "checks" else [[0, 0], [1, 1]])
+        return Pattern(weights, bands / 2 * np.stack([u, v], 1))
+    require_file(Path(kind), "stripes, checks or the file of a picture", field)
+    try:
+        picture = read_image(Path(kind))
+    except Exception as error:
+        raise InputError(f"{kind}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
+    grey = picture[..., :3].astype(np.float32).mean(-1)
+    u = (vertices[:, across] - low[across]) / (high[across] - low[across])
+    inside = 0.5 / np.array(grey.shape[::-1])  # the borders are not those of the next repetition
+    return Pattern(grey > 0.5 * grey.max(), np.clip(np.stack([u, 1 - v], 1), inside, 1 - inside))
+
+
+def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
+    """The BSDF that a text means, in one of `FORMS`. Raises InputError, which names the `field`, if it means none."""
+    try:
+        if text.lower().endswith(".xml"):
+            return load_snippet(Path(text), field)
+        if ".npz" in text.lower() or text.lower().endswith(".binary"):
+            file, _, material = text.partition(".npz:")
+            path = Path(f"{file}.npz" if material else text)
+            require_file(path, FORMS, field)
+            values = {"material": material} if material else {}
+            return mi.load_dict({"type": "merl", "filename": str(path.resolve()), **values})
+        found = mi.load_dict(plugin(text, field, coloured))
+    except RuntimeError as error:
+        raise InputError(f"{field}: {text}: {reason(error)}") from error
+    if not isinstance(found, mi.BSDF):
+        raise InputError(f"{field}: {text}: is no BSDF; give {FORMS}")
+    return found
+
+
+def load_snippet(path: Path, field: str) -> mi.BSDF:
+    """The <bsdf> of an XML file, whose file names are relative to it."""
+    require_file(path, FORMS, field)
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: {field}: is no XML ({error}); give {FORMS}") from error
+    if root.tag != "bsdf":
+        raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
+    move_names(root, path.resolve().parent, Path.cwd())
+    return cast(mi.BSDF, load_element(root))
+
+
+def plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
+    """A plugin and its parameters as Mitsuba's dictionary: `principled base_color=0.6,0.2,0.1 roughness=0.3`."""
+    try:
+        name, *words = shlex.split(text)
+    except ValueError as error:
+        raise InputError(f"{field}: is {text!r} ({error}); give {FORMS}") from error
+    result: dict[str, Any] = {"type": name}
+    for word in words:
+        key, sign, value = word.partition("=")
+        if not (key and sign and value):
+            raise InputError(f"{field}: {text}: found {word!r}; each parameter must be NAME=VALUE")
+        result[key] = meant(value)
+        if value == COLOURS and not coloured:
+            raise InputError(f"{field}: {text}: {key} is {COLOURS}, but the mesh's file has no colours")
+    return result
+
+
+def meant(value: str) -> Any:
+    """A number, a colour R,G,B, true or false, the colours of the mesh, or a text."""
+    if value == COLOURS:
+        return {"type": "mesh_attribute", "name": COLOURS}
+    if value in ("true", "false"):
+        return value == "true"
+    number = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+    if re.fullmatch(number, value):
+        return float(value)
+    if re.fullmatch(f"{number},{number},{number}", value):
+        return {"type": "rgb", "value": [float(part) for part in value.split(",")]}
+    return value

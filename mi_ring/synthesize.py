@@ -1,0 +1,24 @@
+"""Path trace a capture of any mesh, with its truth: `python -m mi_ring.synthesize MESH OUT`."""
+
+from collections.abc import Sequence
+
+from mi_ring.synthesis.capture import write_capture
+from mi_ring.synthesis.config import Synthesis, require_options
+from mi_ring.system import command
+from mi_ring.system.files import locked
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    config = command.parse(Synthesis, arguments, "mi_ring.synthesize")
+    require_options(config)
+    with locked(config.out, "OUT"):
+        write_capture(config)
+    out = config.out
+    said = "" if config.exact else f"\nWhat its calibration should say is in {out}/truth/exact.xml."
+    print(f"{out}/scene.xml, and the true surface in {out}/truth/mesh.ply{said}\n"
+          f"Now: mi-ring check {out}/scene.xml; mi-ring fit {out}/scene.xml")  # fmt: skip
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.synthesize", main)
