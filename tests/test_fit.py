@@ -118,7 +118,7 @@ def test_steps_of_the_flow_are_part_of_the_result(finished):
 
 def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(capture.Capture.spread, "__defaults__", (5,))
-    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK]) == 0
+    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE]) == 0
     page = (tmp_path / "run" / "report.html").read_text()
     assert "12; below are 5 of them" in page and page.count('class="photograph"') == 5
     assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 16 + 160)  # a line says what is green
@@ -205,7 +205,8 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_captur
     small_capture, edit = broken_capture
     if table:
         edit("</scene>", TABLE)
-    arguments = [str(small_capture), "--iterations", "14", "--deterministic", "--seed", "4", *QUICK]
+    start = SPHERE if table else QUICK
+    arguments = [str(small_capture), "--iterations", "14", "--deterministic", "--seed", "4", *start]
     for name in ("a", "b"):
         assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
 
@@ -271,7 +272,7 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
         genuine(*arguments)
 
     monkeypatch.setattr(results, moment, interrupted)
-    status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *QUICK])
+    status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
     never = {"checkpoint.before.pt"} if moment == "write_inputs" else set()  # before the first iteration
     assert {p.name for p in (tmp_path / "run").iterdir()} == set(FILES) - never
     assert status == (130 if moment == "write_inputs" else 0)  # at the end there is nothing left to resume
@@ -282,7 +283,7 @@ def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_
     genuine = terms.rgb_loss
     monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
     with pytest.raises(InputError, match="diverged at iteration 17"):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "40", "--no-indirect", *QUICK])
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "40", "--no-indirect", *SPHERE])
     ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
     assert all(tensor.isfinite().all() for tensor in ring.values())
 
@@ -290,7 +291,7 @@ def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_
 def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(small_capture, monkeypatch):
     """Of weights at once, of losses when there are three in a row; a single one is left out."""
     changes = {"levels": (2,), "widths": (28,), "shares": (1,), "indirect": False, "refine": ("none",)}
-    broken = Fit(load_capture(small_capture), Config(iterations=40, **changes))
+    broken = Fit(load_capture(small_capture), Config(iterations=40, domain="sphere", **changes))
     genuine = terms.rgb_loss
     wrong = {3, 20, 21, 22}
     monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * (np.nan if broken.iteration in wrong else 1))
@@ -314,7 +315,7 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
     monkeypatch.setattr(bridge.Surroundings, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
     for options, bright in (([], True), (["--no-indirect"], False)):
-        first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *QUICK, *options]))
+        first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *SPHERE, *options]))
         assert (first.step().terms["rgb"] > 100) == bright
 
 
@@ -322,7 +323,7 @@ def test_interreflection_is_left_out_where_intensities_cannot_be_true_nor_be_ref
     path, _ = broken_capture
     path.write_text(re.sub(r'name="intensity" value="[^"]*"', 'name="intensity" value="1"', path.read_text()))
     for options, said in (("--refine none", True), ("--refine none --no-indirect", False), ("", False)):
-        command = [str(path), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK, *options.split()]
+        command = [str(path), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE, *options.split()]
         assert fit.main(command) == 0
         assert ("Interreflection is left out" in capsys.readouterr().out) == said
 
@@ -333,7 +334,7 @@ def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatc
     monkeypatch.setattr(bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
-        Fit(load_capture(path), fit.parse_options([str(path), *QUICK, *options])).step()
+        Fit(load_capture(path), fit.parse_options([str(path), *SPHERE, *options])).step()
 
     step()
     step("--no-shadows")
@@ -526,7 +527,7 @@ def reach(process, folder, iteration):
 def test_signals_of_schedulers_and_terminals_lose_nothing(name, small_capture, tmp_path, begun):
     """However often they come; nor does a reader of the output that is gone, of which nobody hears then."""
     folder, end = tmp_path / "run", getattr(signal, name)
-    options = ["--out", str(folder), "--iterations", "900", *QUICK]
+    options = ["--out", str(folder), "--iterations", "900", *SPHERE]
     process = begun([sys.executable, "-m", "mi_ring.fit", str(small_capture), *options], folder)
     process.stdout.close()
     reach(process, folder, results.read_log(folder)[-1]["iteration"] + 10)
@@ -608,7 +609,7 @@ def test_a_damaged_checkpoint_is_made_good_by_the_one_before(small_capture, tmp_
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path, begun):
     folder = tmp_path / "run"
-    options = ["--out", str(folder), "--iterations", "200", *SPHERE]
+    options = ["--out", str(folder), "--iterations", "120", *SPHERE]
     call = [sys.executable, "-m", "mi_ring.fit", str(small_capture), *options]
     process = begun(call, folder)
     process.send_signal(signal.SIGINT)
@@ -617,10 +618,10 @@ def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_pa
     assert "--resume" in output and "Traceback" not in output
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
     stopped = results.read_log(folder)[-1]["iteration"]
-    assert stopped < 200
+    assert stopped < 120
 
     subprocess.run([*call, "--resume"], check=True, timeout=300, capture_output=True)
-    assert [e["iteration"] for e in results.read_log(folder)][-1] == 200
+    assert [e["iteration"] for e in results.read_log(folder)][-1] == 120
     assert distance(folder / "mesh.ply") < 0.04
 
 
@@ -659,7 +660,7 @@ def test_resume_notices_files_that_changed(small_capture, broken_capture, tmp_pa
     path, edit = broken_capture
     trimesh.creation.icosphere(subdivisions=2, radius=30).apply_translation(CENTER).export(path.parent / "ball.ply")
     edit('<bsdf type="cooktorrance"/>', '<string name="domain" value="ball.ply"/><bsdf type="cooktorrance"/>')
-    arguments = [str(path), "--out", str(tmp_path / "run"), "--iterations", "2", *QUICK]
+    arguments = [str(path), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE]
     assert fit.main(arguments) == 0
     assert fit.main([*arguments, "--resume"]) == 0  # there is nothing left to do
     for name in ("images/004.png", "masks/005.png", "ball.ply", path.name):
@@ -706,7 +707,7 @@ from mi_ring import fit
 for out in "ab":
     assert fit.main([*sys.argv[1:], "--out", out, "--iterations", "1", "--threads", "1"]) == 0
 """
-    subprocess.run([sys.executable, "-c", code, path, *QUICK], check=True, timeout=300, cwd=tmp_path)
+    subprocess.run([sys.executable, "-c", code, path, *SPHERE], check=True, timeout=300, cwd=tmp_path)
 
 
 def test_on_one_core_an_exr_is_written_and_read(tmp_path):
@@ -759,7 +760,7 @@ def test_an_unusable_option_is_one_line_that_names_it(options, words):
 def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="--out: cannot be written"):
-        fit.main([str(small_capture), "--out", str(tmp_path / "file" / "run"), "--iterations", "1", *QUICK])
+        fit.main([str(small_capture), "--out", str(tmp_path / "file" / "run"), "--iterations", "1", *SPHERE])
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -873,7 +874,7 @@ def test_writes_are_whole_or_not_at_all(tmp_path, monkeypatch):
 
 def test_scenes_of_the_same_name_do_not_share_a_folder_by_default(small_capture, broken_capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    quick = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2"]
+    quick = ["--iterations", "1", *SPHERE]
     assert fit.main([str(small_capture), *quick]) == 0
     assert fit.main([str(small_capture), *quick]) == 0  # the same scene: the first result is moved aside
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["small", "small.1"]
@@ -887,5 +888,5 @@ def test_two_fits_into_one_folder_are_refused(small_capture, tmp_path):
         files.locked(tmp_path / "run"),
         pytest.raises(InputError, match="run: --out: another process is writing there"),
     ):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *QUICK])
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE])
     assert not (tmp_path / "run").exists()

@@ -43,7 +43,8 @@ def test_what_needs_one_says_so(package, command, arguments, small_capture, tmp_
         (model / f"{name}.txt").write_text("")
     names = {"capture": small_capture, "colmap": model, "run": tmp_path / "run"}
     if command == "export":
-        assert without("pycolmap", "fit", small_capture, "--out", tmp_path / "run", *QUICK, cwd=tmp_path)[0] == 0
+        assert without("pycolmap", "fit", small_capture, "--out", tmp_path / "run", "--domain", "sphere", *QUICK,
+                       cwd=tmp_path)[0] == 0  # fmt: skip
     arguments = [a.format(**names) if isinstance(a, str) else a for a in arguments]
     status, complaint = without(package, command, *arguments, cwd=tmp_path)
     assert status == 1 and "InputError" in complaint
