@@ -20,9 +20,9 @@ def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
     """Total variation of the normals of a closed mesh, vertices (V, 3) and faces (F, 3): a length.
 
     The sum over edges of their length times how far the normals of both sides are apart ("Discrete total variation of
-    the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020; chords instead of angles). Smooth
-    or sharp, an edge costs by its angle: for an octagonal prism no less is to be had than the sum of its edges. 8πR for
-    a sphere of even triangles.
+    the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020; chords instead of angles). A turn
+    costs about as much if it is sharp as if it is spread over many edges, so that flat sides and edges are as good as
+    what is round, and ripples are not. 8πR for a sphere of even triangles.
     """
     pairs, ends = trimesh.graph.face_adjacency(faces, return_edges=True)
     a, b, c = vertices[torch.as_tensor(faces, device=vertices.device)].unbind(1)
@@ -55,7 +55,7 @@ def number_of_bases(values: Tensor) -> Tensor:
 
 
 def columns_of(material: dict[str, Tensor], brdf_net: ReflectanceMap) -> Tensor:
-    """The material at V points as a matrix (V, C) of numbers of about 1: in units of `scale`, or as shares of a range."""
+    """The material at V points as a matrix (V, C) of numbers near 1: in units of `scale`, or as shares of a range."""
     columns = []
     for p in brdf_net.bsdf_parameters:
         unit = float(brdf_net.scale) if math.isinf(p.high) else p.high - p.low

@@ -1,5 +1,7 @@
 """What the ring is compared with: a plain ResNet, whose blocks do not share their weights (paper's ablation)."""
 
+from typing import Any
+
 from torch import nn
 
 from mi_ring.nets.encoding import PosEnc
@@ -33,7 +35,8 @@ class ResNet(Flow):
 
     def velocity_of(self, step: int) -> Velocity:
         """Vₖ, of block k."""
-        return self.blocks[step].velocity
+        block: Any = self.blocks[step]
+        return block.velocity
 
 
 def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
