@@ -3,19 +3,21 @@
 And what shows the difference: triangles turned inside out or crossing others.
 """
 
-import json
+import dataclasses
 import math
+import sys
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 import trimesh
 from test_networks import plain
 
-from mi_ring import export, render
+from mi_ring import export
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.fit import main as fit
+from mi_ring.fit import parse_options
 from mi_ring.fitting import checkpoint, terms
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
@@ -33,12 +35,12 @@ from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit, ring_of, ring_state
 
 
-def wild(net, seed=0, factor=200.0):
-    """A network that moves points by about their own size."""
+def wild(net, seed=0, size=0.1):
+    """A network that moves points by some tenths of the sphere's radius."""
     torch.manual_seed(seed)
     for module in net.modules():
         if hasattr(module, "velocity") and hasattr(module, "output"):
-            torch.nn.init.normal_(module.output.weight, std=factor * 1e-4)
+            torch.nn.init.normal_(module.output.weight, std=size)
     return net
 
 
@@ -84,7 +86,8 @@ def test_the_adaptive_solver_is_as_near_as_its_tolerance(time):
 
 def test_the_adaptive_solver_agrees_with_small_steps_of_another_also_in_its_gradient():
     pytest.importorskip("torchdiffeq")
-    one, other = (wild(ShapeNet(steps, solver)) for steps, solver in ((3, "dopri5"), (40, "rk4")))
+    one, other = wild(ShapeNet(3, "dopri5")), ShapeNet(80, "rk4")
+    other.load_state_dict(one.state_dict())
     s, _ = Sphere().sample(1)
     weight, found = torch.randn(len(s), 3), []
     for net in (one, other):
@@ -114,7 +117,7 @@ def test_gradients_through_other_steps_are_those_of_torchs_layers(solver):
 
 
 def test_what_the_adaptive_solver_needs_is_told_when_it_is_not_there(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "torchdiffeq", None)
+    monkeypatch.setitem(sys.modules, "torchdiffeq", None)
     ShapeNet(3, "rk4")
     with pytest.raises(InputError, match="dopri5: needs the package torchdiffeq, which is not installed; try `pip"):
         ShapeNet(3, "dopri5")
@@ -314,7 +317,7 @@ def capture(small_capture):
     return load_capture(small_capture)
 
 
-@pytest.mark.parametrize("choice", [*CHOICES, {"steps": 1}, {"steps": 40}, {"solver": "dopri5"}], ids=str)
+@pytest.mark.parametrize("choice", [*CHOICES, {"steps": 40}, {"solver": "dopri5"}], ids=str)
 def test_fits_with_each_choice_descend_and_go_on_from_their_state(choice, capture):
     if choice.get("solver") == "dopri5":
         pytest.importorskip("torchdiffeq")
@@ -337,29 +340,29 @@ def test_without_resampling_the_vertices_stay_at_the_same_points(capture):
     assert not torch.equal(*points[True])
 
 
-def test_commands_take_the_choices_from_the_file(small_capture, tmp_path):
-    run = tmp_path / "run"
-    status = fit([
-        str(small_capture), "--out", str(run), "--shape-net", "resnet", "--material-at", "surface", "--encoding", "octaves",
-        "--frequencies", "4", "--no-resample", "--weights.material-rank", "0.1", "--iterations", "2", "--levels", "2",
-        "--widths", "28", "--shares", "1", "--subdivisions", "2", "--domain", "sphere", "--no-indirect",
+def test_the_command_takes_the_choices_and_others_those_of_the_file(small_capture, capture, tmp_path):
+    config = parse_options([
+        str(small_capture), "--shape-net", "resnet", "--material-at", "surface", "--encoding", "octaves",
+        "--frequencies", "4", "--no-resample", "--weights.material-rank", "0.1",
     ])  # fmt: skip
-    ring = load_fit(run)
-    assert status == 0 and type(ring.shape_net) is ResNet and ring.material_at == "surface"
-    assert ring.brdf_net.encoding.spacing == "octaves" and ring.shape_net.encoding.frequencies == 4
-    entry = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
+    choice = {f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | SMALL
+    fit = Fit(capture, Config(**choice))
+    entry = [it.entry() for it in fit][-1]
     assert 1 <= entry["material_rank"] <= math.sqrt(5) and entry["weights"]["material_rank"] == 0.1
+    run = tmp_path / "run"
+    run.mkdir()
+    torch.save(ring_state(fit.ring, fit.config.settings()), run / "ring.pt")
+    ring = load_fit(run)
+    assert type(ring.shape_net) is ResNet and ring.material_at == "surface"
+    assert ring.brdf_net.encoding.spacing == "octaves" and ring.shape_net.encoding.frequencies == 4
     s, _ = ring.domain.sample(2)
     with torch.no_grad():
         expected = ring.brdf_net(ring.shape_net(s))["diffuse"].numpy()
     export.main([str(run), str(tmp_path / "again.ply"), "--subdivisions", "2"])
-    for file in (run / "mesh.ply", tmp_path / "again.ply"):
-        import mitsuba as mi
-
-        mesh = mi.traverse(mi.load_dict({"type": "ply", "filename": str(file)}))
-        np.testing.assert_allclose(np.array(mesh["vertex_diffuse"]).reshape(-1, 3), expected, rtol=1e-5)
-    render.main([str(run), str(small_capture), str(tmp_path / "pictures"), "--spp", "1"])
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 12
+    mesh = mi.traverse(mi.load_dict({"type": "ply", "filename": str(tmp_path / "again.ply")}))
+    shape = mi.traverse(mi.load_dict({"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 2}))
+    for params in (mesh, shape):
+        np.testing.assert_allclose(np.array(params["vertex_diffuse"]).reshape(-1, 3), expected, rtol=1e-5)
 
 
 # What shows the difference.
@@ -393,13 +396,13 @@ def test_triangles_turned_inside_out_are_those_of_negative_jacobians():
 def test_a_wild_resnet_turns_triangles_inside_out_and_a_flow_solved_well_does_not():
     """By torch's own Jacobians of the networks, a second way."""
     s, faces = Sphere().sample(3)
-    for net, some in ((wild(ResNet(3, width=64), 1, 2000), True), (wild(ShapeNet(40, "rk4"), 1, 1000), False)):
+    for net, some in ((wild(ResNet(3, frequencies=3), 1, 1.0), True), (wild(ShapeNet(40, "rk4"), 1), False)):
         found = inside_out(Ring([0.0, 0, 0], 1.0, networks=(net, BRDFNet())), s, faces)
         centres = s[torch.as_tensor(faces)].mean(1)[::7]
         with plain_autograd():
             determinant = torch.func.vmap(torch.func.jacrev(lambda x, net=net: net(x[None])[0]))(centres).det()
-        assert ((determinant < 0).numpy() == found[::7]).mean() > (0.8 if some else 0.999)
-        assert (found.mean() > 0.1) == some
+        assert ((determinant < 0).numpy() == found[::7]).mean() > (0.9 if some else 0.999)
+        assert found.mean() > 0.03 if some else not found.any()
 
 
 @pytest.mark.parametrize("shape", ["crumpled", "two"])
@@ -408,7 +411,7 @@ def test_crossing_triangles_are_those_of_exact_arithmetic(shape):
     mesh = trimesh.creation.icosphere(subdivisions=3)
     random = np.random.default_rng(4)
     if shape == "crumpled":
-        vertices, faces = mesh.vertices + random.normal(0, 0.05, mesh.vertices.shape), mesh.faces
+        vertices, faces = mesh.vertices + random.normal(0, 0.2, mesh.vertices.shape), mesh.faces
     else:
         other = trimesh.creation.icosphere(subdivisions=3, radius=0.7)
         other.apply_transform(trimesh.transformations.random_rotation_matrix(random.random(3)))
