@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mi_ring.errors import InputError
 
-TOLERANCE = 1e-4  #: of the adaptive solver, absolute (in radii of the domain) and relative
+TOLERANCE = 1e-5  #: of the adaptive solver, absolute (in the normalised frame) and relative
 
 Velocity = Callable[[Tensor], Tensor]
 
