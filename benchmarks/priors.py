@@ -1,6 +1,7 @@
 """Fit small captures with and without each prior and print, as Markdown with machine and date, where it pays.
 
-    python benchmarks/priors.py [--only NAME] [--iterations 150] [--level 4] [--width 96] [--seeds 0 1] [--out DIR]
+    python benchmarks/priors.py [--only NAME] [--weights 0 0.03] [--seeds 0 1] [--iterations 150] [--level 4]
+                                [--width 96] [--batch 8] [--out out/priors]
 
 Each capture is made for its prior: `normal_variation` a faceted body, `material_variation` a body of two materials,
 `material_rank` one whose gloss goes with its colour. All are path traced with `cooktorrance` from few sides, and
@@ -111,6 +112,8 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=150)
     parser.add_argument("--level", type=int, default=4)
     parser.add_argument("--width", type=int, default=96)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--weights", type=float, nargs="+", help="Default: those that were found to be of use.")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--out", type=Path, default=Path("out/priors"))
     arguments = parser.parse_args()
@@ -120,19 +123,20 @@ def main() -> None:
         if not (folder / "scene.xml").is_file():
             write_capture(prior, folder)
         capture = load_capture(folder / "scene.xml")
-        for weight in WEIGHTS[prior]:
+        for weight in arguments.weights or WEIGHTS[prior]:
             found = []
             for seed in arguments.seeds:
                 fit = Fit(capture, Config(
                     iterations=arguments.iterations, levels=(arguments.level,), widths=(arguments.width,),
-                    shares=(1.0,), seed=seed, domain="sphere", indirect=False, weights={prior: weight},
+                    shares=(1.0,), batch=arguments.batch, seed=seed, domain="sphere", indirect=False,
+                    weights={prior: weight},
                 ))  # fmt: skip
                 found.append(errors(fit, folder) if all(fit) else [])
             normal, *rest = np.mean(found, 0)
             rows.append([f"`{prior}`", f"{weight:g}", f"{normal:.2f}°", *(f"{x:.1%}" for x in rest)])
             print("; ".join(rows[-1]), file=sys.stderr, flush=True)
     print(f"\n{processor()}; {datetime.date.today()}; {len(capture)} photographs, noise {NOISE}, "
-          f"{arguments.iterations} iterations at level {arguments.level} / {arguments.width} px, "
+          f"{arguments.iterations} iterations of {arguments.batch} at level {arguments.level} / {arguments.width} px, "
           f"seeds {arguments.seeds}\n")  # fmt: skip
     print(table(["prior", "weight", "normals", "diffuse", "specular", "roughness"], rows))
 

@@ -16,7 +16,7 @@ class ResNet(Flow):
     """As deep as the ring, `steps` blocks `x ← x + Vₖ(x) / T`, but each with weights of its own: the flow of no field.
 
     Together the blocks have as many parameters as the ring, as nearly as widths are whole numbers: they are narrower,
-    for T = 20 about 43 neurons wide instead of 256. Or `width` neurons each, which are T times as many parameters at
+    for T = 20 about 42 neurons wide instead of 256. Or `width` neurons each, which are T times as many parameters at
     the ring's own 256.
     """
 
