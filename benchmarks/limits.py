@@ -83,7 +83,7 @@ def rendering(running: Fit, level: int) -> str:
     s, faces = running.ring.domain.sample(level)
     surface.show(running.ring, s, faces)
     with torch.no_grad():
-        vertices, material = running.ring.surface(s), running.ring.brdf_net(s)
+        vertices, material = running.ring(s)
     vertices.requires_grad_()
     material = {name: value.requires_grad_() for name, value in material.items()}
 

@@ -22,8 +22,9 @@ class EvaluateConfig:
 
     In it: errors of normals [deg] and depths [% of the diagonal of the true bounding box] where both surfaces are seen;
     overlap of silhouettes; share of what is seen whose faces point away from the camera; Chamfer distance [% of the
-    diagonal] and F-score of whole surfaces, unseen parts included unless --seen; genus; triangles that cross another;
-    PSNR [dB] and SSIM of the photographs that mi_ring.render predicts. A file has the same for every photograph.
+    diagonal] and F-score of whole surfaces, unseen parts included unless --seen; genus; triangles that cross another,
+    and those that Shape-Net turned inside out; PSNR [dB] and SSIM of the photographs that mi_ring.render predicts. A
+    file has the same for every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]

@@ -1,12 +1,18 @@
 """The terms of the loss, on numbers that can be checked by hand."""
 
 import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import scipy.spatial
 import torch
+import trimesh
 
 from mi_ring import images
-from mi_ring.fitting import terms
+from mi_ring.fitting import priors, terms
+from mi_ring.fitting.config import Config
+from mi_ring.nets.brdfnet import BRDFNet, Parameter
 
 
 def pixels(*values):
@@ -119,3 +125,98 @@ def test_pixels_that_say_nothing_have_no_part_in_the_colour_loss():
         float((predicted - observed)[0, y, x].abs().sum()) / 0.5 for y in range(2) for x in range(3) if telling[0, y, x]
     )
     assert loss.item() == pytest.approx(expected / 18, rel=1e-5)
+
+
+# Priors.
+
+
+def grown(mesh, factor):
+    return torch.tensor(factor * mesh.vertices), mesh.faces
+
+
+@pytest.mark.parametrize("cuts", [0, 3])
+def test_variation_of_normals_of_a_box_is_that_of_its_edges(cuts):
+    """Twelve edges, at each of which normals are √2 apart, however fine the mesh is."""
+    mesh = trimesh.creation.box((2.0, 3.0, 5.0))
+    for _ in range(cuts):
+        mesh = mesh.subdivide()
+    found = priors.variation_of_normals(*grown(mesh, 7.0))
+    assert found.item() == pytest.approx(7 * 4 * (2 + 3 + 5) * math.sqrt(2))
+
+
+@pytest.mark.parametrize("level", [3, 4])
+def test_variation_of_normals_of_a_sphere(level):
+    found = priors.variation_of_normals(*grown(trimesh.creation.icosphere(subdivisions=level), 3.0))
+    assert found.item() == pytest.approx(8 * math.pi * 3, rel=0.03)  # triangles are not quite even
+
+
+def test_variation_of_a_linear_field_is_its_slope():
+    """On a flat sheet of uneven triangles, turned in space; 3 channels, of which one is constant."""
+    random = np.random.default_rng(2)
+    flat = random.random((60, 2)) * [3, 2]
+    faces = scipy.spatial.Delaunay(flat).simplices
+    values = np.stack([0.3 * flat[:, 0] - 0.4 * flat[:, 1], np.full(60, 7.0), 2 * flat[:, 1]], 1)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    vertices = torch.tensor(4 * np.pad(flat, ((0, 0), (0, 1))) @ turn.T)  # and four times as large
+    found = priors.variation_of_values(vertices, faces, torch.tensor(values))
+    assert found.item() == pytest.approx((0.5 + 0 + 2) / 4)
+
+
+def test_a_step_costs_its_height_however_steep_it_is():
+    """Total variation: what is spread over a band costs as much as what is sharp."""
+    x = np.linspace(0, 1, 101)
+    grid = np.stack(np.meshgrid(x, [0.0, 0.1]), -1).reshape(-1, 2)
+    faces = scipy.spatial.Delaunay(grid).simplices
+    vertices = torch.tensor(np.pad(grid, ((0, 0), (0, 1))))
+    for width in (0.02, 0.2, 0.6):
+        ramp = torch.tensor(np.clip((grid[:, :1] - 0.5) / width + 0.5, 0, 1))
+        assert priors.variation_of_values(vertices, faces, ramp).item() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_number_of_bases_counts_materials(count):
+    """√k for k orthogonal basis materials of which there is as much of each; less where there is less of one."""
+    basis = np.linalg.qr(np.random.default_rng(3).normal(size=(5, 5)))[0][:count]
+    mixed = np.repeat(np.eye(count), 40, 0)
+    matrix = torch.tensor(6 * mixed @ basis)
+    assert priors.number_of_bases(matrix).item() == pytest.approx(math.sqrt(count))
+    s = np.array([3.0, 1.0, 0.5])[:count]
+    weighed = torch.tensor(mixed * s @ basis)
+    assert priors.number_of_bases(weighed).item() == pytest.approx(s.sum() / np.sqrt((s**2).sum()))
+
+
+def test_gradients_of_priors_are_those_of_finite_differences():
+    torch.manual_seed(0)
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    vertices = (torch.tensor(mesh.vertices) + 0.1 * torch.randn(42, 3, dtype=torch.float64)).requires_grad_()
+    values = torch.rand(42, 5, dtype=torch.float64).requires_grad_()
+    check = torch.autograd.gradcheck
+    assert check(lambda v: priors.variation_of_normals(v, mesh.faces), vertices)
+    assert check(lambda x: priors.variation_of_values(vertices.detach(), mesh.faces, x), values)
+    assert check(priors.number_of_bases, values)
+    even = torch.ones(42, 5, dtype=torch.float64).requires_grad_()  # where norms are 0
+    priors.variation_of_values(vertices.detach(), mesh.faces, even).backward()
+    assert (even.grad == 0).all()
+
+
+def test_columns_are_in_units_of_the_light_or_of_their_range():
+    net = BRDFNet(250.0, [Parameter("tint", 3, 0.0, math.inf), Parameter("haze", 1, -0.5, 1.5)])
+    material = {"tint": torch.tensor([[250.0, 500.0, 0.0]]), "haze": torch.tensor([1.0])}
+    torch.testing.assert_close(priors.columns_of(material, net), torch.tensor([[1.0, 2.0, 0.0, 0.75]]))
+
+
+def test_priors_are_off_unless_asked_for_and_do_not_depend_on_units():
+    names = ["normal_variation", "material_variation", "material_rank"]
+    assert all(Config().weights[name] == 0 for name in names)
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    for size, scale in ((1.0, 1.0), (50.0, 300.0)):
+        ring = SimpleNamespace(radius=torch.tensor(size), brdf_net=BRDFNet(scale))
+        tint = torch.tensor(mesh.vertices[:, :1] + 2).expand(-1, 3)
+        material = {"diffuse": scale * tint, "specular": scale * tint[:, 0], "roughness": 0.2 * tint[:, 0]}
+        it = SimpleNamespace(vertices=torch.tensor(size * mesh.vertices), faces=mesh.faces, material=material,
+                             fit=SimpleNamespace(ring=ring))  # fmt: skip
+        assert terms.default_terms["normal_variation"].function(it).item() == pytest.approx(1, rel=0.03)
+        assert terms.default_terms["material_rank"].function(it).item() == pytest.approx(1)
+        # The gradient of x along a sphere is sin of the angle to the axis, π/4 in the mean.
+        slope = terms.default_terms["material_variation"].function(it).item()
+        assert slope == pytest.approx(4.2 * math.pi / 4, rel=0.01)

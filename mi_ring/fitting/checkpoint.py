@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.config import Config
+from mi_ring.fitting.config import WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.ring.saved import read_state
 from mi_ring.system.files import is_sealed, relative_to, write_state
@@ -35,9 +35,10 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         path = before
     if state.get("format") != FORMAT or not {"settings", "files", "fit"} <= state.keys():
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
+    known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
+    known["weights"] = WEIGHTS | known["weights"]
     for name, value in config.settings().items():
-        if state["settings"].get(name) != value:
-            before = state["settings"].get(name)
+        if (before := known[name]) != value:
             raise InputError(f"{path}: --{name.replace('_', '-')}: was {before} before, is {value} now; give the same "
                              "settings, --preset among them, or start anew without --resume")  # fmt: skip
     return state

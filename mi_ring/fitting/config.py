@@ -10,7 +10,10 @@ from typing import Any, Literal, get_args, get_origin
 from mi_ring.errors import InputError
 
 #: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
-WEIGHTS = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3}
+WEIGHTS = {
+    "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3,
+    "normal_variation": 0.0, "material_variation": 0.0, "material_rank": 0.0,
+}  # fmt: skip
 
 
 #: What `Config.refine` may have.
@@ -48,7 +51,21 @@ class Config:
     batch: int = 8
     """Photographs per iteration."""
     steps: int = 3
-    """Euler steps of the flow, the paper's T."""
+    """Steps of the flow, the paper's T: Euler's, unless --solver says otherwise."""
+    solver: Literal["euler", "midpoint", "rk4", "dopri5"] = "euler"
+    """How the flow is integrated. midpoint, rk4: steps of second and fourth order, of two and four velocities each;
+    dopri5: as many steps as a tolerance asks for, by the package torchdiffeq."""
+    shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
+    """ring: the paper's flow, one velocity field for all steps. To compare, as many blocks with weights of their own,
+    which is no flow: resnet: narrow ones, of as many parameters together; wide-resnet: of the ring's width."""
+    encoding: Literal["linear", "octaves", "none"] = "linear"
+    """Positional encoding of both networks. linear: frequencies 1, 2, 3, …; octaves: 1, 2, 4, 8, …; none: none."""
+    frequencies: int = 16
+    """How many frequencies the encoding has."""
+    material_at: Literal["domain", "surface"] = "domain"
+    """What BRDF-Net is a function of: points of the start surface, or, to compare, of the deformed one."""
+    resample: bool = True
+    """Have the vertices at other points of the start surface in each iteration? The sphere is randomly rotated."""
     spp: int = 1
     """Samples per pixel."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
@@ -63,7 +80,9 @@ class Config:
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
     """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
-    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says."""
+    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says. Priors, off by
+    default: normal_variation: edges rather than curves; material_variation: patches of one material each;
+    material_rank: mixtures of few basis materials."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
     while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while
@@ -124,6 +143,9 @@ class Config:
             require(self.domain in ("auto", "sphere", "hull"), "domain", "auto, sphere, hull or (mesh, FILE)")
         for name in ("iterations", "steps", "batch", "spp"):
             require(getattr(self, name) >= 1, name, "at least 1")
+        require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
+        require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
+        require(self.shape_net == "ring" or self.solver == "euler", "solver", f"euler for --shape-net {self.shape_net}")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
         for name in ("blur", "laplacian_scale"):
             require(0 <= getattr(self, name) < math.inf, name, "0 or more")

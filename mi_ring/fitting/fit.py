@@ -167,10 +167,10 @@ class Fit:
         """Sample the domain, deform it, choose photographs and render them."""
         config, number = self.config, self.iteration
         stage = next(s for s in self.stages if number < s.last)
-        s, faces = self.ring.domain.sample(stage.level, self.random)
+        s, faces = self.ring.domain.sample(stage.level, self.random if config.resample else None)
         s = s.to(self.device)
         with self.autocast():
-            vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
+            vertices, material = self.ring(s)
 
         index, size = self.choose()
         scale = -(-size[0] // stage.width)

@@ -13,7 +13,8 @@ from mi_ring.fitting.calibration import overall, refined_of
 from mi_ring.fitting.config import Config
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
-from mi_ring.nets.brdfnet import ReflectanceMap
+from mi_ring.nets.brdfnet import BRDFNet, ReflectanceMap
+from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shapenet import Flow
 from mi_ring.rendering.scenes import has_table
 from mi_ring.ring.ring import Ring
@@ -51,8 +52,11 @@ def starting_ring(
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
         networks[1].set_parameters(parameters, scale)
+    else:
+        networks = (shape_net_of(config.shape_net, config.steps, config.solver, config.encoding, config.frequencies),
+                    BRDFNet(scale, parameters, config.encoding, config.frequencies))  # fmt: skip
     ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                networks, capture.shape.ground, capture.shape.up, capture.shape.metres)  # fmt: skip
+                networks, capture.shape.ground, capture.shape.up, capture.shape.metres, config.material_at)  # fmt: skip
     require_networks(ring)
     return ring
 

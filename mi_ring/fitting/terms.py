@@ -10,8 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from mi_ring.fitting import priors
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.images import blur
+from mi_ring.nets.shapenet import Flow
 
 DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
@@ -130,8 +132,9 @@ def velocity(it: Iteration) -> Tensor:
     steps = int(torch.randint(net.steps, (), generator=fit.random))
     with torch.no_grad(), fit.autocast():
         x = net.flow(it.s[chosen], steps)
+    field = net.velocity_of(steps) if isinstance(net, Flow) else net.velocity
     # The velocity in float32 always: its second differences would drown in bfloat16.
-    return velocity_loss(net.velocity, x, fit.config.laplacian_scale)
+    return velocity_loss(field, x, fit.config.laplacian_scale)
 
 
 def calibration(it: Iteration) -> Tensor | None:
@@ -150,4 +153,7 @@ default_terms: dict[str, Term] = {
     "mask": Term(mask),
     "velocity": Term(velocity, schedule=strength),
     "calibration": Term(calibration),
+    "normal_variation": Term(priors.normal_variation),
+    "material_variation": Term(priors.material_variation),
+    "material_rank": Term(priors.material_rank),
 }

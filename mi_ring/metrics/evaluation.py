@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from mi_ring.capture.calibrated import moved
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
+from mi_ring.metrics.embedding import inside_out
 from mi_ring.metrics.predictions import SPP, compare_photographs
 from mi_ring.metrics.surfaces import THRESHOLDS, alignment, compare_shapes, compare_surfaces, load_true_mesh
 from mi_ring.rendering.crossings import crossing_triangles
@@ -21,7 +22,8 @@ LINES = {  # of the table
     "aligned": "truth moved by °, % of the diagonal, factor",
     "chamfer": "Chamfer distance, % of the diagonal",
     **{f"f_score_{t}": f"F-score at {t} % of the diagonal" for t in THRESHOLDS}, "genus": "genus",
-    "self_intersections": "triangles that cross others", "psnr": "PSNR, dB", "ssim": "SSIM",
+    "self_intersections": "triangles that cross others", "inside_out": "triangles turned inside out",
+    "psnr": "PSNR, dB", "ssim": "SSIM",
 }  # fmt: skip
 
 
@@ -59,6 +61,7 @@ def evaluate_fit(
         if surface.is_watertight:
             numbers[key] = genus(surface)
     numbers["self_intersections"] = int(crossing_triangles(guess_mesh.vertices, guess_mesh.faces).sum())
+    numbers["inside_out"] = int(inside_out(ring, *ring.domain.sample(ring.subdivisions)).sum())
     predicted, photographs = compare_photographs(capture, ring, spp)
     numbers |= {f"{key}_input": value for key, value in predicted.items()}
     lists = {"views": [view | photograph for view, photograph in zip(views, photographs)]}

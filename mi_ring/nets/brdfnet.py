@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import MLP
 from mi_ring.nets.registry import register_network
 
@@ -79,15 +80,18 @@ class ReflectanceMap(nn.Module):
 
 @register_network("brdfnet")
 class BRDFNet(MLP, ReflectanceMap):
-    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons on the domain point s, never on the deformed point.
+    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons. Or the parameters of another BSDF.
 
-    Or the parameters of another BSDF.
+    On the domain point s, not on the deformed point, unless `Ring.material_at` says so.
     """
 
-    def __init__(self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE) -> None:
-        super().__init__(depth=5, outputs=sum(Parameter(*p).channels for p in parameters))
+    def __init__(
+        self, scale: float = 1.0, parameters: Sequence[Parameter] = COOK_TORRANCE, encoding: str = "linear",
+        frequencies: int = 16,
+    ) -> None:  # fmt: skip
+        super().__init__(5, sum(Parameter(*p).channels for p in parameters), PosEnc(frequencies, encoding))
         self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
         """What makes it anew; `scale` is among the weights."""
-        return {"parameters": [tuple(p) for p in self.bsdf_parameters]}
+        return {"parameters": [tuple(p) for p in self.bsdf_parameters], **self.encoding.arguments()}

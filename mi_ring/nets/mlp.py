@@ -35,12 +35,12 @@ def plain_autograd() -> Iterator[None]:
 class MLP(nn.Module):
     """`outputs` functions of a point: its encoding, `depth` hidden layers of leaky ReLUs, a linear layer."""
 
-    def __init__(self, depth: int, outputs: int) -> None:
+    def __init__(self, depth: int, outputs: int, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
         super().__init__()
-        self.encoding = PosEnc()
-        sizes = [self.encoding.width] + [WIDTH] * depth
+        self.encoding = encoding or PosEnc()
+        sizes = [self.encoding.width] + [width] * depth
         self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:]))
-        self.output = nn.Linear(WIDTH, outputs)
+        self.output = nn.Linear(width, outputs)
 
     def evaluate(self, x: Tensor) -> Tensor:
         """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.

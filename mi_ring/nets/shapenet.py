@@ -8,8 +8,9 @@ from torch.autograd.function import once_differentiable
 
 from mi_ring.nets.chunks import backward_in_chunks, forward_in_chunks
 from mi_ring.nets.encoding import PosEnc
-from mi_ring.nets.mlp import MLP, Layers, _plain
+from mi_ring.nets.mlp import MLP, WIDTH, Layers, _plain
 from mi_ring.nets.registry import register_network
+from mi_ring.nets.solvers import SOLVERS, Velocity, dopri5, odeint
 
 SPEED = 2.0  #: bound of the velocity, per unit of time: what is opposite on the unit sphere can be reached
 
@@ -22,47 +23,70 @@ class Flow(nn.Module):
     domain is about the unit sphere; a small velocity at first keeps the fit's start there.
     """
 
-    steps: int = 20  #: T: Euler steps from the domain to the object
+    steps: int = 20  #: T: steps from the domain to the object
+    solver: str = "euler"  #: one of `mi_ring.nets.solvers.SOLVERS`; dopri5 takes steps of its own
 
     def velocity(self, x: Tensor) -> Tensor:
         """V(x) for (..., 3) points, of the same shape and type."""
         raise NotImplementedError
 
+    def velocity_of(self, step: int) -> Velocity:
+        """V as it is in a step, counted from 0: the same in all of a flow, but not in those of a plain ResNet."""
+        return self.velocity
+
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Φ(x, steps / T): the first `steps` of the T Euler steps, `x ← x + V(x) / T`, of (V, 3) points."""
-        for _ in range(steps):
-            x = x + self.velocity(x) / self.steps
+        """Φ(x, steps / T): the first `steps` of the T steps, Euler's being `x ← x + V(x) / T`, of (V, 3) points."""
+        if self.solver == "dopri5":
+            return dopri5(self.velocity, x, steps / self.steps)
+        for step in range(steps):
+            x = SOLVERS[self.solver](self.velocity_of(step), x, 1 / self.steps)
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Φ(x, time), `time` in [0, 1]; where that is between two Euler steps, by a part of the second."""
+        """Φ(x, time), `time` in [0, 1]; where that is between two steps, by a shorter one."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
-        return x + rest * self.velocity(x) if rest else x
+        return SOLVERS[self.solver](self.velocity_of(steps), x, rest) if rest else x
 
 
-@register_network("shapenet")
-class ShapeNet(MLP, Flow):
-    """The paper's flow: V is one MLP of 771 neurons.
+class VelocityField(MLP):
+    """V, one MLP, of 771 neurons in the paper.
 
-    V is bounded by `SPEED` (tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH 2022)
+    It is bounded by `SPEED` (tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH 2022)
     and starts at almost 0, so that the start surface equals the domain.
     """
 
-    def __init__(self, steps: int = 20) -> None:
-        super().__init__(depth=3, outputs=3)
-        self.steps = steps
+    def __init__(self, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
+        super().__init__(3, 3, encoding, width)
         with torch.no_grad():
             self.output.weight.mul_(1e-2)
             self.output.bias.zero_()
 
-    def arguments(self) -> dict:
-        """What makes it anew."""
-        return {"steps": self.steps}
-
     def velocity(self, x: Tensor) -> Tensor:
         """V(x) for (..., 3) points, of the same shape and type."""
         return SPEED * torch.tanh(self.evaluate(x).to(x.dtype))
+
+
+@register_network("shapenet")
+class ShapeNet(VelocityField, Flow):
+    """The paper's flow, of one velocity field for all steps: the ring.
+
+    Raises InputError if the package that a `solver` needs is not installed.
+    """
+
+    def __init__(
+        self, steps: int = 20, solver: str = "euler", encoding: str = "linear", frequencies: int = 16
+    ) -> None:  # fmt: skip
+        super().__init__(PosEnc(frequencies, encoding))
+        if solver not in SOLVERS:
+            raise ValueError(f"solver: is {solver}, must be one of {', '.join(SOLVERS)}")
+        if solver == "dopri5":
+            odeint()
+        self.steps, self.solver = steps, solver
+
+    def arguments(self) -> dict:
+        """What makes it anew."""
+        return {"steps": self.steps, "solver": self.solver, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
         """As `Flow.flow`, in bfloat16 under `torch.autocast`.
@@ -70,7 +94,7 @@ class ShapeNet(MLP, Flow):
         Differentiable once and by one backward pass, which frees what was kept for it; within
         `mi_ring.nets.mlp.plain_autograd` as often as one likes.
         """
-        if _plain.get():
+        if _plain.get() or self.solver != "euler":
             return super().flow(x, steps)
         return _Flow.apply(x, SPEED / self.steps, steps, *self.operands(x))
 

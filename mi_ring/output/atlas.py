@@ -146,5 +146,5 @@ def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
     """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
-        parts = [ring.brdf_net(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]
+        parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]
     return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

@@ -23,7 +23,7 @@ def write_mesh(
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():
         s = s.to(ring.center.device)
-        vertices, material = ring.surface(s, time), ring.brdf_net(s)
+        vertices, material = ring(s, time)
     mesh = mesh_of(vertices.cpu().numpy(), faces)
     unseen = None
     if views is not None:

@@ -134,7 +134,7 @@ class ShapeNetMesh(mi.Mesh):
         else:
             s, faces = self.ring.domain.sample(self.subdivisions)
             with torch.no_grad():
-                vertices, material = self.ring.surface(s), self.ring.brdf_net(s)
+                vertices, material = self.ring(s)
         matrix = torch.tensor(to_world, dtype=torch.float32)
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(to_world[:3, :3]) < 0:

@@ -94,7 +94,7 @@ class Surface:
         with torch.no_grad():
             self.set_faces(faces)
             s = s.to(ring.center.device)
-            self.write(ring.surface(s, time), ring.brdf_net(s))
+            self.write(*ring(s, time))
 
 
 def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:

@@ -13,6 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.spherical import SphericalMap
 from mi_ring.nets.brdfnet import ReflectanceMap
+from mi_ring.nets.shapenet import Flow
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
 
@@ -38,13 +39,12 @@ def dress(ring: Ring, options: MaterialOptions) -> None:
     """Give a ring the material that the options ask for. Raises InputError if it cannot have it."""
     if options.material:
         other = load_fit(options.material)
-        ring.bsdf = other.bsdf
-        if same_domain(ring, other):
-            ring.brdf_net = other.brdf_net
-        else:
+        ring.bsdf, ring.material_at = other.bsdf, "domain"
+        ring.brdf_net = other.brdf_net if other.material_at == "domain" else OnSurface(other.brdf_net, other.shape_net)
+        if not same_domain(ring, other):
             here = SphericalMap(ring.domain, "--material: the shape")
             there = SphericalMap(other.domain, f"{options.material}: --material")
-            ring.brdf_net = Carried(other.brdf_net, here, there)
+            ring.brdf_net = Carried(ring.brdf_net, here, there)
         ring.indirect = ring.indirect and other.indirect
     gains: dict[str, ArrayLike] = {}
     offsets: dict[str, float] = {}
@@ -83,6 +83,17 @@ def same_domain(a: Ring, b: Ring) -> bool:
     if isinstance(a.domain, Sphere) or isinstance(b.domain, Sphere):
         return type(a.domain) is type(b.domain)
     return np.array_equal(a.domain.points, b.domain.points) and np.array_equal(a.domain.faces, b.domain.faces)
+
+
+class OnSurface(ReflectanceMap):
+    """A BRDF-Net that is a function of points of its own object's surface, as one of points of the domain."""
+
+    def __init__(self, net: ReflectanceMap, shape_net: Flow) -> None:
+        super().__init__(net.bsdf_parameters, float(net.scale))
+        self.net, self.shape_net = net, shape_net
+
+    def forward(self, s: Tensor) -> dict[str, Tensor]:
+        return self.net(self.shape_net(s.reshape(-1, 3)).reshape(s.shape))
 
 
 class Carried(ReflectanceMap):

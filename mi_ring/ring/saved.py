@@ -11,6 +11,7 @@ import trimesh
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets import resnet  # noqa: F401  (registers it)
 from mi_ring.nets.registry import architecture_of, build
 from mi_ring.ring.ring import Ring
 from mi_ring.system.files import is_sealed
@@ -30,7 +31,7 @@ def ring_state(ring: Ring, config: dict | None = None) -> dict:
         "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
         "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
         "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
-        "up": ring.up, "metres": ring.metres,
+        "up": ring.up, "metres": ring.metres, "material_at": ring.material_at,
     }  # fmt: skip
 
 
@@ -47,6 +48,7 @@ def ring_of(state: dict) -> Ring:
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
         subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
+        material_at=state.get("material_at", "domain"),
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     require_sound(ring)
@@ -65,6 +67,7 @@ def require_sound(ring: Ring) -> None:
     require(ring.ground is None or ring.ground.shape == (2, 3), "ground is no place and normal")
     require(ring.up is None or (len(ring.up) == 3 and all(map(math.isfinite, ring.up))), "up is no direction")
     require(isinstance(ring.bsdf, str), "the BSDF is no XML")
+    require(ring.material_at in ("domain", "surface"), f"a material at {ring.material_at}")
     points, faces = ring.domain.points, ring.domain.faces
     require(points.shape[1:] == faces.shape[1:] == (3,) and bool(np.isfinite(points).all()), "the domain is no mesh")
     require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")

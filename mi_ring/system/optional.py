@@ -13,15 +13,19 @@ def installed(package: str) -> bool:
     return importlib.util.find_spec(package) is not None
 
 
-def need(package: str, what: str) -> ModuleType:
-    """Import a package. Raises InputError, which says `what` it is for, if it is not installed."""
+def need(package: str, what: str, distribution: str | None = None) -> ModuleType:
+    """Import a package. Raises InputError, which says `what` it is for, if it is not installed.
+
+    `distribution`: what to install, if that has another name.
+    """
     try:
         module = importlib.import_module(package)
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
-        raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install {package}` "
-                         "(for some systems, Linux on ARM for one, there is none ready-made)") from error  # fmt: skip
+        raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install "
+                         f"{distribution or package}` (for some systems, Linux on ARM for one, there is none "
+                         "ready-made)") from error  # fmt: skip
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)  # pycolmap has put one of its own, which prints a stack trace

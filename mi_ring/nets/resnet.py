@@ -1,0 +1,65 @@
+"""What the ring is compared with: a plain ResNet, whose blocks do not share their weights (paper's ablation)."""
+
+from typing import Any
+
+from torch import nn
+
+from mi_ring.nets.encoding import PosEnc
+from mi_ring.nets.mlp import WIDTH
+from mi_ring.nets.registry import register_network
+from mi_ring.nets.shapenet import Flow, ShapeNet, VelocityField
+from mi_ring.nets.solvers import Velocity
+
+
+@register_network("resnet")
+class ResNet(Flow):
+    """As deep as the ring, `steps` blocks `x ← x + Vₖ(x) / T`, but each with weights of its own: the flow of no field.
+
+    Together the blocks have as many parameters as the ring, as nearly as widths are whole numbers: they are narrower,
+    for T = 20 about 42 neurons wide instead of 256. Or `width` neurons each, which are T times as many parameters at
+    the ring's own 256.
+    """
+
+    def __init__(
+        self, steps: int = 20, encoding: str = "linear", frequencies: int = 16, width: int | None = None
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.steps, self.width = steps, width
+        self.encoding = PosEnc(frequencies, encoding)
+        widths = [width] * steps if width else equal_widths(steps, self.encoding)
+        self.blocks = nn.ModuleList(VelocityField(self.encoding, w) for w in widths)
+
+    def arguments(self) -> dict:
+        """What makes it anew."""
+        return {"steps": self.steps, "width": self.width, **self.encoding.arguments()}
+
+    def velocity_of(self, step: int) -> Velocity:
+        """Vₖ, of block k."""
+        block: Any = self.blocks[step]
+        return block.velocity
+
+
+def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
+    """Widths of blocks that have about as many parameters together as one of the ring's width.
+
+    The first blocks are one neuron wider than the others, so that not half such a block is missing or too much.
+    """
+
+    def parameters(width: int) -> int:
+        return (encoding.width + 1) * width + 2 * (width + 1) * width + 3 * (width + 1)
+
+    whole = parameters(WIDTH)
+    narrow = max(w for w in range(1, WIDTH + 1) if blocks * parameters(w) <= whole or w == 1)
+    missing = whole - blocks * parameters(narrow)
+    wide = max(0, round(missing / (parameters(narrow + 1) - parameters(narrow))))
+    return [narrow + 1] * wide + [narrow] * (blocks - wide)
+
+
+def shape_net_of(kind: str, steps: int, solver: str, encoding: str, frequencies: int) -> Flow:
+    """The network in Shape-Net's place: the `ring`, a `resnet` of as many parameters, a `wide-resnet` of its width.
+
+    Raises InputError if the package that the solver needs is not installed.
+    """
+    if kind == "ring":
+        return ShapeNet(steps, solver, encoding, frequencies)
+    return ResNet(steps, encoding, frequencies, WIDTH if kind == "wide-resnet" else None)
