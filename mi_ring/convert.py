@@ -9,7 +9,7 @@ import tyro
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.formats import FORMATS
-from mi_ring.importers.frames import require_frames
+from mi_ring.importers.frames import frames_of, require_frames
 from mi_ring.importers.writer import Writer, place_frame
 from mi_ring.system import command
 from mi_ring.system.progress import progress
@@ -27,13 +27,7 @@ def main(arguments: Sequence[str]) -> None:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in FORMATS:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
-    try:
-        frames = list(source.frames())
-    except InputError:
-        raise
-    except Exception as error:  # whatever files of strangers do to those who read them
-        what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        raise InputError(f"{source.src}: SRC: is damaged, or not of this format ({what})") from error
+    frames = frames_of(source)
     if source.left_out and not frames:
         raise InputError(f"{source.src}: SRC: none of {len(source.left_out)} photographs has a pose")
     require_frames(frames, source.src)

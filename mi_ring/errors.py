@@ -6,9 +6,12 @@ from pathlib import Path
 class InputError(ValueError):
     """Something the user gave cannot be used.
 
-    The message is one line: the file, the field, what was found, and what to do. Commands print it and exit with
-    status 2.
+    The message is one line, whatever it echoes: the file, the field, what was found, and what to do. Commands print it
+    and exit with status 2.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))
 
 
 class SceneError(ValueError):

@@ -24,7 +24,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.session import run_session
 from mi_ring.output import results
 from mi_ring.system import command
-from mi_ring.system.files import locked
+from mi_ring.system.files import locked, read_json
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
 AFTERWARDS = 30.0  #: seconds that pictures before a fit and its results after it are taken to take
@@ -144,9 +144,9 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
 def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path) -> FitConfig:
     """The settings that --minutes has led to before, by the folder's config.json, if there is one."""
     try:
-        before = json.loads((folder / "config.json").read_text())
+        before = read_json(folder / "config.json")
         minutes, preset, iterations = before["minutes"], before["preset"], int(before["iterations"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, LookupError, TypeError, OverflowError):
         return config  # its checkpoint tells what is wrong
     if minutes != config.minutes:
         raise InputError(f"{folder}: --minutes: was {minutes:g} before, is {config.minutes:g} now; give the same")

@@ -1,6 +1,9 @@
 """Pictures as arrays: sRGB, box filter, Gaussian blur, files with all their bits."""
 
+import contextlib
 import math
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,11 +16,15 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
+from mi_ring.foreign import require_room
 from mi_ring.system.files import write_file
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+
+# Photographs of phones have more pixels than what Pillow takes for an attack; `require_room` goes by the file's size.
+Image.MAX_IMAGE_PIXELS = None
 
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
@@ -60,34 +67,82 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
 
 
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """An image file by Pillow, which may read more than the header to answer any question.
+
+    Raises ValueError if it declares to be larger than such a file can be, what its reader likes if it is none.
+    """
+    with Image.open(path) as image:
+        require_room(path, 2 * len(image.getbands()) * math.prod(image.size))
+        yield image
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) [px] that an image file declares. Raises as `opened` does."""
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return exr_size(path)[:2]
+    if suffix in (".tif", ".tiff"):  # which Pillow turns by their orientation, `read_image` does not
+        with tifffile.TiffFile(path) as file:
+            return file.pages.first.imagewidth, file.pages.first.imagelength
+    with opened(path) as image:
+        return image.size
+
+
+def exr_size(path: Path) -> tuple[int, int, int]:
+    """Width, height [px] and number of channels that the header of an OpenEXR file declares.
+
+    By "OpenEXR File Layout": attributes are their name and their type, which end in 0, their size and their value.
+    """
+    with path.open("rb") as file:
+        header = file.read(2**16)  # of its chunks there may be many more
+    place, found = 8, {}
+    if header[:4] != b"\x76\x2f\x31\x01":
+        raise ValueError("no OpenEXR file")
+    while header[place]:
+        name, kind = header.index(b"\0", place), 0
+        kind = header.index(b"\0", name + 1)
+        (size,) = struct.unpack_from("<I", header, kind + 1)
+        found[header[place:name]] = header[kind + 5 : kind + 5 + size]
+        place = kind + 5 + size
+    left, top, right, bottom = struct.unpack("<4i", found[b"dataWindow"])
+    channels, place = 0, 0
+    while found[b"channels"][place]:  # a name, then 16 bytes
+        channels, place = channels + 1, found[b"channels"].index(b"\0", place) + 17
+    if min(right - left, bottom - top, channels - 1) < 0:
+        raise ValueError("declares no pixels")
+    return right - left + 1, bottom - top + 1, channels
+
+
 def read_image(path: Path) -> np.ndarray:
-    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32. Raises ValueError for inks."""
+    """Pixels (H, W, C) of an image file as they are: uint8, uint16, else float32.
+
+    Raises ValueError for inks and, before it is allocated, for what declares to be larger than such a file can be; what
+    its reader likes for what is damaged.
+    """
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # which Mitsuba does not read
         with tifffile.TiffFile(path) as file:
-            if file.pages.first.photometric == tifffile.PHOTOMETRIC.SEPARATED:
+            page = file.pages.first
+            if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
+            require_room(path, math.prod(page.shape) * page.dtype.itemsize)
+            if math.prod(page.chunked) > path.stat().st_size:  # each of which would be asked for
+                raise ValueError(f"declares {math.prod(page.chunked):,} strips or tiles, and is shorter")
         pixels = np.array(imageio.imread(path, page=0))
-    elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
-        with Image.open(path) as image:
-            pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
-    else:  # others read PNGs of 16 bits as 8, silently
+    elif suffix == ".exr":
+        require_room(path, 4 * math.prod(exr_size(path)))
         pixels = np.array(mi.Bitmap(str(path)), copy=True)
+    elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
+        with opened(path) as image:
+            pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
+    else:
+        with opened(path):  # others read PNGs of 16 bits as 8, silently
+            pixels = np.array(mi.Bitmap(str(path)), copy=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
-
-
-def read_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image file by its header, if it has one that is read alone. Raises as `read_image`."""
-    suffix = path.suffix.lower()
-    if suffix in (".jpg", ".jpeg", ".png"):
-        with Image.open(path) as image:
-            return image.size
-    if suffix in (".tif", ".tiff"):
-        with tifffile.TiffFile(path) as file:
-            return file.pages.first.imagewidth, file.pages.first.imagelength
-    return read_image(path).shape[1::-1]
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:

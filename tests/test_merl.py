@@ -210,7 +210,7 @@ def test_what_is_no_material_is_one_clear_error(table, tmp_path):
         ("other.binary", "", r"begins with \[0, 0, 0\], must be \[90, 90, 180\]"),
         ("none.binary", "", "which is no file"),
         ("nets.npz", "gold", 'no material "gold"; must be one of one, other'),
-        ("broken.npz", "one", "is no .npz, or was cut off"),
+        ("broken.npz", "one", "cannot be read as arrays of NumPy's, .npz"),
         ("turned.npz", "one", r"w1 is of shape \[1, 21, 6\], must be \[1, 6, 21\]"),
         ("empty.npz", "one", "has no array w1"),
         (str(table), "gold", "a table holds one alone"),

@@ -6,19 +6,21 @@ import json
 import re
 import shutil
 import struct
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import AXES, CENTER
+from matplotlib.figure import Figure
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from mi_ring import fit, images
 from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.fit import Fit
-from mi_ring.output import report
+from mi_ring.output import figures, report
 
 VIEWER = Path(report.__file__).parent / "viewer"
 QUICK = ["--levels", "2", "--widths", "56", "--shares", "1", "--batch", "4", "--subdivisions", "3", "--no-indirect"]
@@ -130,6 +132,56 @@ def test_it_is_one_self_contained_file(page_file, fitted):
     assert all(f"{k:03}.png" in body for k in range(12))
     without = report.report_html(fitted)
     assert without.count("<script") == 1 and "<canvas" not in without
+
+
+def test_figures_are_the_same_whenever_they_are_drawn():
+    """That of a deterministic fit that was interrupted is that of another one."""
+    pages = []
+    for _ in range(2):
+        drawn = Figure()
+        drawn.subplots().plot([1, 3, 2], label="a")
+        pages.append(figures.svg_uri(drawn))
+    assert pages[0] == pages[1]
+
+
+HOSTILE = [
+    "<script>window.evil = 1</script>", '"><img src="x" onerror="window.evil = 1">', "a\n' onload='window.evil = 1",
+    "</script><script>window.evil = 1</script>", "</pre></title></h1><svg onload=window.evil=1>",
+    "{{ 7 * 7 }}{% raw %}", "javascript:window.evil=1", "&lt;script&gt;window.evil=1&lt;/script&gt;", "$\\frac{$",
+    "%s\u2028\u202e", "<!--", "]]>",
+]  # fmt: skip
+
+
+class Parts(HTMLParser):
+    """Names of the elements of a page, and of their attributes; and its text."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.names, self.text = set(), ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.names |= {tag, *(name for name, _ in attrs)}
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_names_that_are_meant_to_run_are_text(page_file, fitted, monkeypatch, open_page, tmp_path):
+    """Of photographs, of the scene, of files in the settings: they add no element and no attribute to the page."""
+    usual = Parts(page_file.read_text("utf-8"))
+    settings = {"domain": ["mesh", *HOSTILE]}
+    monkeypatch.setattr(type(fitted.capture), "names", property(lambda self: HOSTILE))
+    monkeypatch.setattr(type(fitted.config), "settings", lambda self: settings)
+    monkeypatch.setattr(report, "scene_name", lambda path: " ".join(HOSTILE))
+    page = report.report_html(fitted)
+    own = Parts(page)
+    assert own.names <= usual.names and page.count("<script") == 1
+    assert all(own.text.count(name) >= 2 for name in HOSTILE)  # in the heading, and above its pictures
+    (tmp_path / "report.html").write_text(page, "utf-8")
+    shown = open_page(tmp_path / "report.html")
+    assert shown.evaluate("window.evil") is None
+    assert shown.locator("section.photograph").count() == 12 and HOSTILE[3] in shown.locator("h1").inner_text()
 
 
 def test_pictures_are_the_photographs_and_what_was_predicted(page_file, small_capture):

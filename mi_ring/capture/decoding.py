@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.images import contrasted, linear_to_srgb, read_image, read_size, srgb_to_linear
+from mi_ring.foreign import reading
+from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
 
 Read = TypeVar("Read")
@@ -61,7 +62,7 @@ def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
 
 def require_header(path: Path, field: str, sensor: Any, scene: Path) -> None:
     """Raise as `read_pixels` does, for what the first bytes of an image file tell."""
-    require_size(opened(read_size, path, field, sensor, scene), path, field, sensor)
+    require_size(opened(image_size, path, field, sensor, scene), path, field, sensor)
 
 
 def opened(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
@@ -69,10 +70,8 @@ def opened(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, sc
     what = f'photograph "{sensor.id()}", {field}'
     if not path.is_file():
         raise InputError(f"{scene}: {what}: no such file: {path}")
-    try:
+    with reading(f"{path}: {what}", "an image"):
         return read(path)
-    except Exception as error:
-        raise InputError(f"{path}: {what}: cannot be read as an image ({' '.join(str(error).split())})") from error
 
 
 def require_size(size: tuple[int, ...], path: Path, field: str, sensor: Any) -> None:

@@ -139,7 +139,8 @@ class Calibration(nn.Module):
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
         kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
         lenses = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
-        places = np.unique(lights.positions().round(6), axis=0, return_inverse=True)[1].ravel()
+        relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
+        places = np.unique(relative.round(6), axis=0, return_inverse=True)[1].ravel()
         places = places if self.flash is None else np.zeros_like(places)
         self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
         count = len(cameras)

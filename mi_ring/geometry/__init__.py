@@ -1,4 +1,4 @@
 """Surfaces and cameras as arrays: domains, the masks' visual hull, closed meshes.
 
-May import: numpy, scipy, torch, trimesh, skimage, gpytoolbox; system.
+May import: numpy, scipy, torch, trimesh, skimage, gpytoolbox; foreign, system.
 """

@@ -1,21 +1,23 @@
 """Meshes from files, and what is asked of a closed surface."""
 
+import io
 from pathlib import Path
 from typing import Any
 
 import trimesh
 
 from mi_ring.errors import InputError, require_file
+from mi_ring.foreign import reading
 
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     """A mesh from a file, its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
     require_file(path, "the file of a mesh", field)
-    try:
-        mesh: Any = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:
-        raise InputError(f"{path}: {field}: cannot be read as a mesh ({' '.join(str(error).split())})") from error
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices
+    with reading(f"{path}: {field}", "a mesh"):
+        content = io.BytesIO(path.read_bytes())  # of which no more can be asked for than there is
+        resolver = trimesh.resolvers.FilePathResolver(str(path))
+        mesh: Any = trimesh.load(content, path.suffix, resolver=resolver, force="mesh", process=False)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices
     return mesh
 
 

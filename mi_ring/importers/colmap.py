@@ -52,6 +52,7 @@ class Colmap(Photogrammetry):
         try:
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what it has to say is in the exception
             reconstruction = pycolmap.Reconstruction(str(model))
+            registered = {*reconstruction.reg_image_ids()}
         except Exception as error:
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
         if not reconstruction.num_reg_images():
@@ -60,7 +61,6 @@ class Colmap(Photogrammetry):
         images = self.images or next((f for f in beside if f.is_dir()), None)
         if images is None and self.photographs is None:
             raise InputError(f"{self.src}: --images: no folder images beside or above {model}; give it")
-        registered = {*reconstruction.reg_image_ids()}
         for key, image in sorted(reconstruction.images.items(), key=lambda item: item[1].name):
             if key not in registered:
                 self.left_out.add(image.name)

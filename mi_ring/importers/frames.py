@@ -87,6 +87,17 @@ class Source:
         return set()
 
 
+def frames_of(source: Source) -> list[Frame]:
+    """All frames of a source. Raises InputError, whatever files of strangers do to those who read them."""
+    try:
+        return list(source.frames())
+    except InputError:
+        raise
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise InputError(f"{source.src}: SRC: is damaged, or not of this format ({what})") from error
+
+
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise InputError for invalid cameras, lights and names, and for files of another size than their camera's."""
     if not frames:

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.foreign import load_npy
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import existing, image_size, load_npz, matrix, pictures
+from mi_ring.importers.reading import existing, image_size, matrix, pictures
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,9 @@ class Llff(Photogrammetry):
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
         path = existing(self.src / "poses_bounds.npy", "SRC")
-        array = load_npz(path)
-        if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 17:
-            raise InputError(f"{path}: is of shape {getattr(array, 'shape', None)}; must be N x 17 numbers")
+        array = load_npy(path)
+        if array.ndim != 2 or array.shape[1] != 17:
+            raise InputError(f"{path}: is of shape {array.shape}; must be N x 17 numbers")
         poses = matrix(array, array.shape, str(path))[:, :15].reshape(-1, 3, 5)
         folders = [self.src / "images", *sorted(self.src.glob("images_*"), key=by_number), self.src]
         folder = self.images or next((f for f in folders if pictures(f)), folders[0])

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.foreign import load_npy, load_npz
 from mi_ring.importers.cameras import decompose, pinhole
 from mi_ring.importers.frames import Frame, Source
-from mi_ring.importers.reading import entry, first_file, image_size, load_npz, matrix, numbered
+from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Neus(Source):
         numbers = sorted(int(key[10:]) for key in cameras if re.fullmatch(r"world_mat_\d+", key))
         pictures, array = numbered(self.src / "image"), self.src / "images.npy"
         if array.is_file():
-            stack = load_npz(array)
+            stack = load_npy(array)
             if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers):
                 raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3): "
                                  f"one photograph for each world_mat in {path.name}")  # fmt: skip

@@ -8,9 +8,10 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from mi_ring.errors import InputError
+from mi_ring.images import opened
 from mi_ring.importers.frames import Frame, Source, called
 from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
 
@@ -102,11 +103,11 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
     try:
         seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
         return seconds * iso / f_number**2
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ArithmeticError):
         return math.nan
 
 
 def read_exif(path: Path) -> dict[int, Any]:
     """The part of the EXIF data that is about the exposure."""
-    with Image.open(path) as image:
+    with opened(path) as image:
         return image.getexif().get_ifd(ExifTags.IFD.Exif)

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 from xml.etree import ElementTree
 
-import mitsuba as mi
 import numpy as np
 import scipy.io
-from PIL import Image
-from PIL.TiffImagePlugin import TiffImageFile
 
+from mi_ring import images
 from mi_ring.errors import InputError
-from mi_ring.images import read_image
+from mi_ring.foreign import reading
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 Content = TypeVar("Content")
@@ -21,21 +19,12 @@ Content = TypeVar("Content")
 
 def pixels_of(path: Path) -> np.ndarray:
     """Pixels (H, W, C) of an image file. Raises InputError if it cannot be read."""
-    return read_as(path, "image", read_image)
+    return read_as(path, "image", images.read_image)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) [px] of an image file. Raises InputError if it cannot be read."""
-
-    def size(file: Path) -> tuple[int, int]:
-        if path.suffix.lower() == ".exr":
-            width, height = mi.Bitmap(str(file)).size()
-            return width, height
-        with Image.open(file) as image:
-            # Pillow turns TIFFs by their orientation, `read_image` does not.
-            return (image.tag_v2[256], image.tag_v2[257]) if isinstance(image, TiffImageFile) else image.size
-
-    return read_as(path, "image", size)
+    return read_as(path, "image", images.image_size)
 
 
 def has_alpha(path: Path) -> bool:
@@ -44,7 +33,7 @@ def has_alpha(path: Path) -> bool:
         return pixels_of(path).shape[2] in (2, 4)
 
     def alpha(file: Path) -> bool:
-        with Image.open(file) as image:
+        with images.opened(file) as image:
             return image.mode in ("LA", "RGBA")
 
     return read_as(path, "image", alpha)
@@ -127,27 +116,13 @@ def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: 
 
 def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
     """`read(path)`. Raises InputError if there is no such file or if it is not what it should be."""
-    try:
+    with reading(path, what):
         return read(existing(path, what))
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read as {what} ({' '.join(str(error).split())})") from error
 
 
 def load_mat(path: Path) -> dict:
     """The variables of a MATLAB file."""
     return read_as(path, "MATLAB file", scipy.io.loadmat)
-
-
-def load_npz(path: Path) -> Any:
-    """A dictionary of arrays, or the one array of a .npy file."""
-
-    def arrays(file: Path) -> dict[str, np.ndarray] | np.ndarray:
-        content = np.load(file)
-        return content if isinstance(content, np.ndarray) else dict(content)
-
-    return read_as(path, "NumPy file", arrays)
 
 
 def load_json(path: Path) -> Any:

@@ -1,8 +1,8 @@
 """What there is to say of each photograph of a capture, and what is to be mended."""
 
-import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.masks import dark_threshold
 from mi_ring.geometry.hull import WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
+from mi_ring.system.files import read_json
 
 CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares beyond which something is said
 ODD = 3.0  #: a photograph whose light a fit finds so many times as strong as the others', or as weak
@@ -29,6 +30,16 @@ def lit_otherwise(photographs: dict[str, dict[str, Any]]) -> str:
     """Of which photographs a fit has found the light much stronger or weaker than of the others; empty if of none."""
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     return ", ".join(f"{name} ({power:.2g} times)" for name, power in powers.items() if not 1 / ODD < power < ODD)
+
+
+def told_before(scene: Path, names: Collection[str]) -> tuple[str, str]:
+    """`moved_far` and `lit_otherwise` of these photographs, by calibration.json of the scene's fit."""
+    record = read_json(scene.parent / "calibration.json")
+    try:
+        known = {name: entry for name, entry in record["photographs"].items() if name in names}
+        return moved_far(known), lit_otherwise(known)
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError):  # none, or another tool's
+        return "", ""
 
 
 @dataclass
@@ -146,12 +157,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
-    record = capture.path.parent / "calibration.json"  # of the fit that found this calibration
-    try:
-        moved = {k: v for k, v in json.loads(record.read_text("utf-8"))["photographs"].items() if k in capture.names}
-        few, odd = moved_far(moved), lit_otherwise(moved)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # there is none, or it is another tool's
-        few = odd = ""
+    few, odd = told_before(capture.path, capture.names)
     if few:
         found.append(
             f"{few}: the fit has moved the camera much farther than the others': out of focus, or another scene?"

@@ -3,11 +3,13 @@
 import base64
 import io
 
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 
 def svg_uri(figure: Figure) -> str:
-    """A figure as an SVG data URI."""
+    """A figure as an SVG data URI, the same whenever it is drawn."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg")
+    with rc_context({"svg.hashsalt": "mi_ring"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()

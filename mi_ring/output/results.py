@@ -21,7 +21,7 @@ from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, relative_to, write_file, write_state, writing
+from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
 PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
 VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
@@ -30,8 +30,8 @@ VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels ac
 def default_folder(scene: Path) -> Path:
     """Where the results of a scene go: out/<its name>. Raises InputError if those of another scene are there."""
     folder, other = Path("out") / scene_name(scene), None
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it says nothing of use
-        other = folder / json.loads((folder / "config.json").read_text())["scene"]
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # there is none, or it says nothing of use
+        other = folder / read_json(folder / "config.json")["scene"]
     if other and other.is_file() and scene.is_file() and not other.samefile(scene):
         raise InputError(f"{folder}: holds the results of another scene, {relative_to(Path(), other)}; say with --out "
                          "where those of this one are to go")  # fmt: skip
@@ -87,8 +87,8 @@ def add_to_log(folder: Path, entry: dict) -> None:
 def read_log(folder: Path) -> list[dict]:
     """The entries of log.jsonl; a line that was cut off, when the process was killed or the disk was full, is none."""
     entries = []
-    for line in (folder / "log.jsonl").read_text().splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
+    for line in (folder / "log.jsonl").read_bytes().splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
             entries.append(json.loads(line))
     return entries
 

@@ -181,7 +181,7 @@ def lit_surface(capture: Capture, ring: Ring, config: RenderConfig) -> bridge.Su
     """The object in its scene, in the light that the options ask for."""
     if config.envmap:
         return under(config.envmap, up_of(capture, config), capture, ring)
-    return bridge.Surface(capture.scene, capture.shape, ring)
+    return bridge.Surface(capture.scene, capture.shape, ring, as_it_is=integrator_of(config) is not None)
 
 
 def render_views(
@@ -234,4 +234,4 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: Ring) -> bridge.
     lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
-    return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring)
+    return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring, as_it_is=True)

@@ -11,7 +11,8 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.foreign import require_room
+from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, opened, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.system import command
@@ -20,8 +21,6 @@ from mi_ring.system.optional import need
 TRANSPARENT = (".png", ".tif", ".tiff")  #: what may have an alpha channel
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF
 FEWEST = 8  #: photographs that a reconstruction needs at least
-
-Image.MAX_IMAGE_PIXELS = None  # photographs of phones have more than what Pillow takes for an attack
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Picture:
             return read_as(self.path, "raw photograph", develop)
         if suffix in HEIF:
             let_open(self.path)
-            return read_as(self.path, "HEIF photograph", lambda file: np.array(Image.open(file).convert("RGB")))
+            return read_as(self.path, "HEIF photograph", decode_heif)
         pixels = read_as(self.path, "image", read_image)
         if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
@@ -68,8 +67,7 @@ class Picture:
         suffix = self.path.suffix.lower()
         if suffix in HEIF:
             let_open(self.path)
-            with Image.open(self.path) as image:
-                return image.info.get("original_orientation") or 1
+            return read_as(self.path, "HEIF photograph", turned_before)
         if suffix in RAW:
             return FLIPS.get(read_as(self.path, "raw photograph", flip), 1)
         value = self.exif.get(ExifTags.Base.Orientation)
@@ -85,11 +83,11 @@ class Picture:
         """EXIF data, empty where there are none."""
         try:
             let_open(self.path)
-            with Image.open(self.path) as image:
+            with opened(self.path) as image:
                 exif = image.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
                 return exif
-        except (OSError, SyntaxError):  # damaged, or a raw format that Pillow does not know
+        except Exception:  # damaged, in one of many ways, or a raw format that Pillow does not know
             return Image.Exif()
 
     @cached_property
@@ -174,6 +172,18 @@ def let_open(path: Path) -> None:
         need("pillow_heif", f"{path}").register_heif_opener()
 
 
+def decode_heif(path: Path) -> np.ndarray:
+    """A HEIF photograph (H, W, 3) uint8, upright."""
+    with opened(path) as image:
+        return np.array(image.convert("RGB"))
+
+
+def turned_before(path: Path) -> int:
+    """By EXIF's numbers, how a HEIF photograph would have to be turned, had its reader not done so."""
+    with opened(path) as image:
+        return image.info.get("original_orientation") or 1
+
+
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
     """What that package makes masks of photographs with; its network is loaded once."""
@@ -185,6 +195,7 @@ def develop(path: Path) -> np.ndarray:
     """A raw photograph (H, W, 3) uint16, linear radiance in sRGB's primaries, white balance as the camera chose it."""
     rawpy = need("rawpy", f"{path}")
     with rawpy.imread(str(path)) as raw:
+        require_room(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 

@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
-from mi_ring.importers.frames import require_cameras
+from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.board import Board, Sighting, White, calibrate, white
 from mi_ring.photogrammetry.flash import Ball, Flash, find_flash
@@ -136,7 +136,7 @@ def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
         source = replace(source, exif=False)
     for picture in pictures:
         let_open(picture.path)
-    taken = list(source.frames())
+    taken = frames_of(source)
     require_cameras(taken)
     frames = {frame.image.stem: frame for frame in taken}
     for p in pictures:

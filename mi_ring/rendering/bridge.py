@@ -1,5 +1,6 @@
 """The one seam between torch and Dr.Jit: from torch tensors to photographs, and the gradients back."""
 
+import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +22,11 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
 from mi_ring.rendering.scenes import assembled, own_emitters, parted
+from mi_ring.rendering.shading import lamps
 
 WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
+USUAL = 1e-3, 1e4  #: radii [scene units] that are drawn as they are
+FLAT = 1e-6  #: twice the area of a triangle by the square of its sides, below which float32 knows no normal
 PATTERNED = 128, 3  #: the same where a table has a pattern, which glossy surfaces mirror
 
 
@@ -43,12 +47,19 @@ class Surface:
     that shares all other objects with the given one and leaves that as it is. Without, it is the given shape itself.
     Other shapes and top-level emitters of the scene take part in every picture but are not changed; a `table` does so
     only by the light that it reflects onto the others.
+
+    `unit` is how many scene units are one of `scene`'s. Areas and their squares must be numbers in float32: a ring
+    alone that is tiny or enormous is drawn in units of about its radius, unless it is to be drawn `as_it_is`.
     """
 
-    def __init__(self, scene: mi.Scene, shape: mi.Mesh, ring=None):
+    def __init__(self, scene: mi.Scene, shape: mi.Mesh, ring=None, as_it_is: bool = False):
         scene, self.table = parted(scene)
+        self.unit = 1.0
         if ring is not None:
             scene, shape = dressed(scene, shape, ring)
+            alone = self.table is None and len(scene.shapes()) == 1
+            if alone and not as_it_is and all(lamp.is_environment() for lamp in lamps(scene)):
+                self.unit = unit_for(float(ring.radius))
         self.scene, self.shape = scene, shape
         self.params = mi.traverse(scene)
         self.prefix = f"{shape.id()}."
@@ -64,6 +75,7 @@ class Surface:
     def write(self, vertices: Tensor, attributes: dict[str, Tensor], gradients: bool = False) -> list:
         """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes. Returns the Dr.Jit arrays, in that order.
 
+        The array of the vertices is in units of `unit`.
         Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
         Raises ValueError for another number of vertices than the triangles have, and for attributes of another size.
         """
@@ -77,6 +89,8 @@ class Surface:
                     f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)"
                 )
         tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
+        if self.unit != 1:
+            tensors[POSITIONS] = vertices.detach() / self.unit
         arrays = {name: to_drjit(t) for name, t in tensors.items()}
         if gradients:
             dr.enable_grad(*arrays.values())
@@ -95,6 +109,26 @@ class Surface:
             self.set_faces(faces)
             s = s.to(ring.center.device)
             self.write(*ring(s, time))
+
+
+def degenerate(vertices: Tensor, faces: np.ndarray) -> Tensor:
+    """Which of the vertices (V, 3) belong to triangles (F, 3) without an area, (V,) bool: these have no normal.
+
+    Mitsuba's normals of their vertices have gradients that are not finite.
+    """
+    corners = torch.from_numpy(np.asarray(faces, np.int64)).to(vertices.device)
+    a, b, c = vertices[corners.T]
+    areas = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    longest = torch.maximum((b - a).norm(dim=-1), (c - a).norm(dim=-1))
+    flat = ~(areas > FLAT * longest**2) | ((b - c).norm(dim=-1) == 0)
+    found = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
+    found[corners[flat].ravel()] = True
+    return found
+
+
+def unit_for(radius: float) -> float:
+    """The unit of length that an object of this radius is drawn in: 1 where that will do, else a power of 2."""
+    return 1.0 if USUAL[0] <= radius <= USUAL[1] else 2.0 ** round(math.log2(radius))
 
 
 def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
@@ -127,6 +161,7 @@ class _Render(torch.autograd.Function):
                     dr.enable_grad(buffer)
             photographs = photographs.moved(*buffers)
             arrays += buffers
+        photographs = photographs.in_units(surface.unit)
         if gradients:
             surface.edges = Edges.of(surface.scene, surface.edges)
         edges = surface.edges if gradients else None
@@ -154,6 +189,11 @@ class _Render(torch.autograd.Function):
         dr.traverse(dr.ADMode.Backward)
         # Copied: torch may add to a gradient in place.
         grads = [to_torch(dr.grad(a)).clone().reshape(shape) for a, shape in zip(arrays, shapes)]
+        if not grads[0].isfinite().all():
+            own = degenerate(to_torch(arrays[0]).reshape(-1, 3), surface.faces)
+            grads[0] = torch.where(own[:, None], grads[0].nan_to_num(0, 0, 0), grads[0])
+        if surface.unit != 1:
+            grads[0] = grads[0] / surface.unit
         return None, None, None, None, None, None, *grads
 
 
@@ -194,7 +234,8 @@ def draw(
     """
     parts = []
     for pixels in photographs.chunks(spp):
-        channels = render_photographs(surface.scene, photographs, spp, seed, shadows, pixels=pixels)
+        own = photographs.in_units(surface.unit)
+        channels = render_photographs(surface.scene, own, spp, seed, shadows, pixels=pixels)
         dr.eval(channels)
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
@@ -261,7 +302,7 @@ def surroundings(
     usual = (WIDTH, SPP) if table is None else PATTERNED
     width, spp = width or usual[0], spp or usual[1]
     factor = -(-max(photographs.size) // width)
-    small = photographs.select(np.array(photographs.index), photographs.size, factor)
+    small = photographs.select(np.array(photographs.index), photographs.size, factor).in_units(surface.unit)
     channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, table)]
     rgb, alpha = pictures(channels[:4], small)
     harmonics = torch.stack(channels[4:]).reshape(-1, 3, *alpha.shape).movedim(1, -1) if room else None
@@ -286,7 +327,7 @@ def maps(
     width, height = photographs.size
     attributes, parts = {f"vertex_{p.name}": p.channels for p in parameters}, []
     for pixels in photographs.chunks(1):
-        channels = render_maps(surface.scene, photographs, attributes, pixels)
+        channels = render_maps(surface.scene, photographs.in_units(surface.unit), attributes, pixels)
         dr.eval(channels)  # together: each would otherwise trace the rays again
         parts.append(np.stack([np.array(c) for c in channels], -1))
     channels = np.concatenate(parts).reshape(len(photographs), height, width, -1)

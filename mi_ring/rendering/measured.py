@@ -1,11 +1,13 @@
 """Reflectance as it was measured: tables of the MERL database, and networks that were fitted to them."""
 
 from pathlib import Path
-from zipfile import is_zipfile
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.foreign import load_npz
 
 CELLS = 90, 90, 180  #: of a table: θh, θd, φd
 SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its planes, red, green, blue
@@ -51,20 +53,18 @@ class Network:
     """A network of 6-21-21-3 neurons that was fitted to such a table ("Neural BRDF Representation", Sztrajman 2021)."""
 
     def __init__(self, path: Path, material: str):
-        if not is_zipfile(path):
-            raise ValueError(f"{path}: is no .npz, or was cut off")
-        with np.load(path) as file:
-            for name in ("names", *LAYERS):
-                if name not in file:
-                    raise ValueError(f"{path}: has no array {name}; is it one of networks fitted to MERL?")
-            names = [str(name) for name in file["names"]]
-            for name, shape in LAYERS.items():
-                if file[name].shape != (len(names), *shape):
-                    found, wanted = list(file[name].shape), [len(names), *shape]
-                    raise ValueError(f"{path}: {name} is of shape {found}, must be {wanted}")
-            if material not in names:
-                raise ValueError(f'{path}: has no material "{material}"; must be one of {", ".join(names)}')
-            self.layers = [file[name][names.index(material)].astype(float).tolist() for name in LAYERS]
+        arrays = load_npz(path)
+        for name in ("names", *LAYERS):
+            if name not in arrays:
+                raise InputError(f"{path}: has no array {name}; is it one of networks fitted to MERL?")
+        names = np.ravel(arrays["names"]).astype(str).tolist()
+        for name, shape in LAYERS.items():
+            if arrays[name].shape != (len(names), *shape) or arrays[name].dtype.kind not in "fiu":
+                found, wanted = list(arrays[name].shape), [len(names), *shape]
+                raise InputError(f"{path}: {name} is of shape {found}, must be {wanted}, of numbers")
+        if material not in names:
+            raise InputError(f'{path}: has no material "{material}"; must be one of {", ".join(names)}')
+        self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
         """As `Table.value`."""

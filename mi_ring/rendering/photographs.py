@@ -80,6 +80,18 @@ class Photographs:
             distortion=self.distortion if distortion is None else distortion,
         )  # fmt: skip
 
+    def in_units(self, unit: float) -> "Photographs":
+        """The same pictures in a world of another unit of length, of so many scene units."""
+        if unit == 1:
+            return self
+        entry, finite = dr.arange(mi.UInt32, dr.width(self.cameras)), self.lights.finite
+        length = dr.select(entry % 4 == 3, 1 / unit, 1)
+        near = dr.gather(mi.Bool, finite, dr.arange(mi.UInt32, 3 * dr.width(finite)) // 3)
+        scale = dr.select(near, 1 / unit, 1)
+        places, strengths = self.lights.places * scale, self.lights.strengths * scale * scale  # its square may be inf
+        lights = replace(self.lights, places=places, strengths=strengths)
+        return replace(self, cameras=self.cameras * length, lights=lights)
+
     def __len__(self) -> int:
         return dr.width(self.index)
 

@@ -4,11 +4,13 @@ import contextlib
 import errno
 import hashlib
 import io
+import json
 import os
 import secrets
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import filelock
 import torch
@@ -109,6 +111,14 @@ def is_sealed(archive: bytes) -> bool:
 def fingerprint(content: bytes) -> bytes:
     """Of some bytes, in hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file of ours holds; None if there is no such file, or if it is damaged."""
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 @contextlib.contextmanager
