@@ -102,7 +102,7 @@ def test_the_adaptive_solver_agrees_with_small_steps_of_another_also_in_its_grad
 
     rough, exact = there_and_back(one), there_and_back(other)
     with plain_autograd():
-        assert all(torch.equal(a, b) for a, b in zip(rough, there_and_back(one)))
+        torch.testing.assert_close(there_and_back(one), rough, rtol=1e-9, atol=1e-12)
     monkeypatch.setattr(solvers, "TOLERANCE", 1e-7)
     fine = there_and_back(one)
     moved = (exact[0] - s).norm()
@@ -203,7 +203,7 @@ def test_a_plain_resnet_goes_through_its_blocks_one_after_another():
     torch.testing.assert_close(net(x), way[4])
     torch.testing.assert_close(net.flow(x, 3), way[3])
     torch.testing.assert_close(net(x, 0.625), (way[2] + way[3]) / 2)
-    assert (way[4] - x).norm(dim=1).mean() > 0.1
+    assert (way[4] - x).norm(dim=1).mean() > 0.02
 
 
 def test_a_wide_resnet_of_equal_blocks_is_the_ring():
