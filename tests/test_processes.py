@@ -38,6 +38,8 @@ def step(fit):
     loss = fit.weigh(it)
     for optimizer in fit.lookers:
         optimizer.look(it)
+    for optimizer in fit.optimizers:
+        optimizer.zero_grad()
     (loss + 0 * it.vertices.sum()).backward()
     parts = {"shape": fit.ring.shape_net, "brdf": fit.ring.brdf_net, "calibration": fit.calibration}
     fit.processes.sum_gradients([p for part in parts.values() for p in part.parameters()])

@@ -6,7 +6,9 @@ the points and renders some of the photographs, and what these say is summed ove
 torch.distributed, which one process does without.
 """
 
+import atexit
 import contextlib
+import functools
 import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
@@ -82,6 +84,12 @@ class Team(Processes):
         own = self.here == 1 or os.environ.get(OWN) == "1"
         self.nccl = own and torch.cuda.is_available() and distributed.is_nccl_available()
         distributed.init_process_group("cpu:gloo,cuda:nccl" if self.nccl else "gloo")
+        atexit.register(self.part)
+
+    def part(self) -> None:
+        """Take leave of the others, at the end of the process: a second time it could not join them."""
+        with contextlib.suppress(RuntimeError):
+            self.distributed.destroy_process_group()
 
     def attempt(self, exchange: Callable[[], None]) -> None:
         """Raises Lost where torch's own error is that another process has gone."""
@@ -217,6 +225,12 @@ def current() -> Processes:
     return _current
 
 
+@functools.cache
+def team_of_this_process() -> Team:
+    """The one that it belongs to."""
+    return Team()
+
+
 @contextlib.contextmanager
 def joined() -> Iterator[Processes]:
     """Within it the processes that `torchrun` has started are one fit; others are alone.
@@ -227,7 +241,7 @@ def joined() -> Iterator[Processes]:
     if int(os.environ.get("WORLD_SIZE", 1)) == 1 or "TORCHELASTIC_RUN_ID" not in os.environ:
         yield ALONE
         return
-    team = _current = Team()
+    team = _current = team_of_this_process()
     try:
         with silent() if team.rank else contextlib.nullcontext():
             yield team
@@ -237,8 +251,6 @@ def joined() -> Iterator[Processes]:
         raise
     finally:
         _current = ALONE
-        with contextlib.suppress(RuntimeError):
-            team.distributed.destroy_process_group()
 
 
 @contextlib.contextmanager
