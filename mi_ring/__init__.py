@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mi_ring.system import llvm
+from mi_ring.system.gpus import choose_gpu
 from mi_ring.version import __version__
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def _prepare_mitsuba() -> None:
     """Choose LLVM, register the plugins, select a variant."""
     # Torch's workers would spin after each operation and steal the cores from Dr.Jit. Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    choose_gpu()
     llvm.prepare()
     problem = llvm.missing()
     command = _command_looked_for()

@@ -21,6 +21,7 @@ from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_in
 from mi_ring.fitting.checkpoint import read_checkpoint, resumed
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.processes import Processes, joined
 from mi_ring.fitting.session import run_session
 from mi_ring.output import results
 from mi_ring.system import command
@@ -83,38 +84,57 @@ class FitConfig(Config, Task):
 
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 0, or 128 and the signal that it was interrupted by: 130 is Ctrl-C."""
+    with joined() as processes:
+        return run(arguments, processes)
+
+
+def run(arguments: Sequence[str], processes: Processes) -> int:
+    """The command, in each of the processes that it is run by."""
     started = time.monotonic()
-    config = parse_options(arguments)
-    choice = choice_of(config, arguments)
-    require_scene(config.scene)
-    variant: Any = set_variant(config.variant)
-    config, *choice = (dataclasses.replace(c, variant=variant) for c in (config, *choice))
+    config, choice, state = processes.by_first(lambda: asked(arguments))
     folder = config.folder
-    if config.minutes and config.resume:
-        config = planned_before(config, choice, folder)
-    state = read_checkpoint(folder, config) if config.resume else None
+    processes.together(lambda: None if processes.rank == 0 else same_variant(config.variant))
     keep_memory()
-    capture = load_capture(config.scene, masks=config.masks)
+    capture = processes.together(lambda: load_capture(config.scene, masks=config.masks))
     if capture.shape.ring is not None:
         print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:
         print("Masks: found by brightness, for the room was dark")
     elif config.masks != "given" and not any(capture.masks.given):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
-    with threads_of(config.thread_count):
-        fit, costs = resumed(state, capture, config, folder) if state else Fit(capture, config), None
-        results.fitted_scene(fit, folder)  # refuses what cannot be written later
-        with locked(folder):
-            if config.minutes and not state:
-                config, costs = planned(choice, fit, started)
-                replan(fit, config)
-            options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-            prepare = partial(results.prepare_folder, folder, config.scene, options)
-            prepare(config.resume)
-            interrupted = run_session(fit, folder, partial(prepare, resume=True), costs)
+    with threads_of(config.thread_count or processes.threads), contextlib.ExitStack() as held:
+        fit = processes.together(lambda: resumed(state, capture, config, folder) if state else Fit(capture, config))
+        processes.by_first(lambda: results.fitted_scene(fit, folder))  # refuses what cannot be written later
+        processes.by_first(lambda: held.enter_context(locked(folder)))
+        costs = None
+        if config.minutes and not state:
+            config, costs = planned(choice, fit, started)
+            replan(fit, config)
+        options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+        prepare = partial(results.prepare_folder, folder, config.scene, options)
+        processes.by_first(lambda: prepare(config.resume))
+        interrupted = run_session(fit, folder, partial(prepare, resume=True), costs)
     if interrupted:
         print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
     return 128 + interrupted if interrupted else 0
+
+
+def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
+    """The configuration, what --minutes chooses from, and with --resume the state to go on from."""
+    config = parse_options(arguments)
+    choice = choice_of(config, arguments)
+    require_scene(config.scene)
+    variant: Any = set_variant(config.variant)
+    config, *choice = (dataclasses.replace(c, variant=variant) for c in (config, *choice))
+    if config.minutes and config.resume:
+        config = planned_before(config, choice, config.folder)
+    return config, choice, read_checkpoint(config.folder, config) if config.resume else None
+
+
+def same_variant(variant: str) -> None:
+    """Switch to the variant of the first process. Raises InputError if this one cannot."""
+    if set_variant(variant) != variant:
+        raise InputError(f"--variant {variant}: this process has no GPU to use; give llvm_ad_rgb")
 
 
 def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
@@ -132,7 +152,7 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
     """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
     minutes, costs = choice[0].minutes, measure(fit, all_stages(fit, choice))
-    spent = time.monotonic() - started + AFTERWARDS
+    spent = fit.processes.told(time.monotonic() - started) + AFTERWARDS
     if (needed := spent + fewest_seconds(choice, fit.near, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
                          f"{math.ceil(needed / 6) / 10:g} or more")  # fmt: skip

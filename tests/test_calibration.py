@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import mitsuba as mi
@@ -387,7 +388,8 @@ def test_rates_of_cameras_and_lights_rise_once_there_is_a_shape_and_fall(small_c
     fit = mi_ring.Fit(mi_ring.load_capture(small_capture), mi_ring.Config(**changes))
 
     def rates(progress):
-        fit.descend(sum(p.sum() for p in fit.calibration.parameters()) * 0.0, progress)
+        it = SimpleNamespace(terms={"calibration": 0.0}, loss=0.0, progress=progress)
+        fit.descend(it, sum(p.sum() for p in fit.calibration.parameters()) * 0.0)
         groups = [g for o in fit.optimizers for g in o.param_groups]
         return [next(g["lr"] for g in groups if any(p is unknown for p in g["params"]))
                 for unknown in (fit.calibration.turn, fit.calibration.light)]  # fmt: skip

@@ -31,6 +31,7 @@ from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
+from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
@@ -813,7 +814,7 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
     it = SimpleNamespace(predicted=predicted, observed=observed, clipped=clipped, masked=torch.tensor([True]),
                          mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]), valid=None,
                          coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))  # fmt: skip
-    it.surely = lambda: Iteration.surely(it)
+    it.surely, it.share = lambda: Iteration.surely(it), Share(ALONE, 1)
     assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
     it.masked = torch.tensor([False])  # then what is predicted to be the object is
     assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05 + 9) / (0.5 + 0.25 + 0.4 + 9))

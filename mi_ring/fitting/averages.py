@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.rendering.bridge import Surroundings
 
 LATEST = 0.1  #: share of the newest picture, once there are so many
@@ -21,10 +22,12 @@ class Averages:
         #: By the photograph: how many pictures, and their average (h, w, 4) with the object's coverage.
         self.pictures: dict[int, tuple[int, Tensor]] = {}
 
-    def of(self, around: Surroundings, index: np.ndarray) -> Surroundings:
-        """The same surroundings of photographs `index` (n,), with the average of their interreflection."""
+    def of(self, around: Surroundings, index: np.ndarray, share: Share | None = None) -> Surroundings:
+        """The same surroundings, with the average of their interreflection, of photographs `index` (N,) or a share."""
+        share = share or Share(ALONE, len(index))
         averages = []
-        for k, new in zip(index.tolist(), torch.cat([around.radiance, around.alpha[..., None]], -1)):
+        pictures = share.gathered(torch.cat([around.radiance, around.alpha[..., None]], -1))
+        for k, new in zip(index.tolist(), pictures):
             count, average = self.pictures.get(k, (0, new))
             if average.shape != new.shape:
                 count, average = 0, new
@@ -34,5 +37,5 @@ class Averages:
                 average = average + (new - average) * max(1 / (count + 1), LATEST)
                 self.pictures[k] = count + 1, average
             averages.append(average.nan_to_num(0.0, 0.0, 0.0))
-        shown = torch.stack(averages)
+        shown = torch.stack(averages[share.part])
         return replace(around, radiance=shown[..., :3] / shown[..., 3:].clamp(min=1e-2) * around.alpha[..., None])

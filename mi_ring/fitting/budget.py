@@ -35,7 +35,7 @@ def measure(fit: Fit, stages: Iterable[Stage]) -> Costs:
             trial.step()
             costs[stage.level, stage.width] = time.perf_counter() - started
     release_memory()
-    return costs
+    return fit.processes.told(costs)
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:

@@ -4,17 +4,18 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.capture import Capture, Observation
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
 from mi_ring.fitting.averages import Averages
-from mi_ring.fitting.calibration import LIT, Calibration, overall, refined_of
+from mi_ring.fitting.calibration import Calibration, overall, refined_of
 from mi_ring.fitting.caution import Caution
 from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
@@ -23,17 +24,18 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
+from mi_ring.fitting.processes import current
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import starting_ring
 from mi_ring.fitting.summary import summary
+from mi_ring.fitting.surroundings import with_surroundings
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.rendering.photographs import Photographs
 from mi_ring.ring.saved import ring_of, ring_state
 from mi_ring.system.machine import autocast, device, release_memory
 
@@ -71,6 +73,7 @@ class Fit:
         given = default_terms if terms is None else terms
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
         self.callbacks = list(callbacks)
+        self.processes = current()  #: that share out the photographs of each iteration
         if reserved := self.terms.keys() & RESERVED:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
         if not any(self.config.weights.get(name, term.weight) for name, term in self.terms.items()):
@@ -141,14 +144,13 @@ class Fit:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
         if "masks" in self.config.refine and self.iteration in [int(p * self.iterations) for p in REDRAWN]:
-            self.take_outlines(find_outlines(self))
+            self.take_outlines(self.processes.by_first(lambda: find_outlines(self)))
         it = self.predict()
         loss = self.weigh(it)
         for optimizer in self.lookers:
             optimizer.look(it)
-        self.descend(loss, it.progress)
+        self.descend(it, loss)
         self.follow_power()
-        it.loss = float(loss.detach())
         it.detach()
         self.restraint.note(it, self.iterations)
         self.iteration += 1
@@ -169,13 +171,17 @@ class Fit:
         stage = next(s for s in self.stages if number < s.last)
         s, faces = self.ring.domain.sample(stage.level, self.random if config.resample else None)
         s = s.to(self.device)
+        points = self.processes.share(len(s))
         with self.autocast():
-            vertices, material = self.ring(s)
+            vertices, material = self.ring(s[points.part])
+        vertices, *parameters = points.joined([vertices, *material.values()])
+        material = dict(zip(material, parameters))
 
-        index, size = self.choose()
-        scale = -(-size[0] // stage.width)
+        everything, size = self.choose()
+        share = self.processes.share(len(everything))
+        index, scale = everything[share.part], -(-size[0] // stage.width)
         seen = self.capture.observe(index, scale).to(self.device)
-        photographs = self.capture.photographs.select(index, size, scale)
+        photographs = replace(self.capture.photographs.select(index, size, scale), before=share.part.start)
         self.surface.set_faces(faces)
         calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
         if calibration:
@@ -184,39 +190,13 @@ class Fit:
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
         )  # fmt: skip
-        predicted = self.add_surroundings(predicted, coverage, photographs, seen, index, scale)
+        predicted = with_surroundings(self, predicted, coverage, photographs, seen, everything, scale, share)
         if self.calibration:
             predicted = self.calibration.recorded(predicted, index, scale)
         return Iteration(
             self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
-            *seen, predicted, coverage,
+            *seen, predicted, coverage, everything, share,
         )  # fmt: skip
-
-    def add_surroundings(
-        self, predicted: Tensor, coverage: Tensor, photographs: Photographs, seen: Observation, index: np.ndarray,
-        scale: int,
-    ) -> Tensor:  # fmt: skip
-        """Predicted photographs with interreflection and the light of the room, which is found by the way."""
-        calibration = self.calibration if self.calibration and "ambient" in self.calibration.refined else None
-        lit = calibration is not None or photographs.room is not None
-        if not (self.ring.indirect or lit):
-            return predicted
-        around = bridge.surroundings(self.surface, photographs, coverage, self.new_seed(), room=lit,
-                                     indirect=self.ring.indirect)  # fmt: skip
-        if self.ring.indirect and self.surface.table is not None:
-            around = self.averages.of(around, index)
-        if self.ring.indirect:
-            predicted = predicted + (self.calibration.bounced(around.interreflection) if self.calibration
-                                     else around.interreflection)  # fmt: skip
-        if calibration:
-            if self.iteration / self.iterations >= LIT:
-                telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
-                calibration.room.see(around, predicted.detach(), calibration.linear(seen.rgb, index, scale), telling)
-            return predicted + around.room(calibration.room.harmonics)
-        if photographs.room is not None:
-            room = self.calibration.roomlight() if self.calibration else torch.from_numpy(photographs.room)
-            predicted = predicted + around.room(room.to(predicted))
-        return predicted
 
     def take_outlines(self, outlines: dict[int, Tensor]) -> None:
         """Go on with these masks, where there are any, instead of those of the capture."""
@@ -243,8 +223,11 @@ class Fit:
         return int(torch.randint(2**31, (), generator=self.random))
 
     def weigh(self, it: Iteration) -> Tensor:
-        """The weighted sum of the terms; what each is goes into the iteration."""
-        loss = torch.zeros((), device=self.device)
+        """This process's share of the weighted sum of the terms; the iteration gets that and each term of all.
+
+        A term is a mean over photographs, or the same in all processes: its sum by their shares is that of all.
+        """
+        loss, values = torch.zeros((), device=self.device), dict.fromkeys(self.terms, (0.0, 0.0))
         for name, term in self.terms.items():
             weight = self.config.weights.get(name, term.weight)
             value = term.function(it) if weight else None
@@ -254,29 +237,38 @@ class Fit:
                 raise InputError(f"terms: {name}: must give a scalar tensor or None, not {type(value).__name__} "
                                  f"{tuple(getattr(value, 'shape', ()))}")  # fmt: skip
             it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
-            it.terms[name] = float(value.detach())
+            values[name] = float(value.detach()), 1.0
             loss = loss + it.weights[name] * value
+        loss = loss * it.share.weight
+        found = torch.tensor([*values.values(), (float(loss.detach()), 1.0)], dtype=torch.double)
+        found[:-1, 0] *= it.share.weight
+        *told, (it.loss, _) = self.processes.sum(found).tolist()
+        it.terms = {name: value for name, (value, times) in zip(values, told) if times}
         return loss
 
-    def descend(self, loss: Tensor, progress: float) -> None:
+    def descend(self, it: Iteration, loss: Tensor) -> None:
         """The backward pass and a step of the optimisers; none if the loss or its gradient is not finite.
 
         Nor if no term had anything to say: masks alone, and photographs of which none has one.
         """
-        if not loss.requires_grad:
+        if not it.terms:
             return
         for optimizer in self.optimizers:
             optimizer.zero_grad()
-        with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
-            loss.backward()
+        if self.processes.count > 1:
+            loss = loss + 0 * it.vertices.sum()  # whose backward pass waits for that of the others
+        if loss.requires_grad:
+            with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
+                loss.backward()
+        self.processes.sum_gradients([p for o in self.optimizers for group in o.param_groups for p in group["params"]])
         clip = torch.nn.utils.clip_grad_norm_
         # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
-        healthy = bool((loss.detach() + norm).isfinite())  # the renderer may swallow a NaN on the way back
+        healthy = bool((it.loss + norm).isfinite())  # the renderer may swallow a NaN on the way back
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                begun = self.caution.factor * min(1.0, max(0.0, (progress - group.get("start", -1.0)) / RAMP))
-                group["lr"] = group["initial_lr"] * group.get("decay", self.config.decay) ** progress * begun
+                begun = self.caution.factor * min(1.0, max(0.0, (it.progress - group.get("start", -1.0)) / RAMP))
+                group["lr"] = group["initial_lr"] * group.get("decay", self.config.decay) ** it.progress * begun
             if healthy:
                 optimizer.step()
         if not self.caution.note(healthy):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mi_ring.capture.capture import Observation
+from mi_ring.fitting.processes import Share
 from mi_ring.fitting.schedule import Stage
 from mi_ring.rendering.photographs import Photographs
 
@@ -41,6 +42,8 @@ class Iteration:
     valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None: all do
     predicted: Tensor  #: (n, H, W, 3) linear radiance
     coverage: Tensor  #: (n, H, W) the object's coverage as predicted, in [0, 1]
+    everything: np.ndarray  #: (N,) which photographs all processes together see
+    share: Share  #: what this one has of them
     loss: float = 0.0  #: the weighted sum of the terms
     terms: dict[str, float] = field(default_factory=dict)  #: unweighted, by name
     weights: dict[str, float] = field(default_factory=dict)  #: of the terms, in this iteration
@@ -66,7 +69,8 @@ class Iteration:
             surely = self.surely()
             error = (self.predicted - self.observed)[surely]
             error = torch.where(self.clipped[surely], error.clamp(max=0), error)
-            return float(error.abs().sum() / self.observed[surely].sum())
+            wrong, light = self.share.sum(torch.stack([error.abs().sum(), self.observed[surely].sum()]))
+            return float(wrong / light)
 
     def detach(self) -> None:
         """Let go of the graph, when the backward pass is done."""

@@ -83,7 +83,7 @@ class GaussNewton(torch.optim.Optimizer):
     def look(self, it: Iteration) -> None:
         """Take note of which photographs an iteration sees, and of the second derivatives of its loss."""
         begun = it.progress >= self.param_groups[0]["start"]
-        self.seen = (torch.from_numpy(it.index), curvature(it)) if begun else None
+        self.seen = (torch.from_numpy(it.everything), it.share.gathered(curvature(it))) if begun else None
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
@@ -117,15 +117,18 @@ def curvature(it: Iteration) -> Tensor:
     if kind == "l2":
         weight = 2 * torch.ones_like(error)
     else:
-        usual = error[it.coverage > 0.5].mean().nan_to_num(1.0).clamp(min=1e-6)
+        covered = error[it.coverage > 0.5]
+        total, count = it.share.sum(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
+        usual = (total / count).nan_to_num(1.0).clamp(min=1e-6)
         weight = 1 / error.maximum(usual)
     weight *= ~it.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
     if telling is not None:
         weight *= telling[..., None]
-    weight *= it.weights.get("rgb", 0.0) / weight.numel()
+    weight *= it.weights.get("rgb", 0.0) / (len(it.everything) * weight[0].numel())
     colours = terms.perceived(it.predicted, fit.exposure, kind)
     outlines = blur(it.coverage, terms.outline_blur(it))
-    outlined = 2 * it.weights.get("mask", 0.0) / (max(1, int(it.masked.sum())) * height * width)
+    masked = max(1.0, float(it.share.sum(it.masked.sum())))
+    outlined = 2 * it.weights.get("mask", 0.0) / (masked * height * width)
 
     at, radius = calibration.scaled(it.scale), float(fit.ring.radius)
     unit = torch.tensor([calibration.widths["turn"]] * 3 + [calibration.distance * calibration.widths["move"]] * 3)

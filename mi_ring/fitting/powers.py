@@ -40,12 +40,16 @@ class Powers(torch.optim.Optimizer):
             return
         least = BRIGHT * it.fit.exposure
         telling = it.surely() & ~it.clipped.any(-1) & (torch.minimum(it.observed, it.predicted) > least).all(-1)
-        told = [n for n in range(len(it.index)) if int(telling[n].sum()) >= ENOUGH]
-        if len(told) < 2:
+        brighter = torch.full((len(it.index), 3), torch.nan)
+        for n in range(len(it.index)):
+            if int(telling[n].sum()) >= ENOUGH:
+                brighter[n] = (it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log().median(0).values
+        brighter = it.share.gathered(brighter)
+        told = ~brighter.isnan().any(1)
+        if int(told.sum()) < 2:
             return
-        ratios = [(it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log().median(0).values for n in told]
-        brighter = torch.stack(ratios).cpu()
-        self.seen = list(zip(it.index[told].tolist(), brighter - brighter.mean(0)))
+        brighter = brighter[told]
+        self.seen = list(zip(it.everything[told.numpy()].tolist(), brighter - brighter.mean(0)))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.rendering.bridge import Surroundings
 from mi_ring.rendering.rooms import BASIS, FRAMES
 
@@ -14,6 +15,7 @@ RIDGE = 0.01  #: pull toward what the capture says, by the mean of what the phot
 DIM = 0.3  #: radiance, in units of the exposure, below which errors count no more than there
 ROBUST = 0.2  #: relative error from which it counts as its root
 SURELY = 0.99  #: share of a pixel that must be object
+WHOLE = Share(ALONE, 1)
 WIDEST = 64  #: width of the pictures that are compared [px]
 
 
@@ -39,10 +41,12 @@ class Room(nn.Module):
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
     @torch.no_grad()
-    def see(self, around: Surroundings, predicted: Tensor, observed: Tensor, telling: Tensor) -> None:
+    def see(
+        self, around: Surroundings, predicted: Tensor, observed: Tensor, telling: Tensor, share: Share = WHOLE
+    ) -> None:
         """Solve anew, with photographs (N, H, W, 3) as `observed` and as `predicted` without the room; linear.
 
-        `telling` (N, H, W): where they say something of the object.
+        `telling` (N, H, W): where they say something of the object; `share`: what they are of all photographs.
         """
         assert around.harmonics is not None
 
@@ -64,8 +68,11 @@ class Room(nn.Module):
         scale = light + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, self.harmonics)
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
-        self.matrix = MEMORY * self.matrix + torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
-        self.vector = MEMORY * self.vector + torch.einsum("jnc,nc,n->cj", basis, missing, weight)
+        matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
+        vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
+        equations = share.sum(torch.cat([matrix, vector[..., None]], -1))
+        self.matrix = MEMORY * self.matrix + equations[..., :-1]
+        self.vector = MEMORY * self.vector + equations[..., -1]
         ridge = RIDGE * self.matrix.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
             free = self.free

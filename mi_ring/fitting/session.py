@@ -16,6 +16,7 @@ from mi_ring.fitting.budget import Costs, measure
 from mi_ring.fitting.checkpoint import digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.processes import Lost
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
@@ -53,16 +54,22 @@ def heeding_signals() -> Iterator[Callable[[], int]]:
 
 
 class Keeper:
-    """Writes into the folder of a fit what tells how far it is; what cannot be written now is tried again later."""
+    """Writes into the folder of a fit what tells how far it is; what cannot be written now is tried again later.
+
+    Of several processes that of the first does.
+    """
 
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
         self.fit, self.folder, self.prepare = fit, folder, prepare
+        self.writes = fit.processes.rank == 0
         self.files = digests(fit.capture, fit.config)
         self.saved, self.failing = -math.inf, False
 
     def follow(self, it: Iteration) -> None:
         """Write log and checkpoint where they are due after this iteration: the first, each stage's last, in time."""
         log = self.fit.log
+        if not self.writes:
+            return
         if log and log[-1]["iteration"] == it.number:
             self.attempt(lambda: results.add_to_log(self.folder, log[-1]))
         due = it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS
@@ -72,6 +79,8 @@ class Keeper:
 
     def checkpoint(self) -> None:
         """Write one now, and the whole log. Raises InputError or OSError if that is not possible."""
+        if not self.writes:
+            return
         if not self.folder.is_dir():  # somebody has removed it
             self.prepare()
         results.write_log(self.folder, self.fit.log)
@@ -93,6 +102,8 @@ class Keeper:
 
         Raises InputError, even then, if they cannot be written where they were to go.
         """
+        if not self.writes:
+            return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             results.write(self.folder, self.fit, fitted_scene)
@@ -119,7 +130,8 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
-    results.write_log(keeper.folder, fit.log)
+    if keeper.writes:
+        results.write_log(keeper.folder, fit.log)
     with bar:
         while fit.iteration < fit.iterations and not interrupted():
             retreats = fit.caution.retreats
@@ -152,8 +164,13 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     Returns the signal that it was interrupted by, or 0. `prepare` makes the folder anew, should it vanish. `costs`: of
     iterations, if they have been measured already.
     """
-    fitted_scene = results.fitted_scene(fit, folder)
-    with heeding_signals() as interrupted, outliving_readers():
+    processes = fit.processes
+    fitted_scene = processes.by_first(lambda: results.fitted_scene(fit, folder))
+    with heeding_signals() as heard, outliving_readers():
+
+        def interrupted() -> int:
+            return processes.most(heard())
+
         print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
         if fit.calibration:
             print(f"Refined besides surface and material: {', '.join(fit.calibration.refined)}")
@@ -165,12 +182,16 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
                   "strong they are is found by interreflection (--refine scale)")  # fmt: skip
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
-            results.write_inputs(folder / "inputs.png", fit)
+            processes.by_first(lambda: results.write_inputs(folder / "inputs.png", fit))
         keeper = Keeper(fit, folder, prepare)
         try:
             train(fit, keeper, interrupted, costs)
-        except Exception:
+        except Lost:
+            raise
+        except Exception as error:
             keeper.finish(fitted_scene)
+            if isinstance(error, InputError):  # in all processes: `torchrun` would end the first with the others
+                processes.wait()
             raise
         keeper.finish(fitted_scene)
-    return interrupted() if fit.iteration < fit.iterations else 0
+        return interrupted() if fit.iteration < fit.iterations else processes.most(0)

@@ -114,7 +114,8 @@ def mask(it: Iteration) -> Tensor | None:
     In a room that was not black masks are guesses: once the shape has settled, what most of them say outweighs one that
     fills a handle with its shadow.
     """
-    if not it.masked.any():
+    masked = float(it.share.sum(it.masked.sum()))
+    if not masked:
         return None
     coverage, threshold = it.coverage, it.fit.capture.threshold
     if threshold is not None:  # of the object, such masks show what is bright
@@ -122,7 +123,10 @@ def mask(it: Iteration) -> Tensor | None:
         coverage = torch.where(lit, coverage, 0)
     valid = None if it.valid is None else it.valid[it.masked]
     doubt = DOUBT if it.fit.capture.lit_room and it.progress > SETTLED else math.inf
-    return mask_loss(coverage[it.masked], it.mask[it.masked], outline_blur(it), valid, doubt)
+    if not it.masked.any():  # only photographs of other processes have one
+        return 0 * it.coverage.sum()
+    loss = mask_loss(coverage[it.masked], it.mask[it.masked], outline_blur(it), valid, doubt)
+    return loss * (int(it.masked.sum()) / masked / it.share.weight) if it.share.weight else loss
 
 
 def velocity(it: Iteration) -> Tensor:

@@ -49,12 +49,17 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
         raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
-            aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
-            folder.rename(aside)
-            print(f"The results that were in {folder}/ are now in {aside}/")
+            move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
     options = options | {"scene": relative_to(folder, scene.resolve())}
     write_file(folder / "config.json", json.dumps(options, indent=2, default=str))
+
+
+def move_aside(folder: Path) -> None:
+    """Rename a folder, so that other results can go to its place."""
+    aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
+    folder.rename(aside)
+    print(f"The results that were in {folder}/ are now in {aside}/")
 
 
 def save_fit(folder: Path, fit: Any) -> None:

@@ -20,13 +20,13 @@ def boundaries(scene, photographs, edges, seed, shadows=True, window=None):
     `where`. Edges count within `window`, the (lowest, highest) corner [px] of what is rendered, the whole by default.
     """
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
-    views = len(photographs)
-    curves, fronts = edges.outlines(photographs.eye, views, seed)
+    views, before = len(photographs), photographs.before
+    curves, fronts = edges.outlines(photographs.eye, views, seed, before)
     sources = [photographs.source] if shadows and not photographs.colocated else []
     for source in filter(None, map(place_of, scene.emitters())):
         sources.append(lambda view, source=source: (source[0], mi.Bool(source[1])))
     for k, source in enumerate(sources, 1):
-        casters, terminators = edges.shadow_casters(source, views, seed + k, fronts)
+        casters, terminators = edges.shadow_casters(source, views, seed + k, fronts, before)
         curves += terminators + [cast(scene, curve, source, photographs.eye) for curve in casters]
     return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows, window)) is not None]
 
@@ -55,7 +55,8 @@ def boundary(scene, photographs, curve: Curve, seed, shadows, window):
         # Where there is no edge rays may not be finite, which OptiX must not meet.
         meant = dr.gather(mi.Bool, active, pair)
         # The same random numbers on both sides: only what jumps must differ.
-        sides = trace(scene, ray, view, photographs, shadows, next_2d(seed, 2 * n, pair), meant)
+        random = next_2d(seed, 2 * n, dr.gather(mi.UInt32, curve.lane, pair))
+        sides = trace(scene, ray, view, photographs, shadows, random, meant)
         dr.eval(sides)
         before = 2 * dr.arange(mi.UInt32, n)
         jumps = [dr.gather(mi.Float, s, before, active) - dr.gather(mi.Float, s, before + 1, active) for s in sides]
@@ -102,4 +103,4 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
         # Whether a point is in shadow is asked a little above the surface.
         above = dr.mulsign(above, -slope)
         shift = d * (above / slope) - n * above
-    return Curve(curve.view, si.p + shift, tangent, curve.inside, active, JUMP, shadow=True)
+    return Curve(curve.view, curve.lane, si.p + shift, tangent, curve.inside, active, JUMP, shadow=True)

@@ -25,6 +25,7 @@ class Curve:
     """Samples of curves in space, any number per photograph."""
 
     view: mi.UInt32  #: the photograph
+    lane: mi.UInt32  #: the number of the sample, alike whichever photographs are rendered together
     point: mi.Point3f  #: attached to what moves the curve
     tangent: mi.Vector3f  #: detached: the piece of the curve that the sample stands for [scene units]
     inside: mi.Point3f  #: detached: what the curve bounds lies on this side of it
@@ -93,15 +94,16 @@ CURVES = {
 }
 
 
-def outline_of(shape, eye, views, seed) -> list[Curve]:
-    """The outline and the border of a shape that is no mesh, as `views` eyes see it."""
+def outline_of(shape, eye, views, seed, before=0) -> list[Curve]:
+    """The outline and the border of a shape that is no mesh, as `views` eyes see it, others `before` them."""
     to_world = mi.traverse(shape)["to_world"]
     curves = []
     for k, curve in enumerate(CURVES[shape.class_name()]):
         lane = dr.arange(mi.UInt32, views * CURVE_SAMPLES)
         view = lane // CURVE_SAMPLES
-        jitter = mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed) + k)
-        t = (mi.Float(lane % CURVE_SAMPLES) + jitter) / CURVE_SAMPLES
+        t = mi.Float(lane % CURVE_SAMPLES)
+        lane += dr.opaque(mi.UInt32, before * CURVE_SAMPLES)
+        t = (t + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed) + k)) / CURVE_SAMPLES
         with dr.suspend_grad():
             where, finite = eye(view)
             inverse = dr.detach(to_world).inverse()
@@ -110,5 +112,5 @@ def outline_of(shape, eye, views, seed) -> list[Curve]:
             tangent = dr.detach(to_world) @ mi.Vector3f(tangent) / CURVE_SAMPLES
             inside = dr.detach(to_world) @ inside
             dr.eval(p, tangent, inside)
-        curves.append(Curve(view, to_world @ p, tangent, inside, dr.isfinite(p.x), ROOT))
+        curves.append(Curve(view, lane, to_world @ p, tangent, inside, dr.isfinite(p.x), ROOT))
     return curves

@@ -8,7 +8,7 @@ from mi_ring.errors import SceneError
 from mi_ring.rendering.curves import CURVES, ROOT, Curve, outline_of
 
 SMOOTH, CREASE, BORDER = 0, 1, 2  # edges of a mesh where the normals of both sides agree or differ, or where it ends
-SAMPLES, SAMPLES_IN_ALL = 4, 1024  #: per edge of a mesh, and at least in all
+SAMPLES, SAMPLES_IN_ALL = 4, 2048  #: per edge of a mesh, and at least of all edges together, were all of them seen
 
 
 class Edges:
@@ -81,19 +81,20 @@ class Edges:
         )
         return edge, first, second
 
-    def sample(self, lanes, seed, shadow=False) -> Curve:
+    def sample(self, lanes, seed, before=0, shadow=False) -> Curve:
         """Stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
-        count, n = dr.width(self.kind), dr.width(lanes)
-        each = max(SAMPLES, SAMPLES_IN_ALL // n)
-        lane = dr.arange(mi.UInt32, n * each)
+        count = dr.width(self.kind)
+        each = max(SAMPLES, SAMPLES_IN_ALL // count)
+        local = dr.arange(mi.UInt32, dr.width(lanes) * each)
         each = dr.opaque(mi.UInt32, each)  # it changes: no part of the kernel
-        chosen = dr.gather(mi.UInt32, lanes, lane // each)
-        t = (mi.Float(lane % each) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / mi.Float(each)
+        chosen = dr.gather(mi.UInt32, lanes, local // each)
+        lane = (chosen + dr.opaque(mi.UInt32, before * count)) * each + local % each
+        t = (mi.Float(local % each) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / mi.Float(each)
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
         piece = dr.detach(b - a) / mi.Float(each)
         p = a * (1 - t) + b * t  # dr.lerp would add its two gradients of `a` in an order that is not always the same
-        return Curve(chosen // count, p, piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
+        return Curve(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
 
     def middle(self, edge):
         """The centre of the two triangles at an edge, detached."""
@@ -103,9 +104,9 @@ class Edges:
                 corners += dr.gather(mi.Point3f, positions, vertex) / 6
         return corners
 
-    def outlines(self, eye, views, seed):
+    def outlines(self, eye, views, seed, before=0):
         """(curves, fronts): what may be an outline or a crease to the eye of each of so many photographs."""
-        curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed)]
+        curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
         fronts = None
         if self.meshes:
             fronts = self.fronts(eye, views)
@@ -113,28 +114,29 @@ class Edges:
             kind = dr.gather(mi.UInt32, self.kind, edge)
             lanes = dr.compress((first != second) | (kind != SMOOTH))
             if dr.width(lanes):
-                curves.append(self.sample(lanes, seed))
+                curves.append(self.sample(lanes, seed, before))
         return curves, fronts
 
-    def shadow_casters(self, light, views, seed, seen):
+    def shadow_casters(self, light, views, seed, seen, before=0):
         """(casters, terminators): what may cast the edge of a shadow, and where one may begin on a shape itself.
 
         `light` is an eye; `seen` are the `fronts` of the cameras. Casters are the outlines that the light sees.
         Terminators are those edges of meshes among them that a camera sees from the front on both sides: the triangle
         that turns away from the light is black even where interpolated normals still face it.
         """
-        casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed)]
+        casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []
         if self.meshes:
             edge, first, second = self.sides(self.fronts(light, views), views=views)
             kind = dr.gather(mi.UInt32, self.kind, edge)
             lanes = dr.compress((first != second) | (kind == BORDER))
             if dr.width(lanes):
-                casters.append(self.sample(lanes, seed))
+                casters.append(self.sample(lanes, seed, before))
                 edge, first, second = self.sides(seen, lanes)
                 both = dr.compress(first & second & (dr.gather(mi.UInt32, self.kind, edge) == SMOOTH))
                 if dr.width(both):
-                    terminators.append(self.sample(dr.gather(mi.UInt32, lanes, both), seed + 1, shadow=True))
+                    lanes = dr.gather(mi.UInt32, lanes, both)
+                    terminators.append(self.sample(lanes, seed + 1, before, shadow=True))
         return casters, terminators
 
 

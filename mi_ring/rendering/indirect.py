@@ -29,7 +29,8 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False, 
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
-            radiance, escaped, direction = reflect(scene, si, view, photographs, bounces, seed, table)
+            random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.lanes_before(spp))
+            radiance, escaped, direction = reflect(scene, si, view, photographs, bounces, random, table)
             values = [*radiance]
             if room:
                 harmonics = harmonics_toward(direction, photographs.camera(view)[0])
@@ -41,12 +42,12 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=False, 
         return [dr.block_sum(c, spp) / spp for c in channels]
 
 
-def reflect(scene, si, view, photographs, bounces, seed, table=None):
+def reflect(scene, si, view, photographs, bounces, random, table=None):
     """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane.
 
     And where the paths that escape go: (radiance, their throughput, 0 for those that do not, and their direction).
+    `random`: a source of 2-D samples.
     """
-    random = next_2d(seed ^ 0x2545F491, dr.width(view))
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
     escaped, direction = mi.Color3f(0), mi.Vector3f(0, 0, 1)

@@ -29,6 +29,7 @@ class Photographs:
     falloff: object = None  #: Float, one per photograph: exponent of its flash's cone; None if all shine to all sides
     distortion: object = None  #: Float, one per photograph: its lens' as `Camera` has it; None if no lens has any
     room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
+    before: int = 0  #: how many others come before them, rendered elsewhere: random numbers are as if all were together
 
     @classmethod
     def of(cls, sensors: Sequence, room: np.ndarray | None = None) -> "Photographs":
@@ -128,6 +129,10 @@ class Photographs:
         """Of all selected photographs together."""
         return len(self) * self.size[0] * self.size[1]
 
+    def lanes_before(self, spp: int, first: int = 0):
+        """The number of the first lane of these photographs, or of pixel `first` of theirs, if a pixel has `spp`."""
+        return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
+
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
         """Ranges (first, last + 1) of their pixels that make `LANES` rays at most, if a pixel has `spp`."""
         step = max(1, LANES // spp)
@@ -149,7 +154,7 @@ def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int,
     first, last = pixels or (0, photographs.pixels)
     local = dr.arange(mi.UInt32, (last - first) * spp)
     pixel = local // spp + dr.opaque(mi.UInt32, first)
-    lane = local + dr.opaque(mi.UInt32, first * spp % 2**32)
+    lane = local + photographs.lanes_before(spp, first)
     view, column, row = place_in(photographs, pixel)
     jitter_x = mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))
     jitter_y = mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed) ^ 0x5BD1E995)

@@ -15,7 +15,7 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
     range (first, last + 1) of them, counted through all photographs; not together with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
-    lane = dr.arange(mi.UInt32, dr.width(ray)) + dr.opaque(mi.UInt32, pixels[0] * spp % 2**32) if pixels else None
+    lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.lanes_before(spp, pixels[0] if pixels else 0)
     channels = trace(scene, ray, view, photographs, shadows, next_2d(seed, dr.width(ray), lane))
     dr.schedule(channels)  # together: block_sum would otherwise render once per channel
     channels = [dr.block_sum(c, spp) / spp for c in channels]

@@ -66,7 +66,8 @@ def next_2d(seed, lanes, stream=None):
     """A source of 2-D samples: independent streams, the lane's own or the one that `stream` (UInt32) says."""
     # Hashed as in Mitsuba's samplers: neighbouring streams would otherwise resemble each other.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
-    rng = mi.PCG32(lanes, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream))
+    # Of size 1: of another it would add the lane to the stream.
+    rng = mi.PCG32(1, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream))
     return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
 
 

@@ -1,0 +1,129 @@
+"""Reconstruct many objects, on one machine or many: `python -m mi_ring.batch SCENES… --workers N -- FIT OPTIONS`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mi_ring.collection.cluster import Resources, fit_all
+from mi_ring.collection.jobs import Job, jobs_of
+from mi_ring.errors import InputError
+from mi_ring.output.index import Entry, write_index
+from mi_ring.system import command
+from mi_ring.system.files import locked
+from mi_ring.system.machine import cores
+from mi_ring.system.progress import progress
+
+OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives them itself
+
+
+@dataclass(frozen=True)
+class BatchConfig:
+    """Reconstruct many objects, several at a time, on this machine or on those of a Ray cluster.
+
+    Options after -- are those of mi_ring.fit, for all of them. A fit whose process or machine dies goes on from its
+    last checkpoint; one whose input is wrong fails, and the others go on. The same command again goes on with what is
+    unfinished and leaves out what is done, unless its files or options have changed. The exit status is 1 if not all
+    are done.
+    """
+
+    scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE.xml")]]
+    """Mitsuba XML files with the photographs of an object each."""
+    out: Path = Path("out")
+    """Folder of all results: each scene's are in a folder of its name, index.html shows them all, batch/ has what fits
+    have printed. On a cluster all machines must have it, and the scenes, at the same place."""
+    workers: int = 1
+    """How many fits run at a time."""
+    cpus: int = 0
+    """Processor cores of each fit; 0: this machine's, shared out among --workers."""
+    gpus: float = 0
+    """GPUs of each fit, of which it may share one; give --variant cuda_ad_rgb after --, too."""
+    memory: float = 0
+    """Memory that a fit needs [GiB]: no more run on a machine than it has room for. 0: however much."""
+    retries: int = 3
+    """How often in a row a fit may die without getting any further."""
+    address: str | None = None
+    """Of a Ray cluster, such as auto or 10.0.0.1:6379; by default this machine is used alone."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("workers", 1), ("cpus", 0), ("gpus", 0), ("memory", 0), ("retries", 0)):
+            if not least <= getattr(self, name) < 10**6:
+                raise InputError(f"--{name}: is {getattr(self, name)}, must be {least} or more")
+        if not self.scenes:
+            raise InputError("SCENE.xml: is missing; name one or more")
+
+    @property
+    def resources(self) -> Resources:
+        """What each fit is given."""
+        cpus = self.cpus or max(1, cores() // self.workers)
+        return Resources(self.workers, cpus, self.gpus, self.memory, self.address)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command. Returns its exit status: 1 if a fit is not done."""
+    own, options = list(arguments), []
+    if "--" in own:
+        own, options = own[: own.index("--")], own[own.index("--") + 1 :]
+    config = command.parse(BatchConfig, own, "mi_ring.batch")
+    if wrong := [option for option in options if option.split("=")[0] in OWN]:
+        raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
+    jobs = jobs_of(config.scenes, config.out, options)
+    with locked(config.out / "batch"):
+        todo = [job for job in jobs if not job.is_done(job.fingerprint())]
+        for job in todo:
+            job.note(replace(job.record, state="waiting", message="", tries=0))
+        if len(todo) < len(jobs):
+            print(f"{len(jobs) - len(todo)} of {len(jobs)} are done already")
+        show(jobs, config.out, True)
+        if todo:
+            follow(todo, jobs, config)
+        return finish(jobs, config.out)
+
+
+def follow(todo: Sequence[Job], jobs: Sequence[Job], config: BatchConfig) -> None:
+    """Fit them, and say what goes on."""
+    before = {job.name: "waiting" for job in todo}
+    with progress(None, "fits", total=len(todo), leave=True) as bar:
+
+        def look() -> None:
+            changed = False
+            for job in todo:
+                record = job.record
+                if record.state != before[job.name]:
+                    changed, before[job.name] = True, record.state
+                    bar.write(f"{job.name}: {record.state}{': ' * bool(record.message)}{record.message}")
+                    bar.update(record.state in ("failed", "done"))
+            now = [f"{job.name} {job.progress}" for job in todo if before[job.name] == "running"]
+            bar.set_postfix_str("; ".join(now))
+            if changed:
+                show(jobs, config.out, True)
+
+        fit_all(todo, config.resources, config.retries, look)
+
+
+def show(jobs: Sequence[Job], out: Path, running: bool) -> None:
+    """Write index.html."""
+    entries = []
+    for job in jobs:
+        record = job.record
+        text = record.message or (job.progress if record.state == "running" else "")
+        entries.append(Entry(job.name, record.state, text, job.folder))
+    write_index(out, entries, running)
+
+
+def finish(jobs: Sequence[Job], out: Path) -> int:
+    """Say what became of each. Returns the exit status."""
+    show(jobs, out, False)
+    records = {job.name: job.record for job in jobs}
+    for name, record in records.items():
+        if record.state != "done":
+            print(f"{name}: {record.state}{': ' * bool(record.message)}{record.message}")
+    done = sum(record.state == "done" for record in records.values())
+    print(f"{done} of {len(jobs)} done: {out}/index.html")
+    return int(done < len(jobs))
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.batch", main)

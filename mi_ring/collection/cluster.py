@@ -1,0 +1,81 @@
+"""Ray: where many fits run at a time, on this machine or on those of a cluster."""
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mi_ring.collection.fits import fit_to_the_end
+from mi_ring.collection.jobs import Job
+from mi_ring.errors import InputError
+from mi_ring.system.optional import need
+
+STORE = 80 * 2**20  #: bytes of Ray's object store, about the least that it takes: fits give each other nothing
+POLL = 1.0  #: seconds between looks at what goes on
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a fit is given, and how many run at a time."""
+
+    workers: int
+    cpus: int  #: of each fit, and its threads
+    gpus: float
+    memory: float  #: of each fit [GiB]; 0: not asked for
+    address: str | None  #: of a cluster that is there already; None: Ray is started here, and ended with the batch
+
+
+@contextlib.contextmanager
+def cluster(resources: Resources) -> Iterator[Any]:
+    """Ray, while it is needed. Raises InputError if it is not installed, not reached, or has no room for a fit."""
+    ray = need("ray", "mi-ring batch")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    options: dict[str, Any] = {"address": resources.address, "log_to_driver": False, "logging_level": "ERROR"}
+    if resources.address is None:
+        options |= {
+            "address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
+            "num_gpus": math.ceil(resources.workers * resources.gpus), "object_store_memory": STORE,
+        }  # fmt: skip
+    try:
+        ray.init(**options)
+    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        where = f"--address: {resources.address}" if resources.address else "mi-ring batch"
+        raise InputError(f"{where}: Ray cannot be reached or started ({error}); see `ray status`") from error
+    try:
+        asked = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": resources.memory * 2**30}
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(all(node.get(name, 0) >= amount for name, amount in asked.items()) for node in nodes):
+            most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in asked}
+            raise InputError(f"--cpus, --gpus, --memory: no machine has room for a fit; they have {most['CPU']:g} "
+                             f"processor cores, {most['GPU']:g} GPUs, {most['memory'] / 2**30:.3g} GiB")  # fmt: skip
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def fit_all(jobs: Sequence[Job], resources: Resources, retries: int, look: Callable[[], None]) -> None:
+    """Fit them all; what became of each is in its record. `look` is called now and then, and at the end.
+
+    A worker of Ray that dies is replaced, and the fit that it had goes on from its last checkpoint.
+    """
+    with cluster(resources) as ray:
+        fit = ray.remote(fit_to_the_end).options(
+            num_cpus=resources.cpus, num_gpus=resources.gpus, memory=resources.memory * 2**30 or None, max_retries=-1
+        )
+        waiting = list(jobs)
+        running: dict[Any, Job] = {}
+        while waiting or running:
+            while waiting and len(running) < resources.workers:
+                job = waiting.pop(0)
+                running[fit.remote(job, retries, ("--threads", str(resources.cpus)))] = job
+            done, _ = ray.wait(list(running), timeout=POLL)
+            for reference in done:
+                job = running.pop(reference)
+                try:
+                    ray.get(reference)
+                except (ray.exceptions.RayError, OSError, InputError) as error:  # of the worker, not of the fit
+                    message = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+                    job.note(replace(job.record, state="failed", message=message[0]))
+            look()

@@ -1,0 +1,67 @@
+"""One of many fits, in a process of its own that is begun again when it dies, from its last checkpoint."""
+
+import ctypes
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from mi_ring.collection.jobs import Job, Record
+from mi_ring.output.results import move_aside
+
+MISTAKE = 2  #: exit status of a fit for what the user can mend, and no second try
+DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
+
+
+def fit_to_the_end(job: Job, retries: int, extra: tuple[str, ...] = ()) -> Record:
+    """Fit a scene, or go on with its fit, until it is done, has failed, or has died so often without getting further.
+
+    `extra`: options that change nothing of the result. Whoever is killed while at it may call it again.
+    """
+    fingerprint, record = job.fingerprint(), job.record
+    if record.fingerprint != fingerprint:
+        if job.folder.exists():  # a fit of something else
+            move_aside(job.folder)
+        record = Record(fingerprint=fingerprint)
+    if record.state in ("failed", "done"):  # before: a new batch tries anew
+        record = replace(record, tries=0)
+    complaint = record.message
+    while True:
+        iteration = job.iteration
+        tries = 1 if iteration > record.iteration else record.tries + 1
+        if tries > retries + 1:
+            return job.note(replace(record, state="failed", message=complaint or "was killed again and again"))
+        record = job.note(Record("running", fingerprint, "", tries, iteration))
+        resume = ["--resume"] if job.has_checkpoint else []
+        command = [sys.executable, "-m", "mi_ring.fit", str(job.scene), "--out", str(job.folder), *extra, *job.options]
+        status, complaint = run([*command, *resume], job)
+        if status == 0:
+            return job.note(replace(record, state="done", message=""))
+        if status == MISTAKE:
+            return job.note(replace(record, state="failed", message=complaint))
+
+
+def run(command: list[str], job: Job) -> tuple[int, str]:
+    """Run a fit, which ends with this process. Returns its exit status and the last line that it has printed."""
+    with job.output.open("ab") as output:
+        output.write(b"\n$ " + " ".join(command).encode(errors="replace") + b"\n")
+        output.flush()
+        begun = output.tell()
+        status = subprocess.call(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, **dying())
+    with job.output.open("rb") as output:
+        output.seek(begun)
+        lines = [line.strip() for line in re.split(r"[\r\n]+", output.read().decode(errors="replace")) if line.strip()]
+    if status < 0:
+        return status, f"was ended by {signal.Signals(-status).name}"
+    return status, re.sub(r"^mi_ring\.fit: ", "", lines[-1]) if lines else f"ended with status {status}"
+
+
+def dying() -> dict[str, Any]:
+    """Options of a process that is not to outlive this one, however this one ends: Linux can say so."""
+    if not sys.platform.startswith("linux"):
+        return {}
+    prctl: Callable[..., int] = ctypes.CDLL(None).prctl
+    return {"preexec_fn": lambda: prctl(DIE_WITH_PARENT, signal.SIGKILL)}

@@ -1,0 +1,47 @@
+"""What photographs show besides the light of their own: interreflection and the light of the room."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.capture.capture import Observation
+from mi_ring.fitting.calibration import LIT
+from mi_ring.fitting.processes import Share
+from mi_ring.rendering import bridge
+from mi_ring.rendering.photographs import Photographs
+
+if TYPE_CHECKING:
+    from mi_ring.fitting.fit import Fit
+
+
+def with_surroundings(
+    fit: "Fit", predicted: Tensor, coverage: Tensor, photographs: Photographs, seen: Observation, index: np.ndarray,
+    scale: int, share: Share,
+) -> Tensor:  # fmt: skip
+    """Predicted photographs with interreflection and the light of the room, which is found by the way.
+
+    `index`: of all photographs of the iteration, of which these are the `share`.
+    """
+    calibration = fit.calibration if fit.calibration and "ambient" in fit.calibration.refined else None
+    lit = calibration is not None or photographs.room is not None
+    if not (fit.ring.indirect or lit):
+        return predicted
+    around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=lit,
+                                 indirect=fit.ring.indirect)  # fmt: skip
+    if fit.ring.indirect and fit.surface.table is not None:
+        around = fit.averages.of(around, index, share)
+    if fit.ring.indirect:
+        predicted = predicted + (fit.calibration.bounced(around.interreflection) if fit.calibration
+                                 else around.interreflection)  # fmt: skip
+    if calibration:
+        if fit.iteration / fit.iterations >= LIT:
+            telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
+            observed = calibration.linear(seen.rgb, index[share.part], scale)
+            calibration.room.see(around, predicted.detach(), observed, telling, share)
+        return predicted + around.room(calibration.room.harmonics)
+    if photographs.room is not None:
+        room = fit.calibration.roomlight() if fit.calibration else torch.from_numpy(photographs.room)
+        predicted = predicted + around.room(room.to(predicted))
+    return predicted

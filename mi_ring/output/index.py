@@ -1,0 +1,76 @@
+"""index.html: one page that shows many fits, with a picture and the figures of each report."""
+
+import base64
+import contextlib
+import html
+import io
+import re
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+import jinja2
+from PIL import Image
+
+from mi_ring.output.results import read_log
+from mi_ring.system.files import relative_to, write_file
+from mi_ring.version import __version__
+
+SIDE = 160  #: of the pictures, at most [px]
+#: Figures of the page, by their names in a report.
+FIGURES = {"PSNR of the photographs": "PSNR", "Silhouettes": "silhouettes", "Mesh": "mesh", "Fit time": "time"}
+
+
+class Entry(NamedTuple):
+    """A fit: how it is called, how far it is, what there is to say of it, and the folder of its results."""
+
+    name: str
+    state: str  #: waiting, running, failed or done
+    text: str
+    folder: Path
+
+
+def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
+    """The page of all fits. While they are `running` a browser reads it anew now and then."""
+    template = resources.files("mi_ring.output").joinpath("index.html.jinja").read_text("utf-8")
+    rows = [row_of(entry, out) for entry in entries]
+    states = [entry.state for entry in entries]
+    page = jinja2.Environment(autoescape=True).from_string(template)
+    counts = {state: states.count(state) for state in ("done", "running", "waiting", "failed") if state in states}
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / "index.html", page.render(rows=rows, figures=[*FIGURES.values(), "unexplained"], counts=counts,
+                                               running=running, version=__version__))  # fmt: skip
+
+
+def row_of(entry: Entry, out: Path) -> dict:
+    """What the page shows of a fit."""
+    figures: dict[str, str] = {}
+    picture, report = None, entry.folder / "report.html"
+    with contextlib.suppress(OSError, ValueError):
+        page = report.read_text("utf-8")
+        figures, picture = figures_of(page), thumbnail_of(page)
+    with contextlib.suppress(OSError, LookupError):
+        figures["unexplained"] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
+    link = quote(relative_to(out.resolve(), report.resolve())) if report.is_file() else None
+    return {**entry._asdict(), "figures": figures, "picture": picture, "link": link}
+
+
+def figures_of(report: str) -> dict[str, str]:
+    """The figures of a report, the explanations in brackets left out."""
+    cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", report)
+    told = {html.unescape(name): html.unescape(value) for name, value in cells}
+    return {short: re.split(r" \(|, | intersection", told[name])[0] for name, short in FIGURES.items() if name in told}
+
+
+def thumbnail_of(report: str) -> str | None:
+    """The prediction of a report's first photograph as a data URI, small."""
+    found = re.search(r'class="over" src="data:image/\w+;base64,([^"]*)"', report)
+    if not found:
+        return None
+    picture = Image.open(io.BytesIO(base64.b64decode(found[1]))).convert("RGB")
+    picture.thumbnail((SIDE, SIDE))
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=85)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,17 @@
+"""Which GPU is a process's own, said before anything looks for one."""
+
+import os
+from pathlib import Path
+
+OWN = "MI_RING_OWN_GPU"  #: 1 in the environment of a process that shares its GPU with no other of the same fit
+
+
+def choose_gpu() -> None:
+    """Have each of several processes that `torchrun` has started on this machine see one GPU alone, in turn."""
+    here, rank = int(os.environ.get("LOCAL_WORLD_SIZE", 1)), int(os.environ.get("LOCAL_RANK", 0))
+    told = os.environ.get("CUDA_VISIBLE_DEVICES")
+    there = [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]  # none without a driver
+    gpus = there if told is None else [name for name in told.split(",") if name]
+    if here > 1 and gpus and OWN not in os.environ:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[rank % len(gpus)]
+        os.environ[OWN] = str(int(len(gpus) >= here))

@@ -1,0 +1,189 @@
+"""Batches of fits: what becomes of each, whatever is killed."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mi_ring import batch
+from mi_ring.collection import fits
+from mi_ring.collection.jobs import Job, Record, jobs_of
+from mi_ring.errors import InputError
+from mi_ring.output import results
+from mi_ring.output.index import Entry, write_index
+
+OPTIONS = ["--iterations", "60", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--batch",
+           "2", "--domain", "sphere", "--deterministic"]  # fmt: skip
+needs_ray = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None or sys.platform == "win32", reason="needs ray, an extra, and /proc"
+)
+
+
+class Script:
+    """Stands for the process of a fit: does what the test says, one step for each time that it is begun."""
+
+    def __init__(self, monkeypatch, *steps):
+        self.steps, self.commands = list(steps), []
+        monkeypatch.setattr(fits, "run", self)
+
+    def __call__(self, command, job):
+        self.commands.append(command)
+        status, iteration, complaint = self.steps.pop(0)
+        job.folder.mkdir(parents=True, exist_ok=True)
+        if iteration:
+            (job.folder / "checkpoint.pt").write_bytes(b"")
+            results.write_log(job.folder, [{"iteration": iteration, "unexplained": 0.1}])
+        return status, complaint
+
+
+@pytest.fixture
+def job(small_capture, tmp_path):
+    return Job(small_capture, tmp_path / "out/small", ("--seed", "3"))
+
+
+KILLED = "was ended by SIGKILL"
+
+
+def test_a_fit_that_dies_goes_on_from_its_checkpoint_and_gives_up_where_it_gets_no_further(job, monkeypatch):
+    script = Script(monkeypatch, (-9, 0, KILLED), (-9, 5, KILLED), (143, 10, ""), (0, 60, ""))
+    assert fits.fit_to_the_end(job, 1).state == "done"
+    assert [("--resume" in command) for command in script.commands] == [False, False, True, True]
+    script = Script(monkeypatch, *[(-9, 60, KILLED)] * 3)
+    record = fits.fit_to_the_end(job, 2)
+    assert (record.state, record.message, len(script.commands)) == ("failed", KILLED, 3)
+
+
+def test_a_mistake_is_not_tried_again(job, monkeypatch):
+    script = Script(monkeypatch, (2, 0, "small.xml: there is no such file"))
+    record = fits.fit_to_the_end(job, 5)
+    assert (record.state, record.message, len(script.commands)) == ("failed", "small.xml: there is no such file", 1)
+
+
+def test_a_worker_that_is_killed_again_and_again_does_not_try_for_ever(job, monkeypatch):
+    def dies(command, job):
+        raise KeyboardInterrupt  # as near to a death as a test can be
+
+    monkeypatch.setattr(fits, "run", dies)
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            fits.fit_to_the_end(job, 2)
+    assert fits.fit_to_the_end(job, 2).message == "was killed again and again"
+
+
+def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture, tmp_path, monkeypatch):
+    path, edit = broken_capture
+    job = Job(path, tmp_path / "out/small", ("--seed", "3"))
+    Script(monkeypatch, (0, 60, ""))
+    fits.fit_to_the_end(job, 0)
+    assert not job.is_done(job.fingerprint())  # its results are gone
+    for name in ("ring.pt", "report.html"):
+        (job.folder / name).write_text("")
+    assert job.is_done(job.fingerprint())
+    assert not job.is_done(Job(path, job.folder, ("--seed", "4")).fingerprint())
+    mask = path.parent / "masks/003.png"
+    before = mask.read_bytes()
+    mask.write_bytes(before + b" ")
+    assert not job.is_done(job.fingerprint())
+    script = Script(monkeypatch, (0, 60, ""))
+    fits.fit_to_the_end(job, 0)
+    assert "--resume" not in script.commands[0]  # anew: what was there is aside
+    assert (job.folder.parent / "small.1/ring.pt").exists()
+    edit('<float name="fx" value="60.0"/>', '<float name="fx" value="60.5"/>')
+    assert job.fingerprint() != job.record.fingerprint
+
+
+def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_path):
+    with pytest.raises(InputError, match=r"small\.xml: its results would go to .*small, where .*small\.xml is to be"):
+        jobs_of([small_capture, broken_capture[0]], tmp_path, [])
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["a.xml", "--workers", "0"], "--workers: is 0, must be 1 or more"),
+    (["a.xml", "--", "--out", "there"], "--out: is what the batch itself gives each fit; leave it out"),
+    ([], "is missing"),
+])  # fmt: skip
+def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=re.escape(words)):
+        batch.main(arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_shows_pictures_and_figures_of_reports_and_runs_no_script(tmp_path):
+    folder = tmp_path / "a & <script>alert(1)"
+    folder.mkdir()
+    pixel = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+    (folder / "report.html").write_text(
+        "<tr><th>PSNR of the photographs</th><td>31.25 dB (sRGB, all pixels, 4 samples each)</td></tr>"
+        f'<img class="over" src="data:image/png;base64,{pixel}" alt="prediction x">'
+    )
+    results.write_log(folder, [{"iteration": 5, "unexplained": 0.0731}])
+    entries = [Entry(folder.name, "done", "", folder), Entry("b", "failed", "b.xml: <b>wrong</b>", tmp_path / "b")]
+    write_index(tmp_path, entries, False)
+    page = (tmp_path / "index.html").read_text()
+    assert "<td>31.25 dB</td>" in page and "<td>7.3%</td>" in page and "data:image/jpeg;base64," in page
+    assert "<script" not in page and "&lt;b&gt;wrong" in page and "1 done" in page and "1 failed" in page
+    assert 'href="a%20%26%20%3Cscript%3Ealert%281%29/report.html"' in page
+
+
+def processes(word):
+    """Ids of the processes whose command line has a word in it."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if word.encode() in path.read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def parent_of(process):
+    return int(re.search(r"PPid:\s+(\d+)", Path(f"/proc/{process}/status").read_text())[1])
+
+
+@needs_ray
+def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, tmp_path, monkeypatch, capsys):
+    """One scene whose fit is killed, then its worker of Ray; one that is wrong and stops nothing."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(batch.__file__).parents[1]))
+    shutil.copytree(small_capture.parent, tmp_path / "captures")
+    scene = tmp_path / "captures/small.xml"
+    wrong = scene.with_name("wrong.xml")
+    wrong.write_text("<scene")
+    out, killed = tmp_path / "out", []
+
+    def kill(whom):
+        deadline = time.monotonic() + 200
+        while time.monotonic() < deadline:
+            if (out / "small/checkpoint.pt").exists() and (own := processes(str(out / "small"))):
+                victim = {"fit": own[0], "worker": parent_of(own[0])}[whom]
+                before = own[0]
+                os.kill(victim, signal.SIGKILL)
+                killed.append(whom)
+                while Path(f"/proc/{before}").exists() and time.monotonic() < deadline:  # it dies with its worker
+                    time.sleep(0.02)
+                return
+            time.sleep(0.02)
+
+    assassin = threading.Thread(target=lambda: [kill("fit"), kill("worker")])
+    assassin.start()
+    status = batch.main([str(scene), str(wrong), "--out", str(out), "--workers", "1", "--cpus", "1", "--", *OPTIONS])
+    assassin.join()
+    said = capsys.readouterr().out
+    assert killed == ["fit", "worker"] and status == 1, said
+    assert "1 of 2 done" in said and re.search(r"wrong: failed: .*wrong\.xml", said)
+    records = {name: Record(**json.loads((out / f"batch/{name}.json").read_text())) for name in ("small", "wrong")}
+    assert records["small"].state == "done" and results.read_log(out / "small")[-1]["iteration"] == 60
+    assert (out / "small/report.html").is_file()
+    assert (out / "batch/small.txt").read_text().count("--resume") == 2
+    wrong.unlink()
+    assert batch.main([str(scene), "--out", str(out), "--", *OPTIONS]) == 0  # at once, and without Ray
+    assert "1 of 1 are done already" in capsys.readouterr().out
