@@ -56,6 +56,8 @@ def array_of(content: bytes) -> np.ndarray:
         shape, _, kind = np.lib.format.read_array_header_1_0(stream)
     elif version == (2, 0):
         shape, _, kind = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"is of version {version[0]}.{version[1]}")
     if math.prod(shape) * kind.itemsize > len(content):  # before as much is allocated
         raise ValueError(f"declares an array of shape {shape}, and is shorter")
     return np.load(io.BytesIO(content))

@@ -46,4 +46,6 @@ class Pixels(Sequence):
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
         """The same with others in some places."""
-        return Pixels([readers.get(k, reader) for k, reader in enumerate(self.readers)], self.kept)
+        several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
+        left = {*several}
+        return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

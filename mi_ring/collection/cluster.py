@@ -1,7 +1,6 @@
 """Ray: where many fits run at a time, on this machine or on those of a cluster."""
 
 import contextlib
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ def cluster(resources: Resources) -> Iterator[Any]:
     if resources.address is None:
         options |= {
             "address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
-            "num_gpus": math.ceil(resources.workers * resources.gpus), "object_store_memory": STORE,
+            "object_store_memory": STORE,
         }  # fmt: skip
     try:
         ray.init(**options)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from mi_ring.collection.jobs import Job, Record
-from mi_ring.output.results import move_aside
+from mi_ring.output.results import PRECIOUS, move_aside
 
 MISTAKE = 2  #: exit status of a fit for what the user can mend, and no second try
 DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
@@ -23,7 +23,7 @@ def fit_to_the_end(job: Job, retries: int, extra: tuple[str, ...] = ()) -> Recor
     """
     fingerprint, record = job.fingerprint(), job.record
     if record.fingerprint != fingerprint:
-        if job.folder.exists():  # a fit of something else
+        if any((job.folder / name).exists() for name in PRECIOUS):  # of a fit of something else
             move_aside(job.folder)
         record = Record(fingerprint=fingerprint)
     if record.state in ("failed", "done"):  # before: a new batch tries anew
@@ -38,9 +38,9 @@ def fit_to_the_end(job: Job, retries: int, extra: tuple[str, ...] = ()) -> Recor
         resume = ["--resume"] if job.has_checkpoint else []
         command = [sys.executable, "-m", "mi_ring.fit", str(job.scene), "--out", str(job.folder), *extra, *job.options]
         status, complaint = run([*command, *resume], job)
-        if status == 0:
+        if status == 0 and (job.folder / "ring.pt").is_file():
             return job.note(replace(record, state="done", message=""))
-        if status == MISTAKE:
+        if status in (0, MISTAKE):  # without results: it was not asked for any
             return job.note(replace(record, state="failed", message=complaint))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from mi_ring.errors import InputError
 from mi_ring.output.results import read_log
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import write_file
+from mi_ring.system.files import read_json, write_file
 
 RECORDS = "batch"  #: folder beside the results with a record of each fit and with what it has printed
 CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
@@ -49,8 +49,8 @@ class Job:
     @property
     def record(self) -> Record:
         """What was written last; that of a fit that waits, if it cannot be read."""
-        with contextlib.suppress(OSError, ValueError, TypeError):
-            return Record(**json.loads(self.output.with_suffix(".json").read_text()))
+        with contextlib.suppress(TypeError):
+            return Record(**read_json(self.output.with_suffix(".json")))
         return Record()
 
     def note(self, record: Record) -> Record:
@@ -68,7 +68,8 @@ class Job:
             result.update(text)
             words = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", text)
             named = {self.scene.parent / (a or b).decode(errors="replace") for a, b in words}
-            for file in sorted({*named, *map(Path, self.options)}):
+            given = (Path(option.partition("=")[2] or option) for option in self.options)
+            for file in sorted({*named, *given}):
                 with contextlib.suppress(OSError):
                     if file.is_file():
                         result.update(str(file.name).encode() + hashlib.blake2b(file.read_bytes()).digest())
@@ -103,7 +104,7 @@ class Job:
 
 
 def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene. Raises InputError if two have the same name."""
+    """A job for each scene. Raises InputError if two have the same name, or if results would go onto a scene."""
     jobs: dict[str, Job] = {}
     for scene in scenes:
         name = scene_name(scene)
@@ -111,5 +112,8 @@ def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[J
             other = f"{jobs[name].scene} is" if name in jobs else "records of batches are"
             raise InputError(f"{scene}: its results would go to {out / name}, where {other} to be; rename it, or "
                              "fit it in a batch of its own with another --out")  # fmt: skip
-        jobs[name] = Job(scene.resolve(), out.resolve() / name, tuple(options))
+        folder = out.resolve() / name
+        if folder in scene.resolve().parents:
+            raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
+        jobs[name] = Job(scene.resolve(), folder, tuple(options))
     return list(jobs.values())

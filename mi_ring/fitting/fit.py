@@ -180,7 +180,7 @@ class Fit:
         everything, size = self.choose()
         share = self.processes.share(len(everything))
         index, scale = everything[share.part], -(-size[0] // stage.width)
-        seen = self.capture.observe(index, scale).to(self.device)
+        seen = self.processes.together(lambda: self.capture.observe(index, scale)).to(self.device)
         photographs = replace(self.capture.photographs.select(index, size, scale), before=share.part.start)
         self.surface.set_faces(faces)
         calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []

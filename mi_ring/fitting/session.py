@@ -62,7 +62,7 @@ class Keeper:
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
         self.fit, self.folder, self.prepare = fit, folder, prepare
         self.writes = fit.processes.rank == 0
-        self.files = digests(fit.capture, fit.config)
+        self.files = digests(fit.capture, fit.config) if self.writes else {}
         self.saved, self.failing = -math.inf, False
 
     def follow(self, it: Iteration) -> None:

@@ -51,7 +51,7 @@ def row_of(entry: Entry, out: Path) -> dict:
     with contextlib.suppress(OSError, ValueError):
         page = report.read_text("utf-8")
         figures, picture = figures_of(page), thumbnail_of(page)
-    with contextlib.suppress(OSError, LookupError):
+    with contextlib.suppress(OSError, LookupError, TypeError, ValueError):
         figures["unexplained"] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
     link = quote(relative_to(out.resolve(), report.resolve())) if report.is_file() else None
     return {**entry._asdict(), "figures": figures, "picture": picture, "link": link}

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import xml.etree.ElementTree as ElementTree
 from copy import deepcopy
 from dataclasses import asdict, replace
@@ -35,7 +36,7 @@ from mi_ring.synthesis.degradation import HIGHEST, encoded, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
 from mi_ring.synthesis.tracing import Shot
-from mi_ring.system.files import write_file, writing
+from mi_ring.system.files import read_json, write_file, writing
 from mi_ring.system.progress import progress
 
 TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
@@ -162,9 +163,10 @@ def write_capture(config: Synthesis) -> None:
     """
     out, production = config.out, Production(config)
     claim(out, config)
-    for name in ("images", "masks", "truth/images"):
+    for name in ("truth/images", "images", "masks"):
         with writing(out):
             (out / name).mkdir(parents=True, exist_ok=True)
+    write_file(out / SETTINGS, json.dumps(settings_of(config), indent=1))  # by which the same command goes on
     write_file(out / "truth/mesh.ply", cast(bytes, production.mesh.export(file_type="ply")))
     stage = production.stage(out)
     seen, novel = production.views(config.views), production.views(config.novel, novel=True)
@@ -236,10 +238,10 @@ def settings_of(config: Synthesis) -> dict:
     values = asdict(replace(config, out=Path())) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
-        file = Path(str(getattr(config, name)).partition(".npz:")[0])
-        file = file if file.is_file() else file.with_name(f"{file.name}.npz")
-        if file.is_file():
-            values["digests"][name] = hashlib.blake2b(file.read_bytes(), digest_size=16).hexdigest()
+        text = str(getattr(config, name)).partition(".npz:")[0]  # which may be longer than names of files are
+        file = next((file for file in (text, f"{text}.npz") if os.path.isfile(file)), None)
+        if file:
+            values["digests"][name] = hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
     return json.loads(json.dumps(values, default=str))
 
 
@@ -247,12 +249,9 @@ def claim(out: Path, config: Synthesis) -> None:
     """Raise InputError if a folder holds anything but the same capture, whole or in part."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
-    try:
-        found = json.loads((out / SETTINGS).read_text("utf-8"))
-    except (OSError, ValueError):
-        raise InputError(
-            f"{out}: OUT: is there already, and is no capture of mi-ring synthesize; give another name"
-        ) from None
+    found = read_json(out / SETTINGS)
+    if not isinstance(found, dict):
+        raise InputError(f"{out}: OUT: is there already, and is no capture of mi-ring synthesize; give another name")
     wanted = settings_of(config)
     other = [name for name, value in wanted.items() if found.get(name) != value]
     if other:

@@ -12,6 +12,7 @@ import numpy as np
 from mi_ring.capture.loading import reason
 from mi_ring.capture.scenefile import load_element, move_names
 from mi_ring.errors import InputError, require_file
+from mi_ring.foreign import reading
 from mi_ring.images import read_image
 
 COLOURS = "vertex_color"  #: name of the mesh attribute that has the colours of the mesh's file
@@ -40,17 +41,15 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
     which names the `field`, for a picture that cannot be read.
     """
     low, high = vertices.min(0), vertices.max(0)
-    across, height = (up + 1) % 3 if up != 1 else 0, high[up] - low[up]
+    across, height = (up + 1) % 3 if up != 1 else 0, max(high[up] - low[up], 1e-9)
     v = (vertices[:, up] - low[up]) / height
     if kind in ("stripes", "checks"):
         u = (vertices[:, across] - low[across]) / height
         weights = np.array([[0, 1], [1, 0]] if kind == "checks" else [[0, 0], [1, 1]])
         return Pattern(weights, bands / 2 * np.stack([u, v], 1))
     require_file(Path(kind), "stripes, checks or the file of a picture", field)
-    try:
+    with reading(f"{kind}: {field}", "an image"):
         picture = read_image(Path(kind))
-    except Exception as error:
-        raise InputError(f"{kind}: {field}: cannot be read as an image ({' '.join(str(error).split())})") from error
     grey = picture[..., :3].astype(np.float32).mean(-1)
     u = (vertices[:, across] - low[across]) / (high[across] - low[across])
     inside = 0.5 / np.array(grey.shape[::-1])  # the borders are not those of the next repetition
@@ -79,10 +78,8 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
 def load_snippet(path: Path, field: str) -> mi.BSDF:
     """The <bsdf> of an XML file, whose file names are relative to it."""
     require_file(path, FORMS, field)
-    try:
+    with reading(f"{path}: {field}", "XML"):
         root = ElementTree.fromstring(path.read_bytes())
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: {field}: is no XML ({error}); give {FORMS}") from error
     if root.tag != "bsdf":
         raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
     move_names(root, path.resolve().parent, Path.cwd())
