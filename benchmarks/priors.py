@@ -18,7 +18,6 @@ import numpy as np
 import trimesh
 from accuracy import processor, table
 
-from mi_ring.capture import example
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
@@ -28,6 +27,9 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.synthesis import example
+from mi_ring.synthesis.stage import Stage
+from mi_ring.synthesis.tracing import Shot
 
 # isort: split
 import mitsuba as mi
@@ -36,7 +38,7 @@ import torch
 EVERY = 3  #: of the example's cameras, so many are one here
 NOISE = 0.05  #: standard deviation of the linear radiance, 1 is white
 WEIGHTS = {
-    "normal_variation": (0.0, 0.01, 0.03), "material_variation": (0.0, 0.003, 0.01), "material_rank": (0.0, 0.03, 0.1),
+    "normal_variation": (0.0, 0.01, 0.03), "material_variation": (0.0, 1e-4, 3e-4), "material_rank": (0.0, 0.005, 0.01),
 }  # fmt: skip
 
 
@@ -71,15 +73,15 @@ def write_capture(name: str, folder: Path) -> None:
     mesh.set_bsdf(mi.load_dict({"type": "cooktorrance", **textures}))
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
-    random, elements = np.random.default_rng(0), []
+    stage, random, elements = Stage(mesh, truth.vertices), np.random.default_rng(0), []
     for k, camera in enumerate(example.cameras()[::EVERY]):
         position = camera.position + camera.to_world[:3, :3] @ example.FLASH
         light = Light("point", position, np.full(3, 2 * example.DISTANCE**2))
-        picture = example.photographed(mesh, truth.vertices, camera, light, 32, k)
-        noisy = picture[..., :3] + random.normal(0, NOISE, picture[..., :3].shape)
+        picture = stage.radiance(Shot(camera), light, 36, k, 2)
+        noisy = picture + random.normal(0, NOISE, picture.shape)
         files = f"images/{k:03}.png", f"masks/{k:03}.png"
         write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files[0])
-        write_image(to_bytes(picture[..., 3:] > 0.5), folder / files[1])
+        write_image(to_bytes(stage.coverage(Shot(camera))[..., None] >= 0.5), folder / files[1])
         elements.append(photograph_element(f"{k:03}", files[0], camera, light, files[1], calibrated=True))
     truth.export(folder / "truth.ply")
     np.savez(folder / "truth.npz", **material)
