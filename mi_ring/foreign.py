@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,4 +61,9 @@ def array_of(content: bytes) -> np.ndarray:
         raise ValueError(f"is of version {version[0]}.{version[1]}")
     if math.prod(shape) * kind.itemsize > len(content):  # before as much is allocated
         raise ValueError(f"declares an array of shape {shape}, and is shorter")
-    return np.load(io.BytesIO(content))
+    array = np.load(io.BytesIO(content))
+    if kind.kind == "U" and array.nbytes:
+        codes = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(array.dtype.byteorder))
+        if codes.max() > sys.maxunicode:  # which Python stumbles over whenever it looks at one
+            raise ValueError("has characters that are none")
+    return array

@@ -127,6 +127,13 @@ def test_arrays_that_declare_more_than_there_is(tmp_path, monkeypatch):
         (tmp_path / "a.npy").write_bytes(header.ljust(128) + content[128:])
         with pytest.raises(InputError, match=r"a.npy: cannot be read as an array"):
             load_npy(tmp_path / "a.npy")
+    for order in "<>":
+        np.save(tmp_path / "a.npy", np.array(["abc", "\U0010ffff"], f"{order}U3"))
+        assert load_npy(tmp_path / "a.npy").tolist() == ["abc", "\U0010ffff"]
+        content = (tmp_path / "a.npy").read_bytes()
+        (tmp_path / "a.npy").write_bytes(content[:-4] + b"\xff" * 4)
+        with pytest.raises(InputError, match="a.npy: .* .has characters that are none"):
+            load_npy(tmp_path / "a.npy")
     monkeypatch.setattr(foreign, "ROOM", 2**16)
     monkeypatch.setattr(foreign, "EXPANSION", 100)
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(2**17))

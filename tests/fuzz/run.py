@@ -112,15 +112,15 @@ def work(bench: Bench, options: argparse.Namespace, seconds: float) -> None:
 
     until, last = time.monotonic() + seconds, min(options.cases, bench.number + LIFE)
     if options.coverage:
-        guided(bench, last, seconds, options.seed)
+        guided(bench, last, until, options.seed)
     while bench.number < last and time.monotonic() < until:
         random = Random(f"{options.seed}/{bench.name}/{bench.number}")
         k = random.randrange(len(bench.whole))
         bench.case(k, damaged(bench.whole[k], bench.reader.files[k].name, random))
 
 
-def guided(bench: Bench, last: int, seconds: float, seed: int) -> None:
-    """Have libFuzzer choose. What it changes is the number of a file and its content. It ends the process."""
+def guided(bench: Bench, last: int, until: float, seed: int) -> None:
+    """Have libFuzzer choose. What it changes is the number of a file and its content. It does not return."""
     import atheris
     from damage import damaged
 
@@ -132,13 +132,15 @@ def guided(bench: Bench, last: int, seconds: float, seed: int) -> None:
     def one(data: bytes) -> None:
         if data:
             bench.case(data[0] % len(bench.whole), data[1:])
+        if bench.number >= last or time.monotonic() > until:
+            shutil.rmtree(bench.folder, ignore_errors=True)
+            os._exit(0)  # by its own end libraries in C++ would be taken down while they work
 
     def mutated(data: bytes, largest: int, seed: int) -> bytes:
         k = data[0] % len(bench.whole) if data else 0
         return (bytes([k]) + damaged(data[1:], bench.reader.files[k].name, Random(seed)))[:largest]
 
-    flags = [f"-runs={last - bench.number}", f"-max_total_time={max(1, int(seconds))}", "-max_len=1048576",
-             f"-seed={seed + bench.number + 1}", f"-timeout={2 * SLOWEST}", "-rss_limit_mb=8192",
+    flags = ["-max_len=1048576", f"-seed={seed + bench.number + 1}", f"-timeout={2 * SLOWEST}", "-rss_limit_mb=8192",
              f"-artifact_prefix={bench.keep}/"]  # fmt: skip
     atheris.Setup([sys.argv[0], *flags, str(corpus)], one, custom_mutator=mutated)
     atheris.Fuzz()
