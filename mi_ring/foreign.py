@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -15,6 +16,17 @@ from mi_ring.errors import InputError
 #: Bytes that what is in a file may take in memory, and times the file's size: a PNG or a zip file may be 1032 times as
 #: small, what is much smaller than that and not small is made to fill memories.
 ROOM, EXPANSION = 2**28, 2**12
+
+PATIENCE, SPEED = 30.0, 2e6  #: seconds, and bytes in each further second, that a native reader may take
+#: Begins what runs in a process of its own: its memory is bounded where the system can do that.
+BOUNDED = """
+import sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_DATA, 2 * (int(sys.argv[2]),))
+except (ImportError, OSError, ValueError):
+    pass
+"""
 
 
 @contextlib.contextmanager
@@ -33,6 +45,22 @@ def require_room(path: Path, size: int) -> None:
     """Raise ValueError if what a file declares to hold takes more bytes than one of its size can mean."""
     if size > max(ROOM, EXPANSION * path.stat().st_size):
         raise ValueError(f"declares {size:,} bytes, in a file of {path.stat().st_size:,}")
+
+
+def require_survival(read: str, path: Path, size: int, what: str) -> None:
+    """Raise InputError for files that a native reader crashes of, is busy with for ever or takes all memory for.
+
+    `read`: it in Python, with the path as sys.argv[1]; `size`: bytes of the files. Nothing ends such readers, not even
+    Ctrl-C; so another process tries first.
+    """
+    try:
+        trial = [sys.executable, "-c", BOUNDED + read, str(path), str(2**31 + 40 * size)]
+        done = subprocess.run(trial, capture_output=True, text=True, timeout=PATIENCE + size / SPEED)
+        trouble = done.stderr.strip().splitlines()[-1:] or [f"its reader died of signal {-done.returncode}"]
+    except subprocess.TimeoutExpired as late:
+        raise InputError(f"{path}: not {what}, or damaged (not read in {late.timeout:.0f} s)") from late
+    if done.returncode:
+        raise InputError(f"{path}: not {what}, or damaged ({trouble[0]})")
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:

@@ -16,11 +16,11 @@ from mi_ring import foreign, images
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
-from mi_ring.foreign import EXPANSION, ROOM, load_npy, load_npz, reading, require_room
+from mi_ring.foreign import EXPANSION, ROOM, load_npy, load_npz, reading, require_room, require_survival
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_exposure, exposure_of
-from mi_ring.importers.reading import has_alpha, image_size, pixels_of
+from mi_ring.importers.reading import has_alpha, image_size, load_mat, pixels_of
 from mi_ring.importers.transforms import Transforms
 from mi_ring.metrics.captures import told_before
 from mi_ring.output.results import default_folder, read_log
@@ -241,3 +241,18 @@ def test_each_of_520_changed_bits_is_noticed(tmp_path):
             with pytest.raises(InputError, match=f"{path.name}: not a"):
                 read()
         path.write_bytes(content)
+
+
+def test_native_readers_that_crash_are_tried_elsewhere(tmp_path):
+    path = tmp_path / "a.mat"
+    path.write_bytes(bytes(8))
+    for read, words in (
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "its reader died of signal 11"),
+        ("raise OSError('as if')", "OSError: as if"),
+        ("bytearray(2**33)", "MemoryError"),
+    ):
+        with pytest.raises(InputError, match=f"a.mat: not a MATLAB file, or damaged .{words}"):
+            require_survival(read, path, 8, "a MATLAB file")
+    require_survival("open(sys.argv[1], 'rb').read()", path, 8, "a MATLAB file")
+    with pytest.raises(InputError, match="a.mat: not a MATLAB file, or damaged"):
+        load_mat(path)

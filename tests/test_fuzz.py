@@ -13,7 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
 from damage import damaged
 from readers import READERS, beyond
 
-SLOW = {"colmap-binary": 1, "scene": 8}  #: examples of those that take long
+#: Examples of those that take long.
+SLOW = {"colmap-binary": 1, "diligent-mv": 2, "ring.pt": 5, "checkpoint.pt": 5, "scene": 8}
 CHECKS = settings(max_examples=15, derandomize=True, database=None, deadline=None, phases=[Phase.generate],
                   suppress_health_check=[*HealthCheck])  # fmt: skip
 

@@ -1,7 +1,5 @@
 """COLMAP's sparse models, text or binary."""
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,22 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.foreign import require_survival
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import existing
 from mi_ring.system.optional import need
 
-PATIENCE, SPEED = 30.0, 2e6  #: seconds, and bytes in each further second, that reading a model may take
-#: Reads a model in a process of its own, with bounded memory where the system can do that.
+#: Reads a model, for `require_survival`.
 TRIAL = """
-import sys
 import pycolmap
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_DATA, 2 * (int(sys.argv[2]),))
-except (ImportError, OSError, ValueError):
-    pass
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL
 pycolmap.Reconstruction(sys.argv[1])
 """
@@ -48,7 +40,8 @@ class Colmap(Photogrammetry):
         if model is None:
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
         pycolmap = need("pycolmap", f"{model}")
-        require_readable(model)
+        if size := sum(file.stat().st_size for file in model.glob("*.bin")):
+            require_survival(TRIAL, model, size, "a COLMAP model")
         try:
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what it has to say is in the exception
             reconstruction = pycolmap.Reconstruction(str(model))
@@ -76,21 +69,3 @@ class Colmap(Photogrammetry):
             own = reconstruction.cameras[image.camera_id]
             lens = Lens(own.model_name, (own.width, own.height), own.params)
             yield image.name, Frame(path, lens, pose, name=name)
-
-
-def require_readable(model: Path) -> None:
-    """Raise InputError for a binary model that keeps COLMAP's reader busy for ever, or takes all memory: a damaged one.
-
-    Nothing ends that reader, not even Ctrl-C; so another process tries first.
-    """
-    size = sum(file.stat().st_size for file in model.glob("*.bin"))
-    if not size:
-        return
-    try:
-        trial = [sys.executable, "-c", TRIAL, str(model), str(2**31 + 40 * size)]
-        done = subprocess.run(trial, capture_output=True, text=True, timeout=PATIENCE + size / SPEED)
-        trouble = done.stderr.strip().splitlines()[-1:] or [f"its reader died of signal {-done.returncode}"]
-    except subprocess.TimeoutExpired as late:
-        raise InputError(f"{model}: not a COLMAP model, or damaged (not read in {late.timeout:.0f} s)") from late
-    if done.returncode:
-        raise InputError(f"{model}: not a COLMAP model, or damaged ({trouble[0]})")

@@ -27,8 +27,8 @@ class Neus(Source):
         pictures, array = numbered(self.src / "image"), self.src / "images.npy"
         if array.is_file():
             stack = load_npy(array)
-            if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers):
-                raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3): "
+            if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers) or stack.dtype.kind not in "fiu":
+                raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3) numbers: "
                                  f"one photograph for each world_mat in {path.name}")  # fmt: skip
             pictures = dict.fromkeys(numbers, array)
         elif not pictures:

@@ -169,7 +169,7 @@ def fuzz(name: str, options: argparse.Namespace, keep: Path) -> tuple[int, int, 
 
 
 class Forked:
-    """As much of `subprocess` as `colmap` asks for: its trial in a fork, for a new process takes 100 times as long."""
+    """As much of `subprocess` as `foreign` asks for: a trial in a fork, for a new process takes 100 times as long."""
 
     TimeoutExpired = subprocess.TimeoutExpired
 
@@ -192,7 +192,7 @@ class Forked:
 
 def child_of(name: str, options: argparse.Namespace, keep: Path, count: mmap.mmap, words: Path, left: float) -> None:
     """The life of a process that reads."""
-    from mi_ring.importers import colmap
+    from mi_ring import foreign
 
     status, bench = 1, None
     with words.open("w") as output:
@@ -200,7 +200,7 @@ def child_of(name: str, options: argparse.Namespace, keep: Path, count: mmap.mma
         os.dup2(output.fileno(), 2)
         faulthandler.enable()
         dr.set_thread_count(2)
-        colmap.subprocess, colmap.PATIENCE = Forked, 2.0
+        foreign.subprocess, foreign.PATIENCE = Forked, 2.0
         try:
             bench = Bench(name, keep, count)
             work(bench, options, left)
