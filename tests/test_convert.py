@@ -339,7 +339,7 @@ def test_what_strangers_files_do_to_their_readers_is_one_line(colmap, tmp_path, 
 
 def test_colmap_without_masks_and_exif(colmap, tmp_path):
     scene = converted("colmap", colmap, tmp_path / "scan.xml", "--no-exif")
-    assert scene.masks == [None] * 3
+    assert list(scene.masks) == [None] * 3
     lights = scene.photographs.lights
     np.testing.assert_allclose(lights.rgb(), 1)
     np.testing.assert_allclose(lights.positions(), [-R.T @ t for R, t in cameras()], rtol=1e-4)
