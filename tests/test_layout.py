@@ -93,6 +93,10 @@ def test_the_bridge_is_the_only_seam_between_torch_and_dr_jit():
     assert both == {"rendering/bridge.py", "system/machine.py"}  # which sets the number of threads of both
 
 
+def test_one_module_knows_of_other_processes():
+    assert {m for m in MODULES if "torch.distributed" in (PACKAGE / m).read_text("utf-8")} == {"fitting/processes.py"}
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_long_modules_give_a_reason(module):
     text = (PACKAGE / module).read_text("utf-8")
