@@ -519,6 +519,8 @@ def test_wrong_counts_of_photographs_and_masks(tmp_path):
     refused(["neus", source], "image: no photographs in this folder", out)
     np.save(source / "images.npy", np.zeros((2, H, W, 3), np.float32))
     refused(["neus", source], r"images.npy: is of shape \(2, .* must be \(3, H, W, 3\)", out)
+    np.save(source / "images.npy", np.full((3, H, W, 3), b"x"))
+    refused(["neus", source], r"images.npy: is of shape \(3, .* must be \(3, H, W, 3\) numbers", out)
 
 
 @pytest.mark.parametrize(("edit", "pattern"), [
@@ -530,6 +532,7 @@ def test_wrong_counts_of_photographs_and_masks(tmp_path):
     (lambda d: d["1.png"].update(img_size="large"), "1.png.img_size"),
     (lambda d: d["1.png"].update(K=[0] * 16), "1.png.K"),
     (lambda d: d.update({"7.png": d["1.png"]}), "7.png: no such file"),
+    (lambda d: d.update({"/": d["1.png"]}), "/: no such file: /"),
     (lambda d: d.update({"1.png": 3}), "must be an object"),
     (lambda d: d.clear(), "no photographs"),
 ])  # fmt: skip

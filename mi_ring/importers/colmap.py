@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from os.path import splitext
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ class Colmap(Photogrammetry):
             if path is None:
                 continue
             pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
-            name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
+            name = Path(splitext(image.name)[0]).as_posix().replace("/", "_")
             own = reconstruction.cameras[image.camera_id]
             lens = Lens(own.model_name, (own.width, own.height), own.params)
             yield image.name, Frame(path, lens, pose, name=name)

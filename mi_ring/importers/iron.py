@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from os.path import splitext
 
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import inverse, pinhole
@@ -22,7 +23,7 @@ class Iron(Source):
         if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
             raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
         for key in sorted(cameras):  # names end in .png, whatever the files' end is
-            image = with_suffix((path.parent / "image" / key).with_suffix(""), f"{path}: {key}")
+            image = with_suffix(path.parent / "image" / splitext(key)[0], f"{path}: {key}")
             K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
             to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)
             size = matrix(cameras[key].get("img_size", image_size(image)), (2,), f"{path}: {key}.img_size")

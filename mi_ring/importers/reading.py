@@ -66,7 +66,7 @@ def with_suffix(path: Path, field: str) -> Path:
     """An image file whose name may lack its suffix."""
     if is_file(path):
         return path
-    for suffix in SUFFIXES:
+    for suffix in SUFFIXES if path.name else ():
         if is_file(file := path.with_name(path.name + suffix)):
             return file
     raise InputError(f"{field}: no such file: {path}, nor with any of {' '.join(SUFFIXES)}")
