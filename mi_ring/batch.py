@@ -71,9 +71,11 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
     jobs = jobs_of(config.scenes, config.out, options)
     with locked(config.out / "batch"):
-        todo = [job for job in jobs if not job.is_done(job.fingerprint())]
-        for job in todo:
-            job.note(replace(job.record, state="waiting", message="", tries=0))
+        prints = {job: job.fingerprint() for job in progress(jobs, "comparing", unit="scene")}
+        todo = [job for job in jobs if not job.is_done(prints[job])]
+        for job in jobs:
+            state = "waiting" if job in todo else "done"
+            job.note(replace(job.record, state=state, message="", tries=0))
         if len(todo) < len(jobs):
             print(f"{len(jobs) - len(todo)} of {len(jobs)} are done already")
         show(jobs, config.out, True)
@@ -116,13 +118,9 @@ def show(jobs: Sequence[Job], out: Path, running: bool) -> None:
 def finish(jobs: Sequence[Job], out: Path) -> int:
     """Say what became of each. Returns the exit status."""
     show(jobs, out, False)
-    records = {job.name: job.record for job in jobs}
-    for name, record in records.items():
-        if record.state != "done":
-            print(f"{name}: {record.state}{': ' * bool(record.message)}{record.message}")
-    done = sum(record.state == "done" for record in records.values())
-    print(f"{done} of {len(jobs)} done: {out}/index.html")
-    return int(done < len(jobs))
+    left = [job.name for job in jobs if job.record.state != "done"]
+    print(f"{len(jobs) - len(left)} of {len(jobs)} done{', not ' * bool(left)}{', '.join(left)}: {out}/index.html")
+    return int(bool(left))
 
 
 if __name__ == "__main__":

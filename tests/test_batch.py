@@ -41,6 +41,8 @@ class Script:
         if iteration:
             (job.folder / "checkpoint.pt").write_bytes(b"")
             results.write_log(job.folder, [{"iteration": iteration, "unexplained": 0.1}])
+        for name in ("ring.pt", "report.html") if status == 0 else ():
+            (job.folder / name).write_text("")
         return status, complaint
 
 
@@ -83,19 +85,19 @@ def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture
     job = Job(path, tmp_path / "out/small", ("--seed", "3"))
     Script(monkeypatch, (0, 60, ""))
     fits.fit_to_the_end(job, 0)
-    assert not job.is_done(job.fingerprint())  # its results are gone
-    for name in ("ring.pt", "report.html"):
-        (job.folder / name).write_text("")
-    assert job.is_done(job.fingerprint())
+    assert job.is_done(job.fingerprint()) and job.record.iteration == 60
     assert not job.is_done(Job(path, job.folder, ("--seed", "4")).fingerprint())
     mask = path.parent / "masks/003.png"
     before = mask.read_bytes()
     mask.write_bytes(before + b" ")
     assert not job.is_done(job.fingerprint())
-    script = Script(monkeypatch, (0, 60, ""))
-    fits.fit_to_the_end(job, 0)
-    assert "--resume" not in script.commands[0]  # anew: what was there is aside
-    assert (job.folder.parent / "small.1/ring.pt").exists()
+    script = Script(monkeypatch, (2, 0, "masks/003.png: is wrong"))
+    assert fits.fit_to_the_end(job, 0).state == "failed"
+    assert "--resume" not in script.commands[0]  # anew, and from no checkpoint of another
+    mask.write_bytes(before)
+    assert job.is_done(job.fingerprint())  # as before: the fit that failed has not touched it
+    (job.folder / "ring.pt").write_text("of another fit")
+    assert not job.is_done(job.fingerprint())
     edit('<float name="fx" value="60.0"/>', '<float name="fx" value="60.5"/>')
     assert job.fingerprint() != job.record.fingerprint
 
@@ -179,7 +181,7 @@ def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, t
     assassin.join()
     said = capsys.readouterr().out
     assert killed == ["fit", "worker"] and status == 1, said
-    assert "1 of 2 done" in said and re.search(r"wrong: failed: .*wrong\.xml", said)
+    assert "1 of 2 done, not wrong" in said and re.search(r"wrong: failed: .*wrong\.xml", said)
     records = {name: Record(**json.loads((out / f"batch/{name}.json").read_text())) for name in ("small", "wrong")}
     assert records["small"].state == "done" and results.read_log(out / "small")[-1]["iteration"] == 60
     assert (out / "small/report.html").is_file()

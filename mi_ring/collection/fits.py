@@ -5,12 +5,12 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from mi_ring.collection.jobs import Job, Record
-from mi_ring.output.results import PRECIOUS, move_aside
+from mi_ring.collection.jobs import Job, Record, written
 
 MISTAKE = 2  #: exit status of a fit for what the user can mend, and no second try
 DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
@@ -22,24 +22,23 @@ def fit_to_the_end(job: Job, retries: int, extra: tuple[str, ...] = ()) -> Recor
     `extra`: options that change nothing of the result. Whoever is killed while at it may call it again.
     """
     fingerprint, record = job.fingerprint(), job.record
-    if record.fingerprint != fingerprint:
-        if any((job.folder / name).exists() for name in PRECIOUS):  # of a fit of something else
-            move_aside(job.folder)
-        record = Record(fingerprint=fingerprint)
+    if record.fingerprint != fingerprint:  # the fit moves results of another aside, as soon as it begins
+        record = Record(fingerprint=fingerprint, since=time.time(), done=record.done, written=record.written)
     if record.state in ("failed", "done"):  # before: a new batch tries anew
         record = replace(record, tries=0)
     complaint = record.message
     while True:
-        iteration = job.iteration
+        iteration = job.iteration(record.since)
         tries = 1 if iteration > record.iteration else record.tries + 1
         if tries > retries + 1:
             return job.note(replace(record, state="failed", message=complaint or "was killed again and again"))
-        record = job.note(Record("running", fingerprint, "", tries, iteration))
-        resume = ["--resume"] if job.has_checkpoint else []
+        record = job.note(replace(record, state="running", message="", tries=tries, iteration=iteration))
+        resume = ["--resume"] if job.has_checkpoint(record.since) else []
         command = [sys.executable, "-m", "mi_ring.fit", str(job.scene), "--out", str(job.folder), *extra, *job.options]
         status, complaint = run([*command, *resume], job)
-        if status == 0 and (job.folder / "ring.pt").is_file():
-            return job.note(replace(record, state="done", message=""))
+        if status == 0 and (ring := written(job.folder / "ring.pt")):
+            iteration = job.iteration(record.since)
+            return job.note(replace(record, state="done", iteration=iteration, done=fingerprint, written=ring))
         if status in (0, MISTAKE):  # without results: it was not asked for any
             return job.note(replace(record, state="failed", message=complaint))
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_file
 from mi_ring.output.results import read_log
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import read_json, write_file
@@ -26,6 +26,9 @@ class Record:
     message: str = ""  #: why it failed
     tries: int = 0  #: how often it was begun since it got any further
     iteration: int = 0  #: at the beginning of the last try
+    since: float = 0.0  #: when the fit of this fingerprint was begun first; what is older in the folder is another's
+    done: str = ""  #: fingerprint of the results that were there last, which another fit that fails leaves there
+    written: int = 0  #: when their ring.pt was, in nanoseconds
 
 
 @dataclass(frozen=True)
@@ -75,16 +78,15 @@ class Job:
                         result.update(str(file.name).encode() + hashlib.blake2b(file.read_bytes()).digest())
         return result.hexdigest()
 
-    @property
-    def has_checkpoint(self) -> bool:
-        """Can its fit go on from one?"""
-        return any((self.folder / name).is_file() for name in CHECKPOINTS)
+    def has_checkpoint(self, since: float) -> bool:
+        """Can its fit, begun at a time `since`, go on from one?"""
+        return any(written(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
 
-    @property
-    def iteration(self) -> int:
-        """The last that its log has; 0 if there is none."""
+    def iteration(self, since: float = 0.0) -> int:
+        """The last that its log has; 0 if there is none of a fit begun at a time `since`."""
         with contextlib.suppress(OSError, KeyError, TypeError):
-            return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
+            if written(self.folder / "log.jsonl") / 1e9 >= since:
+                return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
         return 0
 
     @property
@@ -94,19 +96,32 @@ class Job:
         with contextlib.suppress(OSError):
             said = re.findall(r"iteration \d+/(\d+)", self.output.read_text(errors="replace"))
             planned = f" of {said[-1]}" if said else ""
-        return f"iteration {self.iteration}{planned}" if self.iteration else "begins"
+        iteration = self.iteration(self.record.since)
+        return f"iteration {iteration}{planned}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
         """Are there results, of what the scene and its options still are?"""
-        record = self.record
-        there = all((self.folder / name).is_file() for name in ("ring.pt", "report.html"))
-        return there and record.state == "done" and record.fingerprint == fingerprint
+        record, ring = self.record, written(self.folder / "ring.pt")
+        there = ring and (self.folder / "report.html").is_file()
+        return bool(there) and (record.done, record.written) == (fingerprint, ring)
+
+
+def written(path: Path) -> int:
+    """When a file was, in nanoseconds; 0 if there is none."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene. Raises InputError if two have the same name, or if results would go onto a scene."""
+    """A job for each scene.
+
+    Raises InputError if one is no file, if two have the same name, or if results would go onto a scene.
+    """
     jobs: dict[str, Job] = {}
     for scene in scenes:
+        require_file(scene, "the XML file of a scene")
         name = scene_name(scene)
         if name in jobs or name == RECORDS:
             other = f"{jobs[name].scene} is" if name in jobs else "records of batches are"

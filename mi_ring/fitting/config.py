@@ -159,7 +159,9 @@ class Config:
             require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
             require(all(0 < v < math.inf for v in value), name, "above 0")
         object.__setattr__(self, "weights", WEIGHTS | self.weights)
-        require(all(0 <= w < math.inf for w in self.weights.values()), "weights", "0 or more")
+        for name, weight in self.weights.items():
+            if not 0 <= weight < math.inf:
+                raise InputError(f"--weights.{name}: is {weight}, must be 0 or more")
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Config":

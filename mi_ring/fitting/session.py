@@ -180,6 +180,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         elif fit.albedo >= 1 and fit.calibration and "scale" in fit.calibration.refined:
             print(f"By the lights' intensities the object reflects {fit.albedo:.3g} times the light that it gets: how "
                   "strong they are is found by interreflection (--refine scale)")  # fmt: skip
+        if processes.count > 1:
+            print(f"{processes.count} processes share the points and photographs of each iteration")
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
             processes.by_first(lambda: results.write_inputs(folder / "inputs.png", fit))
