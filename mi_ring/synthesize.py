@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 from mi_ring.synthesis.capture import write_capture
-from mi_ring.synthesis.config import Synthesis, require_options
+from mi_ring.synthesis.config import SynthesizeConfig, require_options
 from mi_ring.system import command
 from mi_ring.system.files import locked
 
 
 def main(arguments: Sequence[str]) -> None:
     """The command."""
-    config = command.parse(Synthesis, arguments, "mi_ring.synthesize")
+    config = command.parse(SynthesizeConfig, arguments, "mi_ring.synthesize")
     require_options(config)
     with locked(config.out, "OUT"):
         write_capture(config)

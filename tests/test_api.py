@@ -89,10 +89,12 @@ def test_an_iteration_has_what_was_predicted_and_observed(capture):
 
 def test_presets_change_and_weights_that_are_not_given_stay():
     fast = mi_ring.Config.preset("fast", weights={"mask": 10.0})
-    assert fast.iterations == 120 and fast.weights == {"rgb": 1.0, "mask": 10.0, "velocity": 0.01, "calibration": 1e-3}
+    off = dict.fromkeys(("normal_variation", "material_variation", "material_rank"), 0.0)
+    weights = {"rgb": 1.0, "mask": 10.0, "velocity": 0.01, "calibration": 1e-3} | off
+    assert fast.iterations == 120 and fast.weights == weights
     assert mi_ring.Config(weights={"mask": 10.0}).weights == fast.weights
     paper = mi_ring.Config.preset("paper", weights={"velocity": 0.5}, seed=3)
-    assert paper.weights == {"rgb": 1.0, "mask": 0.0, "velocity": 0.5, "calibration": 1e-3}
+    assert paper.weights == weights | {"mask": 0.0, "velocity": 0.5}
     assert paper.optimizer == "adam" and paper.seed == 3
     assert mi_ring.Config.preset("default") == mi_ring.Config()
     with pytest.raises(mi_ring.InputError, match="preset: is quick, must be one of fast, default, fine, paper"):

@@ -160,7 +160,7 @@ def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cu
     photographs = photographs.select([1, 0], (WIDTH, HEIGHT))
     drawn = pictures(render_photographs(scene, photographs, 16, 0))
     coverage = torch.from_numpy(drawn[..., 3]).to(machine.device()).requires_grad_()
-    surface = SimpleNamespace(scene=scene, table=None)
+    surface = SimpleNamespace(scene=scene, table=None, unit=1.0)
     added = bridge.surroundings(surface, photographs, coverage, 5, width, 1024).interreflection
     assert added.shape == (2, HEIGHT, WIDTH, 3)
     for k, expected in zip((0, 1), series(indirect.BOUNCES)[::-1]):

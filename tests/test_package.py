@@ -39,7 +39,10 @@ def test_the_wheel_holds_what_runs_and_nothing_else(built):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert f"-{mi_ring.__version__}-" in wheel.name
     ours = {path.relative_to(ROOT).as_posix() for path in (ROOT / "mi_ring").rglob("*.py")}
-    data = {"mi_ring/py.typed", "mi_ring/output/report.html.jinja", "mi_ring/output/viewer/viewer.min.js"}
+    data = {
+        "mi_ring/py.typed", "mi_ring/output/index.html.jinja", "mi_ring/output/report.html.jinja",
+        "mi_ring/output/viewer/viewer.min.js",
+    }  # fmt: skip
     assert {name for name in names if ".dist-info/" not in name} == ours | data
 
 

@@ -161,7 +161,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     observed = torch.from_numpy(observed).to(machine.device())
     direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0))).to(machine.device())
     room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
-    surface = SimpleNamespace(scene=dark, table=None)
+    surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
     for seed in range(12):
         around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=True)
         predicted = direct[..., :3] + around.interreflection

@@ -23,7 +23,7 @@ from mi_ring.rendering.rooms import COUNT
 from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import look_at, poses
 from mi_ring.synthesis.capture import Production, write_scenes
-from mi_ring.synthesis.config import Synthesis
+from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.degradation import encoded, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURS, load_material, plugin
 from mi_ring.synthesis.stage import Stage, load_object
@@ -182,7 +182,7 @@ def test_an_interrupted_capture_goes_on(matt, lump, tmp_path):
 def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     out = tmp_path / "wrong"
     (out / "truth").mkdir(parents=True)
-    config = Synthesis(lump, out, views=30, novel=0, room=0.1, wrong_cameras=0.5, wrong_light=3, wrong_power=10,
+    config = SynthesizeConfig(lump, out, views=30, novel=0, room=0.1, wrong_cameras=0.5, wrong_light=3, wrong_power=10,
                        wrong_room=True, light="flash")  # fmt: skip
     production = Production(config)
     write_scenes(production, production.views(30), [], exposure=7.0)

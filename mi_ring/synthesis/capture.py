@@ -31,7 +31,7 @@ from mi_ring.images import to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import poses
-from mi_ring.synthesis.config import Synthesis
+from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.degradation import HIGHEST, encoded, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
@@ -56,7 +56,7 @@ class View(NamedTuple):
 class Production:
     """All that a capture is made of, by its options. Raises InputError for what cannot be read."""
 
-    def __init__(self, config: Synthesis) -> None:
+    def __init__(self, config: SynthesizeConfig) -> None:
         self.config = config
         self.mesh, colours, self.placed = load_object(config.mesh, config.radius, config.smooth)
         usual = PLAIN if colours is None else COLOURED
@@ -156,7 +156,7 @@ class Production:
         return int(np.ceil(np.sqrt(self.config.spp))) ** 2
 
 
-def write_capture(config: Synthesis) -> None:
+def write_capture(config: SynthesizeConfig) -> None:
     """Write a capture into its folder, or what is missing of it. The scene file comes last.
 
     Raises InputError for what cannot be read, and if the folder holds anything else.
@@ -228,12 +228,12 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
     write_file(out / "scene.xml", scene(out, seen, "images", "masks", config.exact))
 
 
-def photograph_name(config: Synthesis, view: View) -> str:
+def photograph_name(config: SynthesizeConfig, view: View) -> str:
     """Of its file."""
     return f"{view.name}.{'exr' if config.format == 'exr' else 'png'}"
 
 
-def settings_of(config: Synthesis) -> dict:
+def settings_of(config: SynthesizeConfig) -> dict:
     """The options that a capture depends on, and what their files hold, as JSON has them."""
     values = asdict(replace(config, out=Path())) | {"digests": {}}
     del values["out"]
@@ -245,7 +245,7 @@ def settings_of(config: Synthesis) -> dict:
     return json.loads(json.dumps(values, default=str))
 
 
-def claim(out: Path, config: Synthesis) -> None:
+def claim(out: Path, config: SynthesizeConfig) -> None:
     """Raise InputError if a folder holds anything but the same capture, whole or in part."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return

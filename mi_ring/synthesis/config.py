@@ -14,7 +14,7 @@ from mi_ring.synthesis.lamps import LightKind, RoomKind
 
 
 @dataclass(frozen=True)
-class Synthesis:
+class SynthesizeConfig:
     """Path trace a capture of a mesh: photographs, masks, scene file, and the truth beside them.
 
     The middle of the mesh's bounding box is moved to the origin and its farthest vertex to --radius; its axes stay.
@@ -133,7 +133,7 @@ RANGES = {
 }  # fmt: skip
 
 
-def require_options(config: Synthesis) -> None:
+def require_options(config: SynthesizeConfig) -> None:
     """Raise InputError for options out of range or that contradict each other."""
     for name, (least, most) in RANGES.items():
         if not least <= getattr(config, name) <= most:
