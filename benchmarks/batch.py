@@ -4,54 +4,26 @@
 
 Copies of a scene are fitted, tiny and deterministic, by `mi-ring batch` while the processes of fits, Ray's workers and,
 now and then, the batch itself (which is then called again) get SIGKILL. In the end all results must be there, and equal
-bit for bit to that of a fit that nobody has killed. It needs the extra `batch`, and Linux.
+bit for bit to that of a fit that nobody has killed. It needs the extra `batch`, psutil, and Linux.
 """
 
 import argparse
 import datetime
-import os
 import random
-import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import psutil
 from accuracy import processor
 
 OPTIONS = ["--iterations", "40", "--levels", "2", "--widths", "32", "--shares", "1", "--subdivisions", "2", "--batch",
            "2", "--domain", "sphere", "--deterministic"]  # fmt: skip
 KINDS = "fit", "worker", "batch"
 ODDS = 4, 4, 1  #: of each kind
-
-
-def processes(word: str) -> list[int]:
-    """Ids of the processes whose command line has a word in it."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            if word.encode() in path.read_bytes():
-                found.append(int(path.parent.name))
-        except OSError:
-            continue
-    return found
-
-
-def kill(process: int) -> bool:
-    """Kill a process; False if it has gone already."""
-    try:
-        os.kill(process, signal.SIGKILL)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def parent_of(process: int) -> int:
-    """The process that began another."""
-    return int(re.search(r"PPid:\s+(\d+)", Path(f"/proc/{process}/status").read_text())[1])  # type: ignore[index]
 
 
 def main() -> None:
@@ -78,15 +50,16 @@ def main() -> None:
         started, batch = time.monotonic(), subprocess.Popen(command)
         while batch.poll() is None:
             time.sleep(rng.uniform(2, 10))
-            fits = processes(f"--out\0{folder}/out/")
+            running = psutil.process_iter(["cmdline"])
+            fits = [p for p in running if f"--out\0{folder}/out/" in "\0".join(p.info["cmdline"] or [])]
             if sum(killed.values()) < options.kills and fits:
                 kind, victim = rng.choices(KINDS, ODDS)[0], rng.choice(fits)
                 try:
-                    done = kill({"fit": victim, "worker": parent_of(victim), "batch": batch.pid}[kind])
-                except FileNotFoundError:
-                    done = False
-                killed[kind] += done
-                if kind == "batch" and done:
+                    {"fit": victim, "worker": victim.parent(), "batch": psutil.Process(batch.pid)}[kind].kill()
+                except psutil.NoSuchProcess:
+                    continue
+                killed[kind] += 1
+                if kind == "batch":
                     batch.wait()
                     time.sleep(5)  # what it has begun ends with it
                     batch = subprocess.Popen(command)

@@ -13,8 +13,6 @@ Options of a quick trial: -- --iterations 6 --levels 2 --widths 32 --shares 1 --
 import argparse
 import datetime
 import json
-import os
-import platform
 import random
 import re
 import shutil
@@ -30,6 +28,7 @@ import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 # isort: split
 import torch
 import trimesh
+from accuracy import processor
 from PIL import Image
 
 from mi_ring.ring.saved import load_fit, read_state
@@ -124,7 +123,7 @@ def main() -> None:
         subprocess.run(list(map(str, commands["whole"])), check=True, **silent)
         note.write_text(f"{time.monotonic() - start:.1f}")
     took = float(note.read_text())
-    print(f"{platform.machine()}, {os.cpu_count()} cores; {datetime.date.today()}; {' '.join(options)}\n", flush=True)
+    print(f"{processor()}; {datetime.date.today()}; {' '.join(options)}\n", flush=True)
     print(f"Undisturbed: {took:.0f} s\n\n| kill | after, s | iteration | files that were there |\n|---|---|---|---|")
     folder, kills, finished = folders["killed"], 0, 0
     while True:

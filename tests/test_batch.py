@@ -2,15 +2,14 @@
 
 import importlib.util
 import json
-import os
 import re
 import shutil
-import signal
 import sys
 import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from mi_ring import batch
@@ -136,22 +135,6 @@ def test_the_page_shows_pictures_and_figures_of_reports_and_runs_no_script(tmp_p
     assert 'href="a%20%26%20%3Cscript%3Ealert%281%29/report.html"' in page
 
 
-def processes(word):
-    """Ids of the processes whose command line has a word in it."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            if word.encode() in path.read_bytes():
-                found.append(int(path.parent.name))
-        except OSError:
-            continue
-    return found
-
-
-def parent_of(process):
-    return int(re.search(r"PPid:\s+(\d+)", Path(f"/proc/{process}/status").read_text())[1])
-
-
 @needs_ray
 def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, tmp_path, monkeypatch, capsys):
     """One scene whose fit is killed, then its worker of Ray; one that is wrong and stops nothing."""
@@ -165,13 +148,12 @@ def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, t
     def kill(whom):
         deadline = time.monotonic() + 200
         while time.monotonic() < deadline:
-            if (out / "small/checkpoint.pt").exists() and (own := processes(str(out / "small"))):
-                victim = {"fit": own[0], "worker": parent_of(own[0])}[whom]
-                before = own[0]
-                os.kill(victim, signal.SIGKILL)
+            running = psutil.process_iter(["cmdline"])
+            own = [p for p in running if str(out / "small") in "\0".join(p.info["cmdline"] or [])]
+            if (out / "small/checkpoint.pt").exists() and own:
+                {"fit": own[0], "worker": own[0].parent()}[whom].kill()
                 killed.append(whom)
-                while Path(f"/proc/{before}").exists() and time.monotonic() < deadline:  # it dies with its worker
-                    time.sleep(0.02)
+                own[0].wait(deadline - time.monotonic())  # it dies with its worker
                 return
             time.sleep(0.02)
 

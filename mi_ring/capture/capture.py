@@ -110,7 +110,7 @@ class Capture:
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
         rgb, clipped, mask, valid = zip(*(self.decoded(k, scale) for k in index))
-        masked = torch.tensor([self.masks.given[k] for k in index])
+        masked = torch.tensor(self.masks.part(index).given)
         if all(v is None for v in valid):
             return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, None)
         shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]

@@ -35,6 +35,8 @@ class Silhouette(NamedTuple):
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """A mask (H, W) uint8 with so many pixels across, at most, and how many of its own are one of these across."""
     scale = -(-mask.shape[1] // width)
+    if scale == 1:
+        return mask, 1
     height, width = (n // scale for n in mask.shape)
     blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
     return blocks.mean((1, 3)).astype(np.uint8), scale

@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import functools
 import html
 import io
 import re
@@ -49,12 +50,19 @@ def row_of(entry: Entry, out: Path) -> dict:
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
-        page = report.read_text("utf-8")
-        figures, picture = figures_of(page), thumbnail_of(page)
+        told, picture = shown_of(report, report.stat().st_mtime_ns)
+        figures |= told
     with contextlib.suppress(OSError, LookupError, TypeError, ValueError):
         figures["unexplained"] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
     link = quote(relative_to(out.resolve(), report.resolve())) if report.is_file() else None
     return {**entry._asdict(), "figures": figures, "picture": picture, "link": link}
+
+
+@functools.lru_cache(maxsize=4096)
+def shown_of(report: Path, written: int) -> tuple[dict[str, str], str | None]:
+    """Figures and picture of a report as it was `written`: the page is made anew whenever one of many fits goes on."""
+    page = report.read_text("utf-8")
+    return figures_of(page), thumbnail_of(page)
 
 
 def figures_of(report: str) -> dict[str, str]:

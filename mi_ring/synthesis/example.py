@@ -13,7 +13,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.synthesis.cameras import look_at
+from mi_ring.synthesis.cameras import GOLDEN, look_at
 from mi_ring.synthesis.stage import Stage
 from mi_ring.synthesis.tracing import Shot
 from mi_ring.system.progress import progress
@@ -63,7 +63,7 @@ def cameras() -> list[Camera]:
     result = []
     for k in range(VIEWS):
         y = 1 - 2 * (k + 0.5) / VIEWS
-        turn = k * np.pi * (3 - np.sqrt(5))
+        turn = k * GOLDEN
         direction = np.array([np.cos(turn) * np.sqrt(1 - y * y), y, np.sin(turn) * np.sqrt(1 - y * y)])
         up = np.array([0.0, 1.0, 0.0] if abs(y) < 0.9 else [1.0, 0.0, 0.0])
         to_world = look_at(CENTER + DISTANCE * direction, CENTER, up)

@@ -9,9 +9,11 @@ OWN = "MI_RING_OWN_GPU"  #: 1 in the environment of a process that shares its GP
 def choose_gpu() -> None:
     """Have each of several processes that `torchrun` has started on this machine see one GPU alone, in turn."""
     here, rank = int(os.environ.get("LOCAL_WORLD_SIZE", 1)), int(os.environ.get("LOCAL_RANK", 0))
+    if here == 1 or OWN in os.environ:
+        return
     told = os.environ.get("CUDA_VISIBLE_DEVICES")
     there = [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]  # none without a driver
     gpus = there if told is None else [name for name in told.split(",") if name]
-    if here > 1 and gpus and OWN not in os.environ:
+    if gpus:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[rank % len(gpus)]
         os.environ[OWN] = str(int(len(gpus) >= here))
