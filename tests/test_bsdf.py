@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from mi_ring.plugins.cooktorrance import CookTorrance
+from mi_ring.plugins.cooktorrance import CookTorrance, cosine_shares
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.system import machine
 
@@ -531,3 +531,33 @@ def test_attributes_of_a_stock_mesh_are_accepted(tetrahedron):
     scene = scene_of({"type": "ply", "filename": tetrahedron, "bsdf": bsdf})
     require_attributes(scene.shapes()[0])
     mi.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
+@pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
+@pytest.mark.parametrize("cosine", [0.97, 0.4])
+def test_lobes_reflect_harmonics_as_samples_do(distribution, roughness, cosine):
+    """Of each degree the nearest that a round lobe comes: exactly for l = 0 and 1, if its direction is the mean one."""
+    bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": {"type": "rgb", "value": [0.1, 0.05, 0.2]}, "specular": 0.06,
+                         "roughness": roughness, "distribution": distribution})  # fmt: skip
+    count, sine = 2**18, float(np.sqrt(1 - cosine**2))
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi = mi.Vector3f(0.6 * sine, -0.8 * sine, cosine)
+    random = mi.PCG32(count)
+    two = mi.Point2f(random.next_float32(), random.next_float32())
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, random.next_float32(), two, True)
+    sampled = [[dr.mean(w * y)[0] for w in weight] for y in dr.sh_eval(sample.wo, 4)]
+    by_lobes = np.zeros((25, 3))
+    for direction, shares in bsdf.lobes(si, 4):
+        for k, y in enumerate(dr.sh_eval(direction, 4)):
+            by_lobes[k] += [dr.mean(y * share)[0] for share in mi.Color3f(shares[int(k**0.5)])]
+    error = np.abs(by_lobes - np.array(sampled))
+    assert error[:4].max() < 0.01 * np.abs(sampled).max()
+    assert error[4:].max() < 0.1 * np.abs(sampled).max()
+
+
+def test_a_matte_surface_reflects_harmonics_by_the_known_factors():
+    """Ramamoorthi and Hanrahan 2001, table of A_l: π, 2π/3, π/4, 0, −π/24, 0, π/64."""
+    shares = cosine_shares(6)
+    np.testing.assert_allclose(shares, np.pi * np.array([1, 2 / 3, 1 / 4, 0, -1 / 24, 0, 1 / 64]), atol=1e-12)

@@ -1,6 +1,7 @@
 """Light of the room: its emitter, the pictures of its harmonics, and whether least squares finds it."""
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -16,7 +17,7 @@ from mi_ring.fitting.room import Room
 from mi_ring.rendering import bridge, indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_photographs
-from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, frames_of, room_of
+from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to
 from mi_ring.system import machine
 
 LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value": i}}
@@ -24,11 +25,22 @@ LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value":
 POSES = np.stack([np.array(mi.ScalarTransform4f(photograph(k, LIGHTS[k])["to_world"]).matrix) for k in (0, 1)])
 
 
-def some_room(seed=3):
+ALL = up_to(2, FRAMES)  #: a room beside the photographs' light has no others
+
+
+def some_room(seed=3, order=2):
     """(BASIS, 3), nowhere negative."""
-    harmonics = np.random.default_rng(seed).normal(0, 0.03, (BASIS, 3))
+    harmonics = np.zeros((BASIS, 3))
+    which = up_to(order, FRAMES)
+    harmonics[which] = np.random.default_rng(seed).normal(0, 0.1 / np.sqrt(len(which)), (len(which), 3))
     harmonics[0] += 0.6
     return harmonics
+
+
+def shown(channels, which=ALL):
+    """Pictures (n, 2, H, W, 3) of each harmonic, and as if nothing were in the way, of `render_indirect`'s channels."""
+    both = pictures(channels[4:]).reshape(2, HEIGHT, WIDTH, 2, len(which), 3)
+    return np.moveaxis(both, (3, 4), (0, 1))
 
 
 def emitters(room):
@@ -54,8 +66,8 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
     ball = {"type": "sphere", "center": CENTER.tolist(), "radius": 0.5, "bsdf": material(ALBEDO / np.pi)}
     scene = load(LIGHTS, ball=ball)
     photographs = Photographs.of(scene.sensors())
-    channels = indirect.render_indirect(scene, photographs, spp=256, seed=1, room=True)
-    images = pictures(channels[4:]).reshape(2, HEIGHT, WIDTH, BASIS, 3)
+    channels = indirect.render_indirect(scene, photographs, spp=256, seed=1, room=ALL)
+    images, free = (np.moveaxis(part, 0, 3) for part in shown(channels))
     inside = pictures(channels[:4])[..., 3] == 1
     assert inside[0].sum() > 60 and inside[1].sum() > 60
     decay = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)[:, None]
@@ -71,17 +83,16 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
         normal = (POSES[k][:3, 3] + distance[:, None] * away - CENTER) / 0.5
         own = normal @ POSES[k][:3, :3]
         expected = np.concatenate([decay * harmonics(normal), (decay * harmonics(own))[1:]])
-        seen = images[k][inside[k]] / (ALBEDO / np.pi)  # (n, BASIS, 3)
-        error = seen - expected.T[..., None]
-        assert np.abs(error.mean((0, 2))).max() < 0.02
-        assert np.sqrt((error**2).mean()) < 0.15
+        seen = images[k][inside[k]] / (ALBEDO / np.pi)  # (n, harmonics, 3)
+        assert np.abs(seen - expected.T[..., None]).max() < 0.02  # but for where in the pixel
+        np.testing.assert_allclose(free[k][inside[k]], images[k][inside[k]], rtol=1e-5, atol=1e-6)
 
 
 def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
     """A glossy cup with a ball in it, by `path`: the room's light, once reflected and more often."""
     ball = {"type": "sphere", "center": [0.5, -0.3, -0.1], "radius": 0.3, "bsdf": material([0.1, 0.2, 0.2], 0.05)}
     parts = {"cup": cup(material(0.8 * ALBEDO / np.pi, 0.04)), "ball": ball}
-    room = some_room()
+    room, which = some_room(order=ORDER), up_to(ORDER, FRAMES)
     lit, dark = load(LIGHTS, **parts, **emitters(room)), load(LIGHTS, **parts)
     np.testing.assert_allclose(room_of(lit), room, atol=1e-6)
     assert room_of(dark) is None
@@ -93,8 +104,8 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
                          for k in range(2)])  # fmt: skip
 
     def ours(seed):
-        channels = indirect.render_indirect(dark, photographs, 64, seed, room=True)
-        return np.einsum("nhwjc,jc->nhwc", pictures(channels[4:]).reshape(2, HEIGHT, WIDTH, BASIS, 3), room)
+        channels = indirect.render_indirect(dark, photographs, 64, seed, room=which)
+        return np.einsum("jnhwc,jc->nhwc", shown(channels, which)[0], room[which])
 
     def regions(picture):
         halves = picture[..., : WIDTH // 2, :], picture[..., WIDTH // 2 :, :]
@@ -118,17 +129,18 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=256, seed=2))
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
-    channels = indirect.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, room=True)
-    ours = np.einsum("nhwjc,jc->nhwc", pictures(channels[4:]).reshape(2, HEIGHT, WIDTH, BASIS, 3), room)[1]
+    channels = indirect.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, room=ALL)
+    ours = np.einsum("jnhwc,jc->nhwc", shown(channels)[0], room[ALL])[1]
     np.testing.assert_allclose(added.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
 
     params = mi.traverse(scene)
     key = "room_camera.harmonics"
-    values, step = np.array(params[key]), np.random.default_rng(5).normal(size=27)
+    values = np.array(params[key])
+    step = 0.02 * np.random.default_rng(5).normal(size=len(values))
     weight = mi.TensorXf(np.random.default_rng(6).normal(1, 0.5, (HEIGHT, WIDTH, 3)).astype(np.float32))
 
     def loss():
-        image = mi.render(scene, params, sensor=1, integrator=photometric, spp=16, seed=2)
+        image = mi.render(scene, params, sensor=1, integrator=photometric, spp=256, seed=2)
         return dr.sum(image[..., :3] * weight, axis=None).array
 
     sides = []
@@ -140,7 +152,7 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     dr.enable_grad(params[key])
     params.update()
     dr.backward(loss())
-    assert np.array(dr.grad(params[key])) @ step == pytest.approx(sides[0] - sides[1], rel=5e-3)
+    assert np.array(dr.grad(params[key])) @ step == pytest.approx(sides[0] - sides[1], rel=2e-2)  # other samples
 
 
 @pytest.mark.parametrize("frames", [("world",), ("camera",), ("world", "camera")])
@@ -163,23 +175,26 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
     for seed in range(12):
-        around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=True)
+        around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=room.which)
         predicted = direct[..., :3] + around.interreflection
-        room.see(around, predicted, observed, direct[..., 3] > 0.99)
+        lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
+        free = pictures(render_photographs(dark, lit_so_far, 64, 0)) - pictures(render_photographs(dark, photographs, 64, 0))
+        room.see(around, predicted + torch.from_numpy(free[..., :3]).to(predicted), observed, direct[..., 3] > 0.99)
     good = (direct[..., 3] == 1) & ((observed - predicted).abs() < 1).all(-1)
-    missing, shown = (  # in blocks of 7 × 10 pixels: single ones are noisy
+    missing, added = (  # in blocks of 7 × 10 pixels: single ones are noisy
         torch.nn.functional.avg_pool2d((picture * good[..., None]).movedim(-1, 1), (7, 10))
         for picture in (observed - predicted, around.room(room.harmonics))
     )
-    assert float((shown - missing).abs().mean()) < 0.13 * float(missing.abs().mean())
+    assert float((added - missing).abs().mean()) < 0.13 * float(missing.abs().mean())
     assert not room.harmonics[truth.sum(1) == 0].any()
 
 
 def test_without_anything_seen_the_room_is_as_given():
     given = torch.from_numpy(some_room()).float()
     room = Room(given, 0.3, ("world", "camera"))
-    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), torch.zeros(BASIS, 1, 5, 7, 3), torch.ones(1, 5, 7),
-                                 torch.ones(1, 10, 14), 2)  # fmt: skip
+    dark = torch.zeros(len(ALL), 1, 5, 7, 3)
+    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), ALL, dark, dark, torch.ones(1, 5, 7), torch.ones(1, 10, 14),
+                                 2)  # fmt: skip
     room.see(around, torch.zeros(1, 10, 14, 3), torch.ones(1, 10, 14, 3), torch.ones(1, 10, 14) > 0)
     torch.testing.assert_close(room.harmonics, given)
 
@@ -187,17 +202,18 @@ def test_without_anything_seen_the_room_is_as_given():
 def test_a_room_takes_no_light_away():
     """Photographs that are too dark in red, too bright in green, by what one room would show in both."""
     random = torch.Generator().manual_seed(0)
-    harmonics = torch.rand(BASIS, 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
-    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), harmonics, torch.ones(1, 5, 7), torch.ones(1, 10, 14), 2)
+    harmonics = torch.rand(len(ALL), 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
+    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(1, 5, 7),
+                                 torch.ones(1, 10, 14), 2)  # fmt: skip
     truth = torch.from_numpy(some_room()).float()[:, :1].repeat(1, 3)
     assert float(truth[0, 0]) > 0
     truth[:, 0] *= -1
     truth[COUNT:] = 0
-    shown = torch.einsum("jnhwc,jc->nhwc", harmonics, truth).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    missing = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL]).repeat_interleave(2, 1).repeat_interleave(2, 2)
     room = Room(torch.zeros(BASIS, 3), 0.3)
-    room.see(around, torch.ones(1, 10, 14, 3), 1 + shown, torch.ones(1, 10, 14) > 0)
+    room.see(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
     assert not room.harmonics[:, 0].any()
-    found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[:, 1]) for part in (room.harmonics, truth))
+    found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[ALL, 1]) for part in (room.harmonics, truth))
     assert float((found - missing).abs().mean()) < 0.2 * float(missing.abs().mean())
 
 

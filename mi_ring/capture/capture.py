@@ -180,7 +180,7 @@ class Capture:
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
         """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights."""
-        return float(exposure / np.median(self.photographs.lights.irradiance(center).mean(1)))
+        return float(exposure / np.median(self.photographs.irradiance(center).mean(1)))
 
     @property
     def up(self) -> np.ndarray:

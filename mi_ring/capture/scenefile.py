@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
 from mi_ring.rendering.lights import Light, Lights
-from mi_ring.rendering.rooms import COUNT
+from mi_ring.rendering.rooms import COUNT, ORDER
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
@@ -142,8 +142,9 @@ def add_film(sensor: Element, width: int, height: int) -> None:
 
 def load_element(element: Element) -> mi.Object:
     """The object of Mitsuba's that an element stands for."""
-    element.set("version", "3.0.0")
-    return mi.load_string(ElementTree.tostring(element, "unicode"))
+    whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
+    whole.extend(element)
+    return mi.load_string(ElementTree.tostring(whole, "unicode"))
 
 
 def numbers(values: ArrayLike) -> str:
@@ -213,7 +214,9 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """A `room` as XML: `harmonics` (9, 3) in the axes of the world or of the camera."""
+    """A `room` as XML: `harmonics` (COUNT, 3), or fewer, in the axes of the world or of the camera."""
+    orders = [(order + 1) ** 2 for order in range(2, ORDER + 1)]
+    harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
     ElementTree.SubElement(element, "string", name="frame", value=frame)
     ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))

@@ -9,7 +9,8 @@ camera looks like a flash that is elsewhere, and like another reflectance: it is
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,10 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.curve import Curve
 from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
+from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS, frames_of
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.rooms import BASIS
 from mi_ring.rendering.scenes import has_table
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
@@ -62,6 +65,9 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     `albedo`: the object's, by the lights' intensities.
     """
     names: set[str] = set(config.refine)
+    if capture.photographs.dark:
+        names |= {"ambient"}
+        names -= {"auto"}
     if "auto" in names and not capture.known:
         untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
         names |= {*AUTO, "scale"} if untold else {*AUTO}
@@ -102,12 +108,12 @@ class Calibration(nn.Module):
 
     def __init__(
         self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0,
-        fitted: np.ndarray | None = None,
+        fitted: np.ndarray | None = None, frames: Collection[str] = ("world",),
     ) -> None:  # fmt: skip
         """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
 
         `power`: a factor of what the capture says of the lights' intensities, to begin with; `fitted`: indices of the
-        photographs that are not kept out, by default all.
+        photographs that are not kept out, by default all; `frames`: axes in which a room's light is fixed.
         """
         super().__init__()
         self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
@@ -155,7 +161,7 @@ class Calibration(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room
         room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
-        self.room = Room(room, exposure, frames_of(capture.scene))
+        self.room = Room(room, exposure, frames, capture.photographs.dark)
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""
@@ -253,6 +259,11 @@ class Calibration(nn.Module):
         curve = self.curve_now
         return curve.linear(recorded, index, self.cosines(index, scale) if curve.shading else None)
 
+    def photographs(self, photographs: Photographs, calibrated: Sequence[Tensor]) -> Photographs:
+        """Photographs with cameras and lights as `calibrated`, and the room as it is by now; without gradients."""
+        room = self.roomlight().double().numpy(force=True)
+        return replace(bridge.calibrated(photographs, calibrated), room=room if room.any() else None)
+
     def roomlight(self) -> Tensor:
         """(BASIS, 3) harmonics of the room's light as they are by now; what a scene says goes with `scale`."""
         harmonics = self.room.harmonics
@@ -263,8 +274,9 @@ class Calibration(nn.Module):
         with torch.no_grad():
             now = self()
             distance2 = torch.where(self.finite, (now.places - self.center).square().sum(-1, keepdim=True), 1.0)
-            mean = harmonics[0].cpu() / math.sqrt(4 * math.pi)
-            return math.pi * mean / (now.strengths / distance2).median(0).values
+            mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
+            own = (now.strengths / distance2).median(0).values
+            return torch.where(own > 0, mean / own, torch.inf)
 
     def prior(self) -> Tensor:
         """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""

@@ -125,7 +125,7 @@ def compare(
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
         around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
-                                     indirect=fit.ring.indirect, room=bool(room.any()))  # fmt: skip
+                                     indirect=fit.ring.indirect, room=calibration.room.which)  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
         roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
 

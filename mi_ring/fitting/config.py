@@ -37,6 +37,9 @@ class Config:
     """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
     if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,
     which finds them in a dark room, too; --weights.mask 0 does without any."""
+    light: Literal["capture", "environment", "turntable"] = "capture"
+    """What lights the object. capture: the lights that the scene says; environment: light from everywhere, unknown,
+    fixed in the world; turntable: the same, fixed in the camera."""
     seed: int = 0
     """Random seed."""
     iterations: int = 360
@@ -100,8 +103,8 @@ class Config:
     decay: float = 0.1
     """The learning rates fall exponentially to this share; those of cameras to a half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, newer
-    GPUs)."""
+    """Precision of the networks' matrix products. auto: bfloat16 where that is faster (processors with AMX, AMD's from
+    Zen 4 on, newer GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
     refine: tuple[Unknown, ...] = ("auto",)
@@ -185,7 +188,7 @@ class Config:
 #: Settings that go together, by name.
 PRESETS: dict[str, dict] = {
     "fast": {
-        "iterations": 120, "levels": (4, 5), "widths": (128, 256), "shares": (0.85, 0.15), "subdivisions": 5,
+        "iterations": 140, "levels": (4, 5), "widths": (128, 256), "shares": (0.8, 0.2), "subdivisions": 5,
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},

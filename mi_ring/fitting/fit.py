@@ -21,6 +21,7 @@ from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.light import frames, lit
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
@@ -80,6 +81,7 @@ class Fit:
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
         if not capture.images:
             raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
+        capture = self.capture = lit(capture, self.config)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
@@ -111,7 +113,8 @@ class Fit:
         self.lookers: list[Looker] = []  #: optimisers that see iterations
         if refined := refined_of(seen, self.config, self.albedo):
             power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
-            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted)
+            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
+                                           frames(capture, self.config))  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
@@ -184,8 +187,8 @@ class Fit:
         photographs = replace(self.capture.photographs.select(index, size, scale), before=share.part.start)
         self.surface.set_faces(faces)
         calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
-        if calibration:
-            photographs = bridge.calibrated(photographs, calibration)
+        if self.calibration:
+            photographs = self.calibration.photographs(photographs, calibration)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,

@@ -28,20 +28,19 @@ def with_surroundings(
     lit = calibration is not None or photographs.room is not None
     if not (fit.ring.indirect or lit):
         return predicted
-    around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=lit,
+    which = calibration.room.which if calibration else np.flatnonzero(photographs.room.any(1)).tolist() if lit else []
+    around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=which,
                                  indirect=fit.ring.indirect)  # fmt: skip
     if fit.ring.indirect and fit.surface.table is not None:
         around = fit.averages.of(around, index, share)
     if fit.ring.indirect:
         predicted = predicted + (fit.calibration.bounced(around.interreflection) if fit.calibration
                                  else around.interreflection)  # fmt: skip
-    if calibration:
-        if fit.iteration / fit.iterations >= LIT:
-            telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
-            observed = calibration.linear(seen.rgb, index[share.part], scale)
-            calibration.room.see(around, predicted.detach(), observed, telling, share)
-        return predicted + around.room(calibration.room.harmonics)
+    before = predicted.detach()
     if photographs.room is not None:
-        room = fit.calibration.roomlight() if fit.calibration else torch.from_numpy(photographs.room)
-        predicted = predicted + around.room(room.to(predicted))
+        predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
+    if calibration and (photographs.dark or fit.iteration / fit.iterations >= LIT):
+        telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
+        observed = calibration.linear(seen.rgb, index[share.part], scale)
+        calibration.room.see(around, before, observed, telling, share, fit.iteration / fit.iterations)
     return predicted

@@ -1,5 +1,7 @@
 """The `cooktorrance` BSDF: equation 1 of the paper (Mitsuba plugin)."""
 
+import functools
+import math
 from typing import ClassVar
 
 import drjit as dr
@@ -9,6 +11,7 @@ from mi_ring.rendering.shading import MIN_COSINE
 
 MIN_ROUGHNESS = 0.02  #: below it the highlight is narrower than float32 can integrate
 DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Beckmann}
+NODES, SIDE = 32, 32  #: of the table of gloss, in each direction; its samples in each
 
 
 class CookTorrance(mi.BSDF):
@@ -122,6 +125,26 @@ class CookTorrance(mi.BSDF):
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
+    def lobes(self, si, order, active=True):
+        """What is reflected of light that varies slowly: of each lobe its direction in the world, and by how much each
+        degree of spherical harmonics about that is, a list of `order` + 1.
+
+        The diffuse lobe by "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan
+        2001). That of gloss is taken to be round about its mean direction; how wide it is says a table.
+        """
+        diffuse, specular, r = self.parameters(si, active)
+        active &= self.front(si, mi.Vector3f(0, 0, 1))
+        diffuse, specular = dr.select(active, diffuse, 0), dr.select(active, specular, 0)
+        across = [(r - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), dr.maximum(si.wi.z, MIN_COSINE)]
+        at = mi.Point2f(*(x * (1 - 1 / NODES) + 0.5 / NODES for x in across))
+        tilt, height, *shares = gloss_table(mi.variant(), self.distribution, order).eval(at)
+        toward = dr.normalize(mi.Vector3f(-tilt * si.wi.x, -tilt * si.wi.y, height))
+        specular = self.at(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
+        return [
+            (si.sh_frame.n, [diffuse * share for share in cosine_shares(order)]),
+            (si.to_world(toward), [specular * share for share in shares]),
+        ]
+
     def gloss_probability(self, ctx, si, diffuse, specular):
         """Probability of sampling the specular lobe, in proportion to the bounds of the two albedos, π ρᵈ and 4 ρᵞ.
 
@@ -179,6 +202,57 @@ class CookTorrance(mi.BSDF):
     def to_string(self):
         inner = ", ".join(f"{name}={texture}" for name, texture in self.textures.items())
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
+
+
+def cosine_shares(order):
+    """By how much a surface of B = 1 reflects each degree of spherical harmonics, up to `order`."""
+    shares = [math.pi, 2 * math.pi / 3]
+    for degree in range(2, order + 1):
+        half = degree // 2
+        central = math.comb(degree, half) / 2**degree
+        sign = (-1) ** (half - 1)
+        shares.append(0.0 if degree % 2 else 2 * math.pi * sign / ((degree + 2) * (degree - 1)) * central)
+    return shares[: order + 1]
+
+
+@functools.lru_cache(maxsize=8)
+def gloss_table(variant, distribution, order):
+    """The lobe of gloss for ρᵞ = 1, as a texture over (roughness, n·o) from (0.02, 0) to (1, 1).
+
+    Its channels: how much its mean direction leans away from the viewer, by how much the viewer leans, and how high it
+    is; and for each degree the lobe's integral with that degree's Legendre polynomial about this direction. By the
+    visible normals of `CookTorrance.sample`, a grid of them.
+    """
+    with dr.suspend_grad():
+        count = SIDE**2
+        lane = dr.arange(mi.UInt32, NODES**2 * count)
+        node, sample = lane // count, lane % count
+        r = MIN_ROUGHNESS + mi.Float(node % NODES) / (NODES - 1) * (1 - MIN_ROUGHNESS)
+        cosine = dr.clip(mi.Float(node // NODES) / (NODES - 1), MIN_COSINE, 1 - 1e-4)
+        o = mi.Vector3f(dr.sqrt(1 - cosine**2), 0, cosine)
+        lobe = mi.MicrofacetDistribution(DISTRIBUTIONS[distribution], r, True)
+        h, _ = lobe.sample(o, mi.Point2f((sample % SIDE + 0.5) / SIDE, (sample // SIDE + 0.5) / SIDE))
+        i = mi.reflect(o, h)
+        weight = dr.select(i.z > 0, 4 * lobe.G(i, o, mi.Normal3f(0, 0, 1)) / lobe.smith_g1(o, h), 0)
+        mean = [dr.block_sum(weight * part, count) for part in (i.x, i.z)]
+        length = dr.rsqrt(mean[0] ** 2 + mean[1] ** 2)
+        x, z = mean[0] * length, mean[1] * length
+        toward = mi.Vector3f(dr.gather(mi.Float, x, node), 0, dr.gather(mi.Float, z, node))
+        away = dr.gather(mi.Float, o.x, dr.arange(mi.UInt32, NODES**2) * count)
+        polynomials = legendre(dr.dot(i, toward), order)
+        channels = [-x / away, z, *(dr.block_sum(weight * p, count) / count for p in polynomials)]
+        table = dr.zeros(mi.Float, NODES**2 * len(channels))
+        for k, channel in enumerate(channels):
+            dr.scatter(table, channel, dr.arange(mi.UInt32, NODES**2) * len(channels) + k)
+        return mi.Texture2f(mi.TensorXf(table, (NODES, NODES, len(channels))), wrap_mode=dr.WrapMode.Clamp)
+
+
+def legendre(x, order):
+    """Legendre's polynomials up to a degree, by Bonnet's recursion."""
+    found = [mi.Float(1), x]
+    for n in range(1, order):
+        found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))
+    return found[: order + 1]
 
 
 mi.register_bsdf("cooktorrance", CookTorrance)

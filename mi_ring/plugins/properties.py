@@ -1,5 +1,6 @@
 """What the plugins read of their properties."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -40,13 +41,14 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
     raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is {props[name]}, must be a <{kind}>')
 
 
-def number_list(props, name: str, count: int) -> list[float]:
-    """A property of a plugin that is so many finite numbers. Raises ValueError, which names it, if it is not."""
+def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
+    """A property of a plugin that is one of so many finite numbers. Raises ValueError, which names it, if it is not."""
     text = str(props.get(name, ""))
     try:
         values = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         values = []
-    if len(values) == count and (np.abs(values) <= LARGEST).all():
+    if len(values) in counts and (np.abs(values) <= LARGEST).all():
         return values
-    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is "{text[:60]}", must be {count} numbers')
+    wanted = " or ".join(map(str, counts))
+    raise ValueError(f'{props.plugin_name()} "{props.id()}": {name} is "{text[:60]}", must be {wanted} numbers')

@@ -1,24 +1,27 @@
 """The `room` emitter: the light of the room in which photographs were taken (Mitsuba plugin)."""
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.plugins.photograph import SHUTTER, Photograph
 from mi_ring.plugins.properties import number_list
 from mi_ring.rendering.lights import FAR
-from mi_ring.rendering.rooms import COUNT, ORDER, in_camera
+from mi_ring.rendering.rooms import ORDER, in_camera
 
 
 class Room(mi.Emitter):
-    """Light from infinitely far away that varies slowly with direction, as spherical harmonics of order 2.
+    """Light from infinitely far away that varies slowly with direction, as spherical harmonics of order 4 or a lower one.
 
     Fixed in the world; or in the camera, as is the room around a turntable.
 
     ============= ======= ============================================================================= =====
     Parameter     Type    Description                                                                   Flags
     ============= ======= ============================================================================= =====
-    ``harmonics`` string  27 numbers: R, G, B of the radiance in each real harmonic, in the order of
-                          ``dr.sh_eval`` (l, m = 0, 0; 1, −1; 1, 0; … 2, 2). Exposed as an array        P, ∂
+    ``harmonics`` string  R, G, B of the radiance in each real harmonic, in the order of ``dr.sh_eval``
+                          (l, m = 0, 0; 1, −1; 1, 0; … 2, 2; …): 3, 12, 27, 48 or 75 numbers. Exposed
+                          as an array                                                                   P, ∂
     ``frame``     string  in which axes: ``world``, or ``camera``, those of the `photograph` being
                           rendered (black while another kind of sensor is). Default: ``world``
     ============= ======= ============================================================================= =====
@@ -48,7 +51,7 @@ class Room(mi.Emitter):
         self.frame = props.get("frame", "world")
         if self.frame not in ("world", "camera"):
             raise ValueError(f'room "{props.id()}": frame is "{self.frame}", must be "world" or "camera"')
-        self.harmonics = mi.Float(number_list(props, "harmonics", 3 * COUNT))
+        self.harmonics = mi.Float(number_list(props, "harmonics", [3 * (order + 1) ** 2 for order in range(ORDER + 1)]))
         self.m_flags = mi.EmitterFlags.DeltaPosition  # lest a camera sees it
 
     def sample_direction(self, it, sample, active=True):
@@ -63,7 +66,7 @@ class Room(mi.Emitter):
             active &= it.time == SHUTTER
             direction = in_camera(ds.d, Photograph.current.to_world.matrix)
         radiance = mi.Color3f(0)
-        for j, value in enumerate(dr.sh_eval(direction, ORDER)):
+        for j, value in enumerate(dr.sh_eval(direction, math.isqrt(dr.width(self.harmonics) // 3) - 1)):
             radiance += value * dr.gather(mi.Color3f, self.harmonics, j)
         return ds, dr.select(active, mi.Spectrum(radiance) * dr.four_pi, 0)
 

@@ -22,7 +22,7 @@ def boundaries(scene, photographs, edges, seed, shadows=True, window=None):
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views, before = len(photographs), photographs.before
     curves, fronts = edges.outlines(photographs.eye, views, seed, before)
-    sources = [photographs.source] if shadows and not photographs.colocated else []
+    sources = [photographs.source] if shadows and photographs.cast else []
     for source in filter(None, map(place_of, scene.emitters())):
         sources.append(lambda view, source=source: (source[0], mi.Bool(source[1])))
     for k, source in enumerate(sources, 1):

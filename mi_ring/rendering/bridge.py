@@ -240,11 +240,11 @@ def draw(
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
     if indirect or photographs.room is not None:
-        around = surroundings(surface, photographs, coverage, seed + 1, 128, paths, indirect,
-                              photographs.room is not None)  # fmt: skip
+        which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
+        around = surroundings(surface, photographs, coverage, seed + 1, 128, paths, indirect, which)
         rgb = rgb + (around.interreflection if indirect else 0)
-        if photographs.room is not None:
-            rgb = (rgb + around.room(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
+        if which:
+            rgb = (rgb + around.in_the_way(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
     return rgb.cpu(), coverage.cpu()
 
 
@@ -253,9 +253,9 @@ class Surroundings:
     """What reaches the camera from a surface by other ways than from its photograph's light at once; small pictures."""
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
-    harmonics: (
-        Tensor | None
-    )  #: (BASIS, N, h, w, 3) of a room whose radiance is one harmonic of `mi_ring.rendering.rooms`
+    which: list[int]  #: harmonics of `mi_ring.rendering.rooms`
+    harmonics: Tensor  #: (n, N, h, w, 3) of a room whose radiance is one of these harmonics
+    free: Tensor  #: the same as the large picture has it, as if nothing were in the way of the light
     alpha: Tensor  #: (N, h, w) coverage
     coverage: Tensor  #: (N, H, W) of the large picture
     factor: int  #: by which it is larger
@@ -266,9 +266,12 @@ class Surroundings:
         return self.spread(self.radiance)
 
     def room(self, harmonics: Tensor) -> Tensor:
-        """What a room adds to it, whose radiance is `harmonics` (BASIS, 3)."""
-        assert self.harmonics is not None
-        return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics, harmonics))
+        """What a room adds to a picture without one, whose radiance is `harmonics` (BASIS, 3)."""
+        return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics, harmonics[self.which]))
+
+    def in_the_way(self, harmonics: Tensor) -> Tensor:
+        """What is missing of such a room in a picture that has it: shadow, usually less than 0, and light that bounced."""
+        return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics - self.free, harmonics[self.which]))
 
     def spread(self, rgb: Tensor) -> Tensor:
         """Pictures (N, h, w, 3) of light that varies slowly over what the large picture's object covers.
@@ -287,9 +290,9 @@ class Surroundings:
 
 def surroundings(
     surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
-    spp: int | None = None, indirect: bool = True, room: bool = False,
+    spp: int | None = None, indirect: bool = True, room: Sequence[int] = (),
 ) -> Surroundings:  # fmt: skip
-    """Interreflection in pictures of the surface as last written, and if asked for what a `room` adds to them.
+    """Interreflection in pictures of the surface as last written, and what a `room` of these harmonics adds to them.
 
     Not `indirect`: of the room's light what the surface reflects but once; `interreflection` is then not to be used.
 
@@ -305,8 +308,9 @@ def surroundings(
     small = photographs.select(np.array(photographs.index), photographs.size, factor).in_units(surface.unit)
     channels = [to_torch(c) for c in render_indirect(surface.scene, small, spp, seed, bounces, room, table)]
     rgb, alpha = pictures(channels[:4], small)
-    harmonics = torch.stack(channels[4:]).reshape(-1, 3, *alpha.shape).movedim(1, -1) if room else None
-    return Surroundings(rgb, harmonics, alpha, coverage, factor)
+    empty = rgb.new_zeros(0)
+    basis = torch.stack(channels[4:]).reshape(2, -1, 3, *alpha.shape).movedim(2, -1) if room else (empty, empty)
+    return Surroundings(rgb, list(room), *basis, alpha, coverage, factor)
 
 
 def pictures(channels: list[Tensor], photographs: Photographs) -> tuple[Tensor, Tensor]:

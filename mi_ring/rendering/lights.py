@@ -118,15 +118,15 @@ def place_of(emitter):
 
 
 def parts_of(sensor):
-    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength)."""
+    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength, 0 if it has none)."""
     light = sensor.light
     kind = light.class_name()
     if kind not in ("PointLight", "DirectionalEmitter"):
         raise SceneError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
     where, finite = place_of(light)
     strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
-    if not (dr.all(dr.isfinite(strength) & (strength >= 0)) and dr.any(strength > 0)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive')
+    if not dr.all(dr.isfinite(strength) & (strength >= 0)):
+        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be 0 or more')
     if not dr.all(dr.isfinite(where)):
         raise SceneError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
     return where, finite, strength

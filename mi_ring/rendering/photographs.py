@@ -1,5 +1,6 @@
 """Cameras and lights of many photographs as Dr.Jit buffers, and the rays of their pixels."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from mi_ring.rendering.lights import Lights, cone
 from mi_ring.rendering.pinhole import camera_ray
+from mi_ring.rendering.rooms import shown
 
 LANES = 2**22  #: rays at once where memory is to be bounded: about a gigabyte
 
@@ -29,6 +31,7 @@ class Photographs:
     falloff: object = None  #: Float, one per photograph: exponent of its flash's cone; None if all shine to all sides
     distortion: object = None  #: Float, one per photograph: its lens' as `Camera` has it; None if no lens has any
     room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
+    dark: bool = False  #: have they no lights of their own, which are 0 strong?
     before: int = 0  #: how many others come before them, rendered elsewhere: random numbers are as if all were together
 
     @classmethod
@@ -46,6 +49,7 @@ class Photographs:
             mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
             dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(),
             mi.Float(falloff) if falloff.any() else None, mi.Float(bent) if bent.any() else None, room,
+            dark=not lights.rgb().any(),
         )  # fmt: skip
 
     @classmethod
@@ -123,6 +127,28 @@ class Photographs:
             given = cone(ds.d, self.camera(view)[0], dr.gather(mi.Float, self.falloff, k))
             radiance *= dr.select(finite, given, 1)
         return ds, radiance
+
+    @property
+    def cast(self) -> bool:
+        """May the photographs' own lights cast shadows that are seen?"""
+        return not (self.colocated or self.dark)
+
+    def lighting(self, view):
+        """`light` of photograph `view`, one per lane, as a function of surface interactions; None if they are `dark`."""
+        return None if self.dark else lambda si: self.light(view, si)
+
+    def around(self, scene, view):
+        """What a surface reflects of the room if nothing is in its light's way, as such a function; None if it is dark."""
+        if self.room is None or not self.room.any():
+            return None
+        return lambda si: shown(scene, self, si, view)
+
+    def irradiance(self, point: np.ndarray) -> np.ndarray:
+        """(N, 3) what lights bring to a point (3,), on a surface that faces them; a room, if they are dark, to any."""
+        own = self.lights.irradiance(point)
+        if self.dark and self.room is not None:
+            own = own + math.pi * self.room[0] / math.sqrt(4 * math.pi)
+        return own
 
     @property
     def pixels(self) -> int:

@@ -1,4 +1,6 @@
-"""The light of the room as numbers: spherical harmonics in the axes of the world and in those of the camera."""
+"""Light from far away as numbers: spherical harmonics in the axes of the world and in those of the camera."""
+
+from collections.abc import Collection, Iterable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -6,11 +8,21 @@ import numpy as np
 
 from mi_ring.rendering.shading import is_room
 
-ORDER = 2  #: of the harmonics
+ORDER = 4  #: of the harmonics, at most
 COUNT = (ORDER + 1) ** 2
 #: Of the world's harmonics and the camera's, without the camera's first: it is the world's.
 BASIS = 2 * COUNT - 1
 FRAMES = {"world": [*range(COUNT)], "camera": [0, *range(COUNT, BASIS)]}  #: which of them are in these axes
+
+
+def up_to(order: int, frames: Iterable[str]) -> list[int]:
+    """Which of the harmonics are in these axes, and of this order or a lower one."""
+    return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
+
+
+def degree(k: int) -> int:
+    """The degree l of harmonic `k`."""
+    return int((k if k < COUNT else k - COUNT + 1) ** 0.5)
 
 
 def room_of(scene) -> np.ndarray | None:
@@ -18,12 +30,8 @@ def room_of(scene) -> np.ndarray | None:
     rooms = [emitter for emitter in scene.emitters() if is_room(emitter)]
     total = np.zeros((BASIS, 3))
     for room in rooms:
-        harmonics = np.array(room.harmonics).reshape(COUNT, 3)
-        if room.frame == "camera":
-            total[0] += harmonics[0]
-            total[COUNT:] += harmonics[1:]
-        else:
-            total[:COUNT] += harmonics
+        harmonics = np.array(room.harmonics).reshape(-1, 3)
+        total[FRAMES[room.frame][: len(harmonics)]] += harmonics
     return total if rooms else None
 
 
@@ -32,11 +40,43 @@ def frames_of(scene) -> set[str]:
     return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
-def harmonics_toward(direction, to_world) -> list:
-    """The BASIS harmonics in a direction of the world, for a camera with this pose."""
-    return [*dr.sh_eval(direction, ORDER), *dr.sh_eval(in_camera(direction, to_world), ORDER)[1:]]
+def harmonics_toward(direction, to_world, which: Sequence[int]) -> list:
+    """The harmonics `which` in a direction of the world, for a camera with this pose."""
+    order = max(map(degree, which))
+    world = dr.sh_eval(direction, order) if min(which) < COUNT else []
+    camera = dr.sh_eval(in_camera(direction, to_world), order) if max(which) >= COUNT else []
+    return [world[k] if k < COUNT else camera[k - COUNT + 1] for k in which]
 
 
 def in_camera(direction, to_world):
     """A direction of the world in the axes of a camera with this pose."""
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
+
+
+def reflecting(scene) -> list:
+    """The BSDFs of a scene that know what they reflect of harmonics, each once: those that have `lobes`."""
+    found = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if hasattr(bsdf, "lobes")}
+    return list(found.values())
+
+
+def reflected(bsdfs: Collection, si, to_world, which: Sequence[int], active=True) -> list:
+    """Radiance toward the viewer by each of the harmonics `which`, if nothing is in their way: Color3f each, attached.
+
+    By the BSDFs' `lobes`: a lobe reflects each degree of the harmonics about its direction by a factor, as in "A
+    Signal-Processing Framework for Inverse Rendering" (Ramamoorthi and Hanrahan 2001). Other BSDFs reflect nothing.
+    """
+    total = [mi.Color3f(0) for _ in which]
+    for bsdf in bsdfs:
+        own = active & (si.bsdf() == mi.BSDFPtr(bsdf))
+        for direction, factors in bsdf.lobes(si, ORDER, own):
+            for n, (k, value) in enumerate(zip(which, harmonics_toward(direction, to_world, which))):
+                total[n] += value * factors[degree(k)]
+    return total
+
+
+def shown(scene, photographs, si, view, active=True):
+    """Radiance toward the viewer by the room of `photographs`, if nothing is in its way; attached to the surface."""
+    which = [int(k) for k in np.flatnonzero(photographs.room.any(1))]
+    buffer = mi.Float(photographs.room[which].astype(np.float32).ravel())
+    values = reflected(reflecting(scene), si, photographs.camera(view)[0], which, active)
+    return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))

@@ -8,10 +8,11 @@ from mi_ring.rendering.curves import leave
 MIN_COSINE = 1e-3  #: grazing cosines are clamped here: see `CookTorrance`
 
 
-def shade(scene, si, light, next_2d, shadows, rooms=False):
-    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²).
+def shade(scene, si, light, next_2d, shadows, rooms=False, around=None):
+    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²), if not None.
 
-    `rooms`: and under the scene's `room` emitters, by one sample each; `render_indirect` does so with less noise.
+    `around(si)`: radiance that is added, of light from everywhere. `rooms`: and under the scene's `room` emitters, by
+    one sample each; `render_indirect` does so with less noise.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. Black there would be an edge of its own.
@@ -25,7 +26,9 @@ def shade(scene, si, light, next_2d, shadows, rooms=False):
         value = bsdf.eval(context, si, si.to_local(ds.d), lit)
         return dr.select(lit, value * weight, 0)
 
-    radiance = reflected(*light(si), shadows)
+    radiance = reflected(*light(si), shadows) if light else mi.Color3f(0)
+    if around:
+        radiance += dr.select(active, around(si), 0)
     for emitter in lamps(scene, rooms):
         radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
@@ -72,10 +75,13 @@ def next_2d(seed, lanes, stream=None):
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph; zero where not `active`."""
-    shadows = shadows and not photographs.colocated
+    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph; zero where not `active`.
+
+    And under the light of the photographs' room as if nothing were in its way: what is, `render_indirect` knows.
+    """
+    shadows = shadows and photographs.cast
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     dr.eval(hit)  # one traversal serves the image and its gradient
     si = hit.compute_surface_interaction(ray, active=active)
-    radiance = shade(scene, si, lambda si: photographs.light(view, si), next_2d, shadows)
+    radiance = shade(scene, si, photographs.lighting(view), next_2d, shadows, around=photographs.around(scene, view))
     return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]

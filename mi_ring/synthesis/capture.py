@@ -40,7 +40,6 @@ from mi_ring.system.files import read_json, write_file, writing
 from mi_ring.system.progress import progress
 
 TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
-FAINT = 1e-6  #: of a photograph's light where an environment lights the object: a photograph must have one
 SETTINGS = "truth/settings.json"  #: by which an interrupted capture is known
 
 
@@ -190,7 +189,7 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
     """Write scene.xml, the truth's own, and, where scene.xml is wrong, what it should say: truth/exact.xml."""
     config = production.config
     out = config.out
-    strength = exposure * (1.0 if production.environment is None else FAINT)
+    strength = exposure if production.environment is None else 0.0
     extra: list[Element] = []
     if production.environment is not None:
         extra = [production.environment_element(exposure)]

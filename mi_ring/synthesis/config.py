@@ -98,7 +98,7 @@ class SynthesizeConfig:
     wrong_power: float = 0.0
     """How wrong the power of each light is said to be, standard deviation [%]."""
     wrong_room: bool = False
-    """Say nothing of --room in the scene file."""
+    """Say nothing of --room or of --environment in the scene file."""
 
     spp: int = 64
     """Paths per pixel; a square number, or the next one is taken."""
@@ -110,7 +110,7 @@ class SynthesizeConfig:
     @property
     def exact(self) -> bool:
         """Does the scene file say nothing wrong?"""
-        unknown = self.wrong_room and self.room > 0
+        unknown = self.wrong_room and bool(self.room > 0 or self.environment)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or unknown)
 
     @property

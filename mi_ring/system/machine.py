@@ -34,10 +34,15 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    # With AVX512-BF16 alone it is half as fast as float32. PyTorch and oneDNN can be told to do without what there is.
+    # PyTorch and oneDNN can be told to do without what there is.
     told = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
-    allowed = torch.backends.cpu.get_cpu_capability().startswith("AVX512") and (told == "DEFAULT" or "AMX" in told)
-    return allowed and torch.cpu._is_amx_tile_supported()
+    if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):
+        return False
+    if torch.cpu._is_amx_tile_supported():
+        return told == "DEFAULT" or "AMX" in told
+    # By AVX512-BF16 alone products are twice as fast as in float32 on AMD's (Zen 4), half as fast on Intel's.
+    amd = "AMD" in getattr(torch.cpu, "get_capabilities", dict)().get("cpu_name", "")  # from PyTorch 2.10 on
+    return amd and torch.cpu._is_avx512_bf16_supported() and (told == "DEFAULT" or "BF16" in told or "AMX" in told)
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
