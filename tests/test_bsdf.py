@@ -538,8 +538,9 @@ def test_attributes_of_a_stock_mesh_are_accepted(tetrahedron):
 @pytest.mark.parametrize("cosine", [0.97, 0.4])
 def test_lobes_reflect_harmonics_as_samples_do(distribution, roughness, cosine):
     """Of each degree the nearest that a round lobe comes: exactly for l = 0 and 1, if its direction is the mean one."""
-    bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": {"type": "rgb", "value": [0.1, 0.05, 0.2]}, "specular": 0.06,
-                         "roughness": roughness, "distribution": distribution})  # fmt: skip
+    diffuse = {"type": "rgb", "value": [0.1, 0.05, 0.2]}
+    bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": diffuse, "specular": 0.06, "roughness": roughness,
+                         "distribution": distribution})  # fmt: skip
     count, sine = 2**18, float(np.sqrt(1 - cosine**2))
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))

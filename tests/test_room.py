@@ -178,8 +178,8 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
         around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=room.which)
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
-        free = pictures(render_photographs(dark, lit_so_far, 64, 0)) - pictures(render_photographs(dark, photographs, 64, 0))
-        room.see(around, predicted + torch.from_numpy(free[..., :3]).to(predicted), observed, direct[..., 3] > 0.99)
+        free = torch.from_numpy(pictures(render_photographs(dark, lit_so_far, 64, 0))).to(direct) - direct
+        room.see(around, predicted + free[..., :3], observed, direct[..., 3] > 0.99)
     good = (direct[..., 3] == 1) & ((observed - predicted).abs() < 1).all(-1)
     missing, added = (  # in blocks of 7 × 10 pixels: single ones are noisy
         torch.nn.functional.avg_pool2d((picture * good[..., None]).movedim(-1, 1), (7, 10))

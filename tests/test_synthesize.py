@@ -121,7 +121,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     direction = mi.Vector3f(*own.reshape(-1, 3).T.astype(np.float32))
     basis = [np.array(h) + np.zeros(hit.size) for h in dr.sh_eval(direction, 2)]
     order = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4], [1, 3, 5])
-    harmonics = np.vstack([room[:1], room[COUNT:]]) if in_camera else room[:COUNT]
+    harmonics = np.vstack([room[:1], room[COUNT : COUNT + 8]]) if in_camera else room[:9]
     irradiance = (np.array(basis).T @ (order[:, None] * harmonics)).reshape(*hit.shape, 3)
     assert hit.sum() > 100
     error = (found / np.maximum(ALBEDO / np.pi * irradiance, 1e-9) - 1)[hit]  # of 256 paths: 1.5 % each

@@ -35,13 +35,6 @@ def with_calibration(
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))
 
 
-def in_the_dark(capture: Capture, harmonics: np.ndarray) -> Capture:
-    """The same photographs without lights of their own, in a room of these harmonics (BASIS, 3)."""
-    cameras = [sensor.camera for sensor in capture.sensors]
-    none = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
-    return with_calibration(capture, cameras, none, room=harmonics, falloff=np.zeros(len(cameras)))
-
-
 def moved(capture: Capture, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Capture:
     """The same photographs, with cameras and lights in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
 

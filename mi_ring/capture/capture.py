@@ -219,7 +219,7 @@ class Capture:
     @property
     def whole(self) -> bool:
         """Do masks show the whole object? Those that were found do not show what is in shadow."""
-        return self.threshold is None or self.photographs.colocated
+        return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
         """The file that photograph `k` has its mask from."""

@@ -65,9 +65,9 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     `albedo`: the object's, by the lights' intensities.
     """
     names: set[str] = set(config.refine)
-    if capture.photographs.dark:
-        names |= {"ambient"}
-        names -= {"auto"}
+    unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamp": {"light", "ambient"}}.get(config.light)
+    if unknown:  # nothing else can be told of them
+        names = (names - {"auto"}) | unknown
     if "auto" in names and not capture.known:
         untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
         names |= {*AUTO, "scale"} if untold else {*AUTO}
@@ -270,13 +270,16 @@ class Calibration(nn.Module):
         return harmonics if "ambient" in self.refined else harmonics / self.reflecting
 
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """(3,) a room's light on the object, mean over all directions, by that of the flash where it faces it."""
+        """(3,) a room's light on the object, mean over all directions, by that of the flash where it faces it.
+
+        Where there is none, its mean radiance.
+        """
         with torch.no_grad():
             now = self()
             distance2 = torch.where(self.finite, (now.places - self.center).square().sum(-1, keepdim=True), 1.0)
             mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
             own = (now.strengths / distance2).median(0).values
-            return torch.where(own > 0, mean / own, torch.inf)
+            return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
         """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""

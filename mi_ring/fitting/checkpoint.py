@@ -13,7 +13,7 @@ from mi_ring.system.files import is_sealed, relative_to, write_state
 
 NAME = "checkpoint.pt"
 BEFORE = "checkpoint.before.pt"  #: the one before it, in case that it is damaged
-FORMAT = 3  #: of checkpoints; others are refused
+FORMAT = 4  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 

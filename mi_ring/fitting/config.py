@@ -37,9 +37,10 @@ class Config:
     """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
     if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,
     which finds them in a dark room, too; --weights.mask 0 does without any."""
-    light: Literal["capture", "environment", "turntable"] = "capture"
-    """What lights the object. capture: the lights that the scene says; environment: light from everywhere, unknown,
-    fixed in the world; turntable: the same, fixed in the camera."""
+    light: Literal["capture", "environment", "turntable", "lamp", "auto"] = "capture"
+    """What lights the object. capture: the lights that the scene says. Else they are unknown: environment: light from
+    everywhere, fixed in the world; turntable: the same, fixed in the camera; lamp: one lamp, fixed in the world; auto:
+    what explains the photographs best in coarse fits."""
     seed: int = 0
     """Random seed."""
     iterations: int = 360

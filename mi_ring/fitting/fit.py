@@ -21,7 +21,7 @@ from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.light import frames, lit
+from mi_ring.fitting.lighting import Lighting, frames, lighting_of, lit
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
@@ -81,7 +81,10 @@ class Fit:
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
         if not capture.images:
             raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
-        capture = self.capture = lit(capture, self.config)
+        #: What lights the photographs; `capture` is under these lights.
+        self.lighting = Lighting(*state["lighting"]) if state else lighting_of(capture, self.config, Fit)
+        capture = self.capture = lit(capture, self.lighting)
+        chosen = replace(self.config, light=self.lighting.kind)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
@@ -97,7 +100,7 @@ class Fit:
         self.fitted = np.setdiff1d(np.arange(len(capture)), self.held_out)  #: all other photographs
         seen = capture.part(self.fitted) if len(self.held_out) else capture
         self.exposure = seen.exposure()
-        self.ring = ring_of(state["ring"]) if state else starting_ring(seen, self.config, self.exposure, networks)
+        self.ring = ring_of(state["ring"]) if state else starting_ring(seen, chosen, self.exposure, networks)
         regularised = self.terms.get("velocity") is default_terms["velocity"] and self.config.weights["velocity"]
         if regularised and not hasattr(self.ring.shape_net, "velocity"):
             raise InputError(f"networks: {type(self.ring.shape_net).__name__}: has no velocity, which the term of that "
@@ -111,10 +114,10 @@ class Fit:
         self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
         self.calibration: Calibration | None = None
         self.lookers: list[Looker] = []  #: optimisers that see iterations
-        if refined := refined_of(seen, self.config, self.albedo):
+        if refined := refined_of(seen, chosen, self.albedo):
             power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
             self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
-                                           frames(capture, self.config))  # fmt: skip
+                                           frames(capture, self.lighting))  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
@@ -324,6 +327,7 @@ class Fit:
             "averages": self.averages.pictures,
             "confirmed": self.confirmed,
             "outlines": self.outlines,
+            "lighting": tuple(self.lighting),
         }
         return copy.deepcopy(state)  # which the next iteration would change
 

@@ -73,6 +73,8 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
     if "ambient" in calibration.refined:
         what = "light of the room on the object, as shares of the flash's: red, green, blue"
+        if fit.capture.photographs.dark:
+            what = "mean radiance of the environment: red, green, blue"
         unknowns["ambient"] = {"what": what, "before": given, "after": share, "harmonics": room.harmonics.tolist()}
 
     center, radius = fit.ring.center.cpu().numpy(), float(fit.ring.radius)

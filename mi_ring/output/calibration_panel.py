@@ -7,7 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mi_ring.capture.capture import Capture
+from mi_ring.images import linear_to_srgb
 from mi_ring.output.figures import svg_uri
+from mi_ring.rendering.rooms import seen_from_within
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 LISTED = 6  #: unknowns of one kind that are listed one by one
@@ -79,7 +81,8 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     """Cameras and lights from above, and how far each photograph's picture or power has moved."""
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
-    told = max(moved) > 0 or len(power)  # else nothing of single photographs is
+    light = after.photographs.room if after.photographs.dark else None
+    told = max(moved) > 0 or len(power) or light is not None  # else nothing of single photographs is
     figure = Figure(figsize=(9 if told else 4.5, 3.4), layout="constrained")
     plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]
     up = before.up
@@ -91,6 +94,12 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     plan.set_aspect("equal", "datalim")
     plan.set_title("cameras and lights (•) from above [scene units]", fontsize=9)
     for bars in others:
+        if light is not None:
+            radiance = seen_from_within(light, np.eye(4)).clip(min=0)
+            bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
+            bars.axis("off")
+            bars.set_title("the environment, by longitude and latitude, y up", fontsize=9)
+            continue
         if max(moved) > 0:
             bars.bar(range(len(moved)), moved, color=AFTER)
             bars.set_ylabel("pixels")

@@ -17,6 +17,7 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
+from mi_ring.rendering.rooms import seen_from_within
 from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
@@ -135,6 +136,9 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     if fit.outlines:
         scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
+    if capture.photographs.dark and capture.photographs.room is not None:  # it is all the light there is
+        radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
+        write_image(radiance.astype(np.float32), folder / "environment.exr")
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)

@@ -12,7 +12,7 @@ from mi_ring.rendering.rooms import ORDER, in_camera
 
 
 class Room(mi.Emitter):
-    """Light from infinitely far away that varies slowly with direction, as spherical harmonics of order 4 or a lower one.
+    """Light from infinitely far away that varies slowly with direction, as spherical harmonics of order 4 at most.
 
     Fixed in the world; or in the camera, as is the room around a turntable.
 

@@ -270,7 +270,7 @@ class Surroundings:
         return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics, harmonics[self.which]))
 
     def in_the_way(self, harmonics: Tensor) -> Tensor:
-        """What is missing of such a room in a picture that has it: shadow, usually less than 0, and light that bounced."""
+        """What a picture with such a room lacks: shadow, which is less than 0, and light that bounced."""
         return self.spread(torch.einsum("jnhwc,jc->nhwc", self.harmonics - self.free, harmonics[self.which]))
 
     def spread(self, rgb: Tensor) -> Tensor:

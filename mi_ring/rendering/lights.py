@@ -118,7 +118,10 @@ def place_of(emitter):
 
 
 def parts_of(sensor):
-    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength, 0 if it has none)."""
+    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength).
+
+    Of one that has none the strength is 0.
+    """
     light = sensor.light
     kind = light.class_name()
     if kind not in ("PointLight", "DirectionalEmitter"):

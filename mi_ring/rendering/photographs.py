@@ -134,11 +134,11 @@ class Photographs:
         return not (self.colocated or self.dark)
 
     def lighting(self, view):
-        """`light` of photograph `view`, one per lane, as a function of surface interactions; None if they are `dark`."""
+        """`light` of photograph `view`, one per lane, as a function of surface interactions; None if `dark`."""
         return None if self.dark else lambda si: self.light(view, si)
 
     def around(self, scene, view):
-        """What a surface reflects of the room if nothing is in its light's way, as such a function; None if it is dark."""
+        """What a surface reflects of the room if nothing is in the way, as such a function; None if there is none."""
         if self.room is None or not self.room.any():
             return None
         return lambda si: shown(scene, self, si, view)

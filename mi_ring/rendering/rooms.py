@@ -12,6 +12,7 @@ ORDER = 4  #: of the harmonics, at most
 COUNT = (ORDER + 1) ** 2
 #: Of the world's harmonics and the camera's, without the camera's first: it is the world's.
 BASIS = 2 * COUNT - 1
+ROWS = 128  #: of a picture of a room by latitude and longitude
 FRAMES = {"world": [*range(COUNT)], "camera": [0, *range(COUNT, BASIS)]}  #: which of them are in these axes
 
 
@@ -80,3 +81,18 @@ def shown(scene, photographs, si, view, active=True):
     buffer = mi.Float(photographs.room[which].astype(np.float32).ravel())
     values = reflected(reflecting(scene), si, photographs.camera(view)[0], which, active)
     return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))
+
+
+def seen_from_within(room: np.ndarray, to_world: np.ndarray, rows: int = ROWS) -> np.ndarray:
+    """Radiance (rows, 2 rows, 3) of a room (BASIS, 3) as Mitsuba's `envmap` has it, y up, for a camera with this pose.
+
+    A sum of few harmonics may be less than zero, and is so here.
+    """
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
+    # Mitsuba's: y up, and -z in the middle of the picture's borders
+    direction = mi.Vector3f(*(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)))
+    which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(theta), 3))
+    for k, harmonic in zip(which, harmonics_toward(direction, mi.Matrix4f(to_world), which)):
+        values += np.asarray(dr.detach(harmonic) + dr.zeros(mi.Float, len(theta)))[:, None] * room[k]
+    return values.reshape(rows, 2 * rows, 3)

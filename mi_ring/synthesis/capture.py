@@ -87,7 +87,9 @@ class Production:
                       config.table != "none")  # fmt: skip
         focal, size = config.size[0] / 2 / np.tan(np.radians(config.fov / 2)), config.size
         cameras = [Camera(to_world, np.full(2, focal), np.array(size) / 2, size) for to_world in place]
-        lights = lamps.lights_of(config.light, cameras, config.offset, config.spread, self.random(3, novel))
+        lights = lamps.lights_of(
+            config.light, cameras, config.offset, config.spread, self.random(3, novel and config.light != "lamp")
+        )
         return [View(camera, light, f"{k:03}", config.seed * 40_009 + 2 * (k + novel * 10_007))
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 

@@ -63,7 +63,8 @@ class SynthesizeConfig:
     """From the cameras to the middle of the object, in its radii. Default: so that it just fills the photograph."""
 
     light: LightKind = "flash"
-    """flash: a point light at the lens; point: anywhere as far away; distant: parallel light."""
+    """flash: a point light at the lens; point: anywhere as far away; distant: parallel light; lamp: a point light
+    that is in one place for all photographs."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the flash from the lens: left, up and forward, by the distance from the camera to the object."""
     spread: float = 40.0

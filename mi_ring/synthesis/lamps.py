@@ -2,18 +2,17 @@
 
 from typing import Literal
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera
 from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS, COUNT, harmonics_toward
+from mi_ring.rendering.rooms import BASIS, COUNT, seen_from_within
 
-LightKind = Literal["flash", "point", "distant"]
+LightKind = Literal["flash", "point", "distant", "lamp"]
 RoomKind = Literal["constant", "harmonics"]
 
-ROWS = 128  #: of the picture of a room, in which its harmonics are drawn
+SLOW = 9  #: harmonics of a room that are not 0, those of order 2
 TINT, WAVES = 0.12, 0.5  #: of the light of a room: how colours differ, and brightness with direction, about 1
 DARKEST = 0.15  #: radiance of a room in its darkest direction, by its mean
 
@@ -26,9 +25,14 @@ def lights_of(
 
     Every point light has the same intensity. `offset`: of a flash from the lens, left, up and forward, by the distance
     from the camera to the origin; `spread`: how far others are from the camera at most, seen from the origin [degrees].
+    A lamp is in one place for all, about as far away as cameras are.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
+    elif kind == "lamp":
+        away = random.normal(size=3)
+        distance = np.median([np.linalg.norm(camera.position) for camera in cameras])
+        places = [distance * away / np.linalg.norm(away)] * len(cameras)
     else:
         places = [strayed(camera.position, np.radians(spread), random) for camera in cameras]
     if kind == "distant":
@@ -52,30 +56,18 @@ def room_of(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.
 
     `in_camera`: it stands still with the camera beside a turntable, not with the object.
     """
-    harmonics = np.zeros((COUNT, 3))
+    harmonics = np.zeros((SLOW, 3))
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     harmonics[0] = colour * np.sqrt(4 * np.pi)  # times the first harmonic, which is 1 / sqrt(4 pi)
     if kind == "harmonics":
-        waves = random.normal(0, WAVES, (COUNT - 1, 1)) * colour
+        waves = random.normal(0, WAVES, (SLOW - 1, 1)) * colour
         darkest = (seen_from_within(np.vstack([0 * waves[:1], waves]), np.eye(4)) / colour).min()
         harmonics[1:] = waves * min(1.0, (1 - DARKEST) / -darkest)
     room = np.zeros((BASIS, 3))
-    room[:COUNT] = harmonics
-    if in_camera:
-        room[COUNT:], room[1:COUNT] = harmonics[1:], 0
+    room[0] = harmonics[0]
+    first = COUNT if in_camera else 1
+    room[first : first + SLOW - 1] = harmonics[1:]
     return room
-
-
-def seen_from_within(room: np.ndarray, to_world: np.ndarray, rows: int = ROWS) -> np.ndarray:
-    """Radiance (rows, 2 rows, 3) of harmonics (COUNT or BASIS, 3) as `envmap` has it, for a camera with this pose."""
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
-    theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
-    # Mitsuba's: y up, and -z in the middle of the picture's borders
-    direction = mi.Vector3f(*(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)))
-    values = np.zeros((len(theta), 3))
-    for row, harmonic in zip(room, harmonics_toward(direction, mi.Matrix4f(to_world))):
-        values += np.asarray(dr.detach(harmonic) + dr.zeros(mi.Float, len(theta)))[:, None] * row
-    return values.reshape(rows, 2 * rows, 3)
 
 
 def environment_of(radiance: np.ndarray) -> mi.Emitter:
