@@ -14,6 +14,7 @@ import trimesh
 
 from mi_ring.rendering import bridge, photographs
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.rooms import BASIS
 from mi_ring.ring.ring import Ring
 from mi_ring.system import machine
 
@@ -36,14 +37,15 @@ class Setting:
     `unit` scales the world: lengths by `unit`, intensities by its square, so that the pictures stay the same.
     """
 
-    def __init__(self, lights, shadows, wall=False, unit=1.0):
+    def __init__(self, lights, shadows, wall=False, unit=1.0, room=False):
         self.shadows, self.unit = shadows, unit
         sensors = {f"sensor{k}": self.photograph(k, light) for k, light in enumerate(lights)}
         ball = {"type": "shapenet", "id": "ball", "subdivisions": 3, "bsdf": {"type": "cooktorrance"}}
         self.scene = mi.load_dict({"type": "scene", "ball": ball, **({"wall": WALL} if wall else {}), **sensors})
         shape = next(s for s in self.scene.shapes() if s.id() == "ball")
         self.surface = bridge.Surface(self.scene, shape)
-        self.photographs = Photographs.of(self.scene.sensors())
+        harmonics = np.random.default_rng(9).normal(0, 0.4, (BASIS, 3)) if room else None
+        self.photographs = Photographs.of(self.scene.sensors(), harmonics)
         ico = trimesh.creation.icosphere(subdivisions=3)
         self.s, self.faces = ico.vertices, ico.faces
         self.surface.set_faces(self.faces)
@@ -96,6 +98,7 @@ SETTINGS = {
     "light off the camera, wall behind": {"lights": OFF_CAMERA, "shadows": False, "wall": True},
     "shadows on the wall and on itself": {"lights": OFF_CAMERA, "shadows": True, "wall": True},
     "flash at the camera, wall behind": {"lights": [None, None], "shadows": True, "wall": True},
+    "in a room, as if nothing were in the way of its light": {"lights": OFF_CAMERA, "shadows": False, "room": True},
 }
 
 

@@ -1,0 +1,134 @@
+"""Unknown light: what a fit takes it to be, finds, and writes."""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import AXES, CENTER
+
+import mi_ring
+from mi_ring import synthesize
+from mi_ring.errors import InputError
+from mi_ring.fitting import lighting
+from mi_ring.fitting.lighting import Lighting, brightest, frames, lit
+from mi_ring.images import read_image, write_image
+from mi_ring.rendering.rooms import BASIS, seen_from_within
+from mi_ring.rendering.shading import is_room
+
+TINY = {"levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3}
+TOWARD = np.array([0.48, 0.6, -0.64])  #: the brightest direction of `lobe`, a unit vector
+
+
+def lobe(path):
+    """An environment, brightest in one direction: 1 + 2 max(0, cos)."""
+    rows = 32
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    polar, azimuth = np.pi * v, 2 * np.pi * u
+    away = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)], -1)
+    write_image((1 + 2 * np.maximum(away @ TOWARD, 0))[..., None].repeat(3, -1).astype(np.float32), path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def short_trials(monkeypatch):
+    monkeypatch.setattr(lighting, "COARSE", lighting.COARSE | {"iterations": 16, "batch": 4})
+
+
+@pytest.fixture(scope="module")
+def in_an_environment(tmp_path_factory):
+    """Path of a scene of an ellipsoid in `lobe`, of which the scene says nothing."""
+    folder = tmp_path_factory.mktemp("environment")
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball.vertices = ball.vertices * AXES
+    ball.export(folder / "ball.ply")
+    small = ["--views", "10", "--novel", "0", "--size", "40", "32", "--spp", "16"]
+    light = ["--environment", str(lobe(folder / "lobe.exr")), "--wrong-room"]
+    out = folder / "capture"
+    synthesize.main([str(folder / "ball.ply"), str(out), *small, *light, "--material", "diffuse reflectance=0.5"])
+    return out / "scene.xml"
+
+
+def test_an_environment_is_found_and_written(in_an_environment, tmp_path):
+    """Where it is brightest, and as if the albedo were a half; beside the scene, and as its only light."""
+    capture = mi_ring.load_capture(in_an_environment)
+    assert capture.photographs.dark
+    with pytest.raises(InputError, match="nothing lights the object; give lights, or --light auto"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY))
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
+    losses = [it.terms["rgb"] for it in fit]
+    assert np.mean(losses[-5:]) < 0.3 * losses[0]
+    fit.save(tmp_path)
+    seen = read_image(tmp_path / "environment.exr").astype(float).mean(-1)
+    rows, columns = seen.shape
+    i, j = np.unravel_index(seen.argmax(), seen.shape)
+    polar, azimuth = np.pi * (i + 0.5) / rows, 2 * np.pi * (j + 0.5) / columns
+    found = np.array([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)])
+    assert np.degrees(np.arccos(found @ TOWARD)) < 15
+    again = mi_ring.load_capture(tmp_path / "scene.xml")
+    assert again.photographs.dark and sum(map(is_room, again.scene.emitters())) == 1
+    np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
+    albedo = np.pi * fit.ring.material(fit.ring.domain.sample(3)[0])["diffuse"].mean().item()
+    assert 0.3 < albedo < 0.8
+
+
+def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
+    capture = mi_ring.load_capture(in_an_environment)
+    config = mi_ring.Config.preset("fast", **TINY, light="environment")
+    fit = mi_ring.Fit(capture, config)
+    fit.step(), fit.step()
+    resumed = mi_ring.Fit(capture, config, state=fit.state())
+    assert resumed.lighting == fit.lighting
+    torch.testing.assert_close(resumed.calibration.room.harmonics, fit.calibration.room.harmonics)
+    assert resumed.step().loss == pytest.approx(fit.step().loss, rel=1e-4)
+
+
+def test_a_lamp_begins_where_the_environment_is_brightest():
+    """Harmonics of light from a single direction are their values there."""
+    import drjit as dr
+
+    harmonics = np.array([np.ravel(value)[0] for value in dr.sh_eval(mi.Vector3f(*TOWARD.tolist()), 1)])
+    sensors = [
+        SimpleNamespace(camera=SimpleNamespace(position=CENTER + p)) for p in ([0, 3, 4], [0, 0, 5.0], [6, 8, 0.0])
+    ]
+    room = torch.zeros(BASIS, 3)
+    room[:4] = torch.from_numpy(harmonics).float()[:, None] * torch.tensor([1.0, 0.5, 0.2])
+    fit = SimpleNamespace(ring=SimpleNamespace(center=torch.from_numpy(CENTER)), capture=SimpleNamespace(sensors=sensors),
+                          calibration=SimpleNamespace(room=SimpleNamespace(harmonics=room)))  # fmt: skip
+    np.testing.assert_allclose(brightest(fit), CENTER + 5 * TOWARD, atol=1e-5)
+
+
+def test_a_lamp_is_one_for_all_and_as_strong_as_makes_the_albedo_a_half(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    place = np.array([3.1, -4.2, 12.0])
+    lamp = lit(capture, Lighting("lamp", tuple(place.tolist())))
+    lights = lamp.photographs.lights
+    np.testing.assert_allclose(lights.positions(), np.broadcast_to(place, (12, 3)), rtol=1e-6)
+    assert np.pi * lamp.reflectance(capture.sphere()[0], capture.exposure()) == pytest.approx(0.5, rel=1e-5)
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamp"))
+    assert fit.calibration.refined == ("light", "ambient")
+    assert len(fit.calibration.light) == 1  # one place for all photographs
+
+
+def test_axes_are_those_of_the_light(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    assert list(frames(capture, Lighting("environment"))) == ["world"]
+    assert list(frames(capture, Lighting("turntable"))) == ["camera"]
+
+
+def test_a_flash_capture_is_found_to_be_one(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="auto"))
+    assert fit.lighting == Lighting("capture")
+
+
+def test_a_map_shows_the_radiance_of_harmonics():
+    """Of l = 0 the same everywhere; of l = 1 the cosine to an axis."""
+    room = np.zeros((BASIS, 3))
+    room[0], room[2] = np.sqrt(4 * np.pi) * np.array([1, 2, 3]), np.sqrt(4 * np.pi / 3)  # 1, 2, 3 and z
+    seen = seen_from_within(room, np.eye(4), 16)
+    v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
+    z = -np.sin(np.pi * v) * np.cos(2 * np.pi * u)
+    np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)
