@@ -43,8 +43,8 @@ class ExportConfig(MaterialOptions):
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write; OBJ and XML bring others of the same name along."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices, up to 10 for .ply, 8 for others. Default: that of the fit; for .glb
-    5, it has a normal map."""
+    """Level of the mesh: about 10 · 4^level vertices, up to 10 for .ply, 8 for others. Default: that of the fit; for
+    .glb 5, it has a normal map."""
     resolution: int = 2048
     """Texels across the textures."""
     time: float = 1.0
