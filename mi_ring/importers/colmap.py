@@ -67,7 +67,8 @@ class Colmap(Photogrammetry):
                 path = self.photograph(photograph, str(model))
             if path is None:
                 continue
-            pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
+            turn, shift = np.split(image.cam_from_world().matrix(), [3], axis=1)
+            pose = np.vstack([np.hstack([turn.T, -turn.T @ shift]), [0, 0, 0, 1]])
             name = Path(splitext(photograph)[0]).as_posix().replace("/", "_")
             own = reconstruction.cameras[image.camera_id]
             lens = Lens(own.model_name, (own.width, own.height), own.params)
