@@ -51,7 +51,7 @@ def run(command: list[str], job: Job) -> tuple[int, str]:
         output.flush()
         begun = output.tell()
         place = job.place if job.place.is_dir() else None  # a worker of a cluster is elsewhere, or has no such folder
-        streams = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
         status = subprocess.call(command, cwd=place, **streams, **dying())
     with job.output.open("rb") as output:
         output.seek(begun)

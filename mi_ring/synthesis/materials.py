@@ -104,6 +104,8 @@ def plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
         name, *words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{field}: is {text!r} ({error}); give {FORMS}") from error
+    if name in ("bitmap", "blendbsdf"):  # without what has no place here Mitsuba crashes of them
+        raise InputError(f"{field}: {text}: has parts that are no numbers and colours; give {FORMS}")
     result: dict[str, Any] = {"type": name}
     for word in words:
         key, sign, value = word.partition("=")
