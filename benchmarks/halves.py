@@ -35,11 +35,14 @@ def half(scene: Path, which: int, path: Path) -> None:
 
 
 def fitted(scene: Path, out: Path, options: list[str]) -> dict:
-    """What a fit has refined; it is not made again if there is one."""
-    if not (out / "report.html").exists():
+    """What a fit has refined; it is not made again if there is one by these options."""
+    note = out.with_suffix(".txt")
+    if not (out / "report.html").exists() or not note.exists() or note.read_text() != " ".join(options):
+        note.unlink(missing_ok=True)
         command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]
         if status := subprocess.run(command, stdout=sys.stderr).returncode:
             sys.exit(status)  # it has said why
+        note.write_text(" ".join(options))
     return json.loads((out / "calibration.json").read_text())
 
 

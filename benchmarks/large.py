@@ -1,14 +1,19 @@
-"""Open and fit a capture of very many large photographs, and print what it costs in time and memory.
+"""Open, check and fit a capture of very many photographs, or export a very fine mesh: what it costs in time and memory.
 
     python benchmarks/large.py CAPTURE.xml [--count 2000] [--size 3464] [--out out/large]
+    python benchmarks/large.py RUN [--level 9] [--out out/large]
 
-The photographs are those of the capture, enlarged and written as JPEG, the same few again and again under other names.
+The photographs are those of the capture, in another size and written as JPEG, the same few again and again under other
+names. RUN is the results folder of a fit, whose surface and material are written as PLY. Linux.
 """
 
 import argparse
+import contextlib
 import copy
 import datetime
+import io
 import os
+import re
 import resource
 import time
 from pathlib import Path
@@ -19,6 +24,7 @@ import numpy as np
 from accuracy import processor
 
 import mi_ring
+from mi_ring import check, export
 from mi_ring.fitting.config import Config
 from mi_ring.images import linear_to_srgb, read_image, to_bytes
 
@@ -67,31 +73,63 @@ def write(path: Path, count: int, size: int, out: Path) -> Path:
     return out / "scene.xml"
 
 
+class Costs:
+    """Rows of a table: what took how long since the one before, and the most memory until then."""
+
+    def __init__(self) -> None:
+        print("| | wall, s | processor, s | GiB at most |\n|---|---|---|---|", flush=True)
+        self.before = time.perf_counter(), time.process_time()
+
+    def row(self, what: str) -> None:
+        """Print one."""
+        now, memory = (time.perf_counter(), time.process_time()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        wall, busy = (after - before for after, before in zip(now, self.before))
+        print(f"| {what} | {wall:.1f} | {busy:.1f} | {memory / 2**20:.1f} |", flush=True)
+        self.before = now
+
+
+def measure_fit(scene: Path, costs: Costs) -> None:
+    """Open, check and fit it."""
+    capture = mi_ring.load_capture(scene)
+    costs.row("opened")
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        status = check.main([str(scene), "--out", str(scene.with_name("check.png"))])
+    costs.row(f"`mi-ring check`, {len(said.getvalue().splitlines())} lines, status {status}")
+    fit = mi_ring.Fit(capture, Config.preset("fast", refine=("none",)))
+    costs.row("hull, brightness")
+    for _ in range(STEPS):
+        fit.step()
+    costs.row(f"{STEPS} iterations")
+
+
+def measure_export(run: Path, level: int, out: Path, costs: Costs) -> None:
+    """Write a fine mesh."""
+    path = out / f"level{level}.ply"
+    export.main([str(run), str(path), "--subdivisions", str(level)])
+    with path.open("rb") as file:
+        vertices, faces = (int(n) for n in re.findall(rb"element \w+ (\d+)", file.read(4096)))
+    costs.row(f"{vertices:,} vertices, {faces:,} triangles, {path.stat().st_size / 2**20:,.0f} MiB")
+    path.unlink()
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
+    parser.add_argument("source", type=Path, metavar="CAPTURE.xml|RUN")
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--size", type=int, default=3464)
+    parser.add_argument("--level", type=int, default=9)
     parser.add_argument("--out", type=Path, default=Path("out/large"))
     options = parser.parse_args()
-    scene = write(options.capture, options.count, options.size, options.out)
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.source.is_dir():
+        print(f"{processor()}; {datetime.date.today()}; level {options.level}\n")
+        measure_export(options.source, options.level, options.out, Costs())
+        return
+    scene = write(options.source, options.count, options.size, options.out)
     print(f"{processor()}; {datetime.date.today()}; {options.count} photographs, {options.size} pixels wide\n")
-    print("| | wall, s | processor, s | GiB at most |\n|---|---|---|---|", flush=True)
-    wall, busy = time.perf_counter(), time.process_time()
-
-    def row(what: str) -> None:
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(f"| {what} | {time.perf_counter() - wall:.1f} | {time.process_time() - busy:.1f} | {memory:.1f} |",
-              flush=True)  # fmt: skip
-
-    capture = mi_ring.load_capture(scene)
-    row("opened")
-    fit = mi_ring.Fit(capture, Config.preset("fast", refine=("none",)))
-    row("hull, brightness")
-    for _ in range(STEPS):
-        fit.step()
-    row(f"{STEPS} iterations")
+    measure_fit(scene, Costs())
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
     python benchmarks/stress.py [SCENE.xml] [--kills 100] [--seed 0] [-- OPTIONS OF FIT]
 
 A deterministic fit runs once undisturbed. Then it is begun anew and killed (SIGKILL) at N random moments, resumed after
-each; moments are spread over the time that the undisturbed one took, start, checkpoints, results and report included.
+each; moments are spread over the processor time that the undisturbed one took, start, checkpoints, results and report
+included, so that it matters little what else the machine has to do. It needs psutil.
 After each kill all result files must be readable: those that are there, whole. At the end all of them must be
 bit for bit those of the undisturbed fit, but for what says how long it took or where it was (in log, report, config and
 checkpoint, of which the rest is compared) and for the checkpoint before the last, which is of any moment.
@@ -13,8 +14,10 @@ Options of a quick trial: -- --iterations 6 --levels 2 --widths 32 --shares 1 --
 import argparse
 import datetime
 import json
+import math
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -26,6 +29,7 @@ from pathlib import Path
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 
 # isort: split
+import psutil
 import torch
 import trimesh
 from accuracy import processor
@@ -91,6 +95,14 @@ def content(path: Path) -> object:
     return path.read_bytes()
 
 
+def busy(process: subprocess.Popen) -> float:
+    """Seconds of processor that it has taken, threads included; infinite when it has ended."""
+    try:
+        return sum(psutil.Process(process.pid).cpu_times()[:2]) if process.poll() is None else math.inf
+    except psutil.NoSuchProcess:
+        return math.inf
+
+
 def iteration(folder: Path) -> int:
     """Of the checkpoint that is there; -1 if there is none."""
     try:
@@ -117,31 +129,32 @@ def main() -> None:
         name: [sys.executable, "-m", "mi_ring.fit", own.scene, "--out", folder, "--deterministic", *options]
         for name, folder in folders.items()
     }
-    note = place / "seconds.txt"
+    note, complaints = place / "seconds.txt", place / "complaints.txt"
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     if not note.is_file():
-        start, silent = time.monotonic(), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         subprocess.run(list(map(str, commands["whole"])), check=True, **silent)
-        note.write_text(f"{time.monotonic() - start:.1f}")
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        note.write_text(f"{used.ru_utime + used.ru_stime:.1f}")
     took = float(note.read_text())
     print(f"{processor()}; {datetime.date.today()}; {' '.join(options)}\n", flush=True)
-    print(f"Undisturbed: {took:.0f} s\n\n| kill | after, s | iteration | files that were there |\n|---|---|---|---|")
+    print(f"Undisturbed: {took:.0f} s of processor\n\n| kill | after, s | iteration | files that were there |")
+    print("|---|---|---|---|", flush=True)
     folder, kills, finished = folders["killed"], 0, 0
     while True:
         resume = ["--resume"] * any(folder.glob("checkpoint*.pt"))
-        process = subprocess.Popen(list(map(str, [*commands["killed"], *resume])), stdout=subprocess.DEVNULL,
-                                   stderr=subprocess.PIPE, text=True)  # fmt: skip
-        moment = chance.uniform(0, took) if kills < own.kills else None
-        try:
-            _, complaint = process.communicate(timeout=moment)
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.communicate()
+        with complaints.open("w") as said:
+            process = subprocess.Popen(list(map(str, [*commands["killed"], *resume])), **silent | {"stderr": said})
+        moment = chance.uniform(0, took) if kills < own.kills else math.inf
+        while process.poll() is None and busy(process) < moment:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)  # nothing, if it has ended
+        if process.wait() == -signal.SIGKILL:
             kills += 1
             files = readable(folder) if folder.is_dir() else []
             print(f"| {kills} | {moment:.1f} | {iteration(folder)} | {', '.join(files)} |", flush=True)
             continue
         if process.returncode:
-            sys.exit(f"status {process.returncode} after {kills} kills: {complaint[-500:]}")
+            sys.exit(f"status {process.returncode} after {kills} kills: {complaints.read_text()[-500:]}")
         if kills >= own.kills:
             break
         finished += 1  # too few kills yet: once more from the start

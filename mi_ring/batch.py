@@ -1,6 +1,6 @@
 """Reconstruct many objects, on one machine or many: `python -m mi_ring.batch SCENES… --workers N -- FIT OPTIONS`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 from mi_ring.collection.cluster import Resources, fit_all
 from mi_ring.collection.jobs import Job, jobs_of
 from mi_ring.errors import InputError
+from mi_ring.fit_config import parse_options
 from mi_ring.output.index import Entry, write_index
 from mi_ring.system import command
 from mi_ring.system.files import locked
@@ -70,9 +71,10 @@ def main(arguments: Sequence[str]) -> int:
     if wrong := [option for option in options if option.split("=")[0] in OWN]:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
     jobs = jobs_of(config.scenes, config.out, options)
+    parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
     with locked(config.out / "batch"):
         prints = {job: job.fingerprint() for job in progress(jobs, "comparing", unit="scene")}
-        todo = [job for job in jobs if not job.is_done(prints[job])]
+        todo = {job: own for job, own in prints.items() if not job.is_done(own)}
         for job in jobs:
             state = "waiting" if job in todo else "done"
             job.note(replace(job.record, state=state, message="", tries=0))
@@ -84,7 +86,7 @@ def main(arguments: Sequence[str]) -> int:
         return finish(jobs, config.out)
 
 
-def follow(todo: Sequence[Job], jobs: Sequence[Job], config: BatchConfig) -> None:
+def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
     """Fit them, and say what goes on."""
     before = {job.name: "waiting" for job in todo}
     with progress(None, "fits", total=len(todo), leave=True) as bar:
@@ -111,7 +113,7 @@ def show(jobs: Sequence[Job], out: Path, running: bool) -> None:
     for job in jobs:
         record = job.record
         text = record.message or (job.progress if record.state == "running" else "")
-        entries.append(Entry(job.name, record.state, text, job.folder))
+        entries.append(Entry(job.name, record.state, text, job.folder, job.output))
     write_index(out, entries, running)
 
 

@@ -24,6 +24,7 @@ from mi_ring.system.files import require_place, write_file
 
 KINDS = (".ply", ".obj", ".glb", ".xml")
 GLB_LEVEL = 5  #: of its mesh; the normal map has what is finer
+FINEST, FINEST_PLY = 8, 10  #: level of a mesh with textures, and of one that has none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,8 @@ class ExportConfig(MaterialOptions):
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write; OBJ and XML bring others of the same name along."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices. Default: that of the fit; for .glb 5, it has a normal map."""
+    """Level of the mesh: about 10 · 4^level vertices, up to 10 for .ply, 8 for others. Default: that of the fit; for
+    .glb 5, it has a normal map."""
     resolution: int = 2048
     """Texels across the textures."""
     time: float = 1.0
@@ -56,8 +58,12 @@ def require_options(config: ExportConfig) -> None:
     """Raise InputError for options out of range, and for a file that cannot be written."""
     if config.file.suffix.lower() not in KINDS:
         raise InputError(f"{config.file}: must end in {', '.join(KINDS)}")
-    if config.subdivisions is not None and not 0 <= config.subdivisions <= 8:
-        raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
+    finest = FINEST_PLY if config.file.suffix.lower() == ".ply" else FINEST
+    if config.subdivisions is not None and not 0 <= config.subdivisions <= finest:
+        raise InputError(
+            f"--subdivisions: is {config.subdivisions}, must be 0 to {finest}"
+            + f"; textures have what is finer, and .ply takes up to {FINEST_PLY}" * (finest == FINEST)
+        )
     if not 64 <= config.resolution <= 4096:
         raise InputError(f"--resolution: is {config.resolution}, must be 64 to 4096")
     if not 0 <= config.time <= 1:

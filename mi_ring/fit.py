@@ -1,25 +1,20 @@
 """Reconstruct an object from its photographs: `python -m mi_ring.fit SCENE.xml`."""
 
-import argparse
 import contextlib
 import dataclasses
 import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import tyro
-from tyro.conf import Positional, arg
+from typing import Any
 
 from mi_ring.capture.loading import load_capture, require_scene
 from mi_ring.errors import InputError
+from mi_ring.fit_config import FitConfig, parse_options
 from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
 from mi_ring.fitting.checkpoint import read_checkpoint, resumed
-from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.processes import Processes, joined
 from mi_ring.fitting.session import run_session
@@ -30,56 +25,6 @@ from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
 AFTERWARDS = 30.0  #: seconds that pictures before a fit and its results after it are taken to take
 PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """What a fit is of, where its results go, and what computes it."""
-
-    scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs."""
-    out: Path | None = None
-    """Folder of the results. Default: out/<name>, the name of the scene file, or of its folder if it is scene.xml."""
-    resume: bool = False
-    """Go on from the folder's checkpoint.pt. Give the same settings as before."""
-    preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Settings that go together; each can be overridden. paper: the paper's own, seven hours on two cores."""
-    minutes: float = 0
-    """About how long the command may take, results included: by what iterations take on this machine --iterations are
-    chosen, and --preset unless it is given. 0: as long as they take."""
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is
-    one."""
-    threads: int = 0
-    """Processor threads of the fit; 0: all."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitConfig(Config, Task):
-    """Reconstruct an object: photographs in, a watertight mesh with a spatially varying material out."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.threads < 0:
-            raise InputError(f"--threads: is {self.threads}, must be 0 or more")
-        if not 0 <= self.minutes < math.inf:
-            raise InputError(f"--minutes: is {self.minutes}, must be 0 or more")
-        if self.minutes and self.deterministic:
-            raise InputError("--deterministic: does not go with --minutes, by which the machine's speed decides")
-        if self.deterministic and self.variant != "llvm_ad_rgb":
-            raise InputError("--deterministic: needs --variant llvm_ad_rgb; a GPU adds numbers in an order of its own")
-        if not set(self.weights) <= set(WEIGHTS):
-            raise InputError(f"--weights: is {self.weights}, must be of {', '.join(WEIGHTS)}")
-
-    @property
-    def thread_count(self) -> int:
-        """Threads to compute with; 0: all."""
-        return 1 if self.deterministic else self.threads
-
-    @property
-    def folder(self) -> Path:
-        """Where the results go."""
-        return self.out or results.default_folder(self.scene)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -177,15 +122,6 @@ def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path)
 def given(arguments: Sequence[str], option: str) -> bool:
     """Is it among the arguments?"""
     return any(argument.split("=")[0] == option for argument in arguments)
-
-
-def parse_options(arguments: Sequence[str]) -> FitConfig:
-    """The configuration: the preset's settings under those given on the command line."""
-    early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
-    early.add_argument("--preset", nargs="?", default="default")
-    preset = early.parse_known_args(arguments)[0].preset
-    default = FitConfig(scene=tyro.MISSING, **PRESETS.get(preset, {}))
-    return command.parse(FitConfig, arguments, "mi_ring.fit", default, needs_llvm=False)
 
 
 if __name__ == "__main__":

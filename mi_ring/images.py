@@ -21,6 +21,7 @@ from mi_ring.system.files import write_file
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
+EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader holds some, however low the picture is
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 # Photographs of phones have more pixels than what Pillow takes for an attack; `require_room` goes by the file's size.
@@ -132,7 +133,8 @@ def read_image(path: Path) -> np.ndarray:
                 raise ValueError(f"declares {math.prod(page.chunked):,} strips or tiles, and is shorter")
         pixels = np.array(imageio.imread(path, page=0))
     elif suffix == ".exr":
-        require_room(path, 4 * math.prod(exr_size(path)))
+        width, height, channels = exr_size(path)
+        require_room(path, 4 * width * max(height, EXR_CHUNK) * channels)
         pixels = np.array(mi.Bitmap(str(path)), copy=True)
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
         with opened(path) as image:

@@ -50,21 +50,25 @@ def job(small_capture, tmp_path):
     return Job(small_capture, tmp_path / "out/small", ("--seed", "3"))
 
 
+def fitted(job, retries):
+    return fits.fit_to_the_end(job, job.fingerprint(), retries)
+
+
 KILLED = "was ended by SIGKILL"
 
 
 def test_a_fit_that_dies_goes_on_from_its_checkpoint_and_gives_up_where_it_gets_no_further(job, monkeypatch):
     script = Script(monkeypatch, (-9, 0, KILLED), (-9, 5, KILLED), (143, 10, ""), (0, 60, ""))
-    assert fits.fit_to_the_end(job, 1).state == "done"
+    assert fitted(job, 1).state == "done"
     assert [("--resume" in command) for command in script.commands] == [False, False, True, True]
     script = Script(monkeypatch, *[(-9, 60, KILLED)] * 3)
-    record = fits.fit_to_the_end(job, 2)
+    record = fitted(job, 2)
     assert (record.state, record.message, len(script.commands)) == ("failed", KILLED, 3)
 
 
 def test_a_mistake_is_not_tried_again(job, monkeypatch):
     script = Script(monkeypatch, (2, 0, "small.xml: there is no such file"))
-    record = fits.fit_to_the_end(job, 5)
+    record = fitted(job, 5)
     assert (record.state, record.message, len(script.commands)) == ("failed", "small.xml: there is no such file", 1)
 
 
@@ -75,15 +79,15 @@ def test_a_worker_that_is_killed_again_and_again_does_not_try_for_ever(job, monk
     monkeypatch.setattr(fits, "run", dies)
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
-            fits.fit_to_the_end(job, 2)
-    assert fits.fit_to_the_end(job, 2).message == "was killed again and again"
+            fitted(job, 2)
+    assert fitted(job, 2).message == "was killed again and again"
 
 
 def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture, tmp_path, monkeypatch):
     path, edit = broken_capture
     job = Job(path, tmp_path / "out/small", ("--seed", "3"))
     Script(monkeypatch, (0, 60, ""))
-    fits.fit_to_the_end(job, 0)
+    fitted(job, 0)
     assert job.is_done(job.fingerprint()) and job.record.iteration == 60
     assert not job.is_done(Job(path, job.folder, ("--seed", "4")).fingerprint())
     mask = path.parent / "masks/003.png"
@@ -91,7 +95,7 @@ def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture
     mask.write_bytes(before + b" ")
     assert not job.is_done(job.fingerprint())
     script = Script(monkeypatch, (2, 0, "masks/003.png: is wrong"))
-    assert fits.fit_to_the_end(job, 0).state == "failed"
+    assert fitted(job, 0).state == "failed"
     assert "--resume" not in script.commands[0]  # anew, and from no checkpoint of another
     mask.write_bytes(before)
     assert job.is_done(job.fingerprint())  # as before: the fit that failed has not touched it
@@ -99,6 +103,19 @@ def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture
     assert not job.is_done(job.fingerprint())
     edit('<float name="fx" value="60.0"/>', '<float name="fx" value="60.5"/>')
     assert job.fingerprint() != job.record.fingerprint
+
+
+def test_paths_in_options_are_those_of_where_the_batch_was_begun(small_capture, tmp_path, monkeypatch):
+    """A worker of a cluster is elsewhere."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (job,) = jobs_of([small_capture], tmp_path / "out", ["--domain", "mesh", "ball.ply"])
+    before = job.fingerprint()
+    (tmp_path / "here/ball.ply").write_text("ply")
+    monkeypatch.chdir(tmp_path)
+    assert job.fingerprint() != before
+    job.output.parent.mkdir(parents=True)
+    assert fits.run([sys.executable, "-c", "print(open('ball.ply').read())"], job) == (0, "ply")
 
 
 def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_path):
@@ -109,10 +126,13 @@ def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_
 @pytest.mark.parametrize(("arguments", "words"), [
     (["a.xml", "--workers", "0"], "--workers: is 0, must be 1 or more"),
     (["a.xml", "--", "--out", "there"], "--out: is what the batch itself gives each fit; leave it out"),
+    (["a.xml", "--", "--iteration", "3"], "--iteration, 3; perhaps you meant --iterations"),
+    (["a.xml", "--", "--minutes", "-1"], "--minutes: is -1.0, must be 0 or more"),
     ([], "is missing"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(batch, "jobs_of", lambda scenes, *_: [Job(scene, tmp_path) for scene in scenes])
     with pytest.raises(InputError, match=re.escape(words)):
         batch.main(arguments)
     assert not list(tmp_path.iterdir())
@@ -127,12 +147,16 @@ def test_the_page_shows_pictures_and_figures_of_reports_and_runs_no_script(tmp_p
         f'<img class="over" src="data:image/png;base64,{pixel}" alt="prediction x">'
     )
     results.write_log(folder, [{"iteration": 5, "unexplained": 0.0731}])
-    entries = [Entry(folder.name, "done", "", folder), Entry("b", "failed", "b.xml: <b>wrong</b>", tmp_path / "b")]
+    (tmp_path / "batch").mkdir()
+    (tmp_path / "batch/b#.txt").write_text("what it has printed")
+    entries = [Entry(folder.name, "done", "", folder, tmp_path / "batch/a.txt"),
+               Entry("b#", "failed", "b.xml: <b>wrong</b>", tmp_path / "b#", tmp_path / "batch/b#.txt")]  # fmt: skip
     write_index(tmp_path, entries, False)
     page = (tmp_path / "index.html").read_text()
     assert "<td>31.25 dB</td>" in page and "<td>7.3%</td>" in page and "data:image/jpeg;base64," in page
     assert "<script" not in page and "&lt;b&gt;wrong" in page and "1 done" in page and "1 failed" in page
     assert 'href="a%20%26%20%3Cscript%3Ealert%281%29/report.html"' in page
+    assert 'href="batch/b%23.txt">failed</a>' in page and ">done</td>" in page  # which has printed nothing
 
 
 @needs_ray

@@ -92,6 +92,9 @@ BROKEN = {
     "a folder with a scene": (lambda path: (path.rename(path.with_name("scene.xml")), path.mkdir(),
                                             path.with_name("scene.xml").rename(path / "scene.xml")), [],
                               ["small.xml: is a folder; give ", "scene.xml"]),
+    "a picture without a file, of which Mitsuba crashes": (
+        xml("<bsdf[^>]*/>", '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>'), [],
+        ["small.xml: bitmap: filename is missing"]),
     "no XML": (xml("<shape.*", "<shape"), [], ["small.xml: ", "XML"]),
     "an empty file": (content("small.xml", b""), [], ["small.xml: ", "XML"]),
     "a picture as scene": (lambda path: mi.Bitmap(IMAGE).write(str(path), mi.Bitmap.FileFormat.PNG), [],

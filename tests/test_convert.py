@@ -330,6 +330,23 @@ def test_a_model_that_keeps_its_reader_busy_for_ever_is_refused(colmap, tmp_path
     assert not (tmp_path / "scan.xml").exists()
 
 
+@pytest.mark.parametrize("form", ["sparse/0/images.bin", "text/images.txt"])
+def test_a_name_in_a_model_that_is_no_text(colmap, tmp_path, form):
+    path = colmap / form
+    path.write_bytes(path.read_bytes().replace(b"sub/1", b"sub/\xb2"))
+    refused(["colmap", path.parent, "--images", colmap / "images"], "not a COLMAP model .*can't decode byte 0xb2",
+            tmp_path / "new/scan.xml")  # fmt: skip
+
+
+def test_a_model_with_a_rotation_that_is_none(colmap, tmp_path):
+    path = colmap / "text/frames.txt"
+    lines = path.read_text().splitlines()
+    words = lines[-1].split()
+    path.write_text("\n".join([*lines[:-1], " ".join([*words[:2], "1e300", *words[3:]])]))
+    refused(["colmap", path.parent, "--images", colmap / "images"], "its pose is no rotation and translation",
+            tmp_path / "new/scan.xml")  # fmt: skip
+
+
 def test_what_strangers_files_do_to_their_readers_is_one_line(colmap, tmp_path, monkeypatch):
     for error in (OverflowError("int too large"), KeyError(3), UnicodeDecodeError("utf-8", b"x", 0, 1, "bad")):
         monkeypatch.setattr(importer.Colmap, "posed", lambda self, error=error: (_ for _ in ()).throw(error))

@@ -463,7 +463,8 @@ def test_material_options_reach_the_files(ring, run, tmp_path):
 @pytest.mark.parametrize("arguments, words", [
     (["o.stl"], "o.stl: must end in .ply, .obj, .glb, .xml"),
     (["o.glb", "--resolution", "7"], "--resolution: is 7"),
-    (["o.glb", "--subdivisions", "9"], "--subdivisions: is 9"),
+    (["o.glb", "--subdivisions", "9"], "--subdivisions: is 9, must be 0 to 8; textures"),
+    (["o.ply", "--subdivisions", "11"], "--subdivisions: is 11, must be 0 to 10"),
     (["o.ply", "--time", "1.5"], "--time: is 1.5"),
     (["o.glb", "--metres", "-1"], "--metres: is -1"),
     (["o.obj", "--metres", "0.01"], "--metres: is for .glb"),

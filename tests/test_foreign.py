@@ -97,6 +97,14 @@ def test_the_header_of_an_exr_is_what_its_pixels_are(width, height, channels, tm
     assert image_size(path) == (width, height)
 
 
+def test_an_exr_of_one_row_that_is_enormous(tmp_path, monkeypatch):
+    """Its reader has room for several of its chunks of 32 rows or more, though one row is all there is."""
+    exr(tmp_path / "a.exr", 2**24, 1)
+    monkeypatch.setattr(mi, "Bitmap", lambda *_, **__: pytest.fail("was asked"))
+    with pytest.raises(InputError, match=r"declares [\d,]+ bytes, in a file of"):
+        pixels_of(tmp_path / "a.exr")
+
+
 def test_a_tiff_of_more_strips_than_bytes(tmp_path):
     """Each of which its reader would look for."""
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((7, 5, 3), np.uint8), compression="zlib", photometric="rgb")

@@ -13,7 +13,7 @@ import torch
 
 from mi_ring.errors import InputError
 from mi_ring.nets import chunks
-from mi_ring.system import command, files, machine, progress
+from mi_ring.system import command, files, gpus, machine, progress
 
 
 def write(path, text):
@@ -210,3 +210,15 @@ def test_what_nobody_reads_is_dropped(tmp_path, monkeypatch):
             print("four")
             assert os.path.samestat(os.fstat(pipe.fileno()), os.stat(os.devnull))
         assert sys.stdout is stream and stream.getvalue() == "one\nthree\n"
+
+
+@pytest.mark.parametrize(("words", "seen"), [
+    (["python", "-u", "-m", "mi_ring.fit", "a.xml"], "7"), (["python", "/bin/mi-ring", "fit", "a.xml"], "7"),
+    (["python", "-u", "train.py"], "4,7"),
+])  # fmt: skip
+def test_fits_that_torchrun_starts_see_one_gpu_each_and_other_programs_all_of_theirs(words, seen, monkeypatch):
+    there = {"LOCAL_WORLD_SIZE": "2", "LOCAL_RANK": "1", "CUDA_VISIBLE_DEVICES": "4,7"}
+    monkeypatch.setattr(os, "environ", there)
+    monkeypatch.setattr(sys, "orig_argv", words)
+    gpus.choose_gpu()
+    assert there["CUDA_VISIBLE_DEVICES"] == seen and (gpus.OWN in there) == (seen == "7")

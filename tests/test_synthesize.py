@@ -1,6 +1,7 @@
 """Synthetic captures: radiance by closed forms, what scene files say, what is wrong on purpose, what is refused."""
 
 import os
+import struct
 
 import drjit as dr
 import mitsuba as mi
@@ -346,12 +347,17 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--views", "0"], "--views: is 0, must be 1 to"),
     (["--size", "4", "9"], "--size: is 4 9"),
     (["--distance", "1"], "--distance: is 1.0"),
-    (["--material", "gold"], "--material: gold: "),
-    (["--material", "diffuse reflectence=0.5,0.1,0.1"], "--material: .*reflectence"),
+    (["--material", "gold"], "^--material: gold: Mitsuba has no plugin gold; give a file .xml"),
+    (["--material", "diffuse reflectence=0.5,0.1,0.1 b=c"], "^--material: .*: has no parameter reflectence and b; "),
+    (["--second", "principled roughness=low"], "^--second: .*: roughness is a string, must be a number or a colour"),
+    (["--material", "roughplastic alpha=true"], "^--material: .*: alpha is a boolean, must be a number$"),
+    (["--material", "diffuse reflectance=-1,2,3"], r"^--material: diffuse reflectance=-1,2,3: Invalid RGB"),
+    (["--exposure", "2", "--clipped", "0.1"], "^--clipped: is what the exposure is chosen by"),
     (["--material", "diffuse 0.5"], "found '0.5'; each parameter must be NAME=VALUE"),
     (["--material", "principled base_color=vertex_color"], "the mesh's file has no colours"),
     (["--material", "none.xml"], "none.xml: --material: no such file"),
     (["--material", "none.npz:gold"], "none.npz: --material: no such file"),
+    (["--material", "bitmap"], "--material: bitmap: has parts that are no numbers and colours; give a file .xml"),
     (["--second", "perspective"], "--second: perspective: is no BSDF"),
     (["--second", "diffuse", "--pattern", "dots"], "dots: --pattern: no such file; give stripes, checks or"),
     (["--environment", "none.exr"], "none.exr: --environment: no such file"),
@@ -362,6 +368,22 @@ def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, t
     with pytest.raises(mi_ring.InputError, match=message):
         synthesize.main([str(lump), str(tmp_path / "out"), *options])
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and not os.path.basename(path).startswith(".")]
+
+
+@pytest.mark.parametrize("content", ['<texture type="bitmap" name="base_color"/>', '<bsdf type="blendbsdf"/>'])
+def test_materials_that_mitsuba_crashes_of(content, lump, tmp_path):
+    (tmp_path / "a.xml").write_text(f'<bsdf type="principled">{content}</bsdf>')
+    with pytest.raises(mi_ring.InputError, match="--material: .*a.xml: b[a-z]+: (filename is|is empty)"):
+        synthesize.main([str(lump), str(tmp_path / "out"), "--material", str(tmp_path / "a.xml")])
+
+
+def test_an_environment_that_declares_to_be_enormous(lump, tmp_path):
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(tmp_path / "sky.exr"))
+    content = (tmp_path / "sky.exr").read_bytes()
+    window = struct.pack("<4i", 0, 0, 7, 3)
+    (tmp_path / "sky.exr").write_bytes(content.replace(window, struct.pack("<4i", 0, 0, 59999, 59999)))
+    with pytest.raises(mi_ring.InputError, match=r"sky.exr: --environment: .*declares [\d,]+ bytes, in a file of"):
+        synthesize.main([str(lump), str(tmp_path / "out"), "--environment", str(tmp_path / "sky.exr")])
 
 
 def test_what_is_no_mesh_is_told(tmp_path):

@@ -52,7 +52,7 @@ def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
 
     Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
     """
-    pixels = opened(read_image, path, field, sensor, scene)
+    pixels = read_by(read_image, path, field, sensor, scene)
     require_size(pixels.shape[1::-1], path, field, sensor)
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
         what = f'photograph "{sensor.id()}", {field}'
@@ -62,10 +62,10 @@ def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
 
 def require_header(path: Path, field: str, sensor: Any, scene: Path) -> None:
     """Raise as `read_pixels` does, for what the first bytes of an image file tell."""
-    require_size(opened(image_size, path, field, sensor, scene), path, field, sensor)
+    require_size(read_by(image_size, path, field, sensor, scene), path, field, sensor)
 
 
-def opened(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
+def read_by(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
     """What is read of a file. Raises InputError if there is none, or if it is no image."""
     what = f'photograph "{sensor.id()}", {field}'
     if not path.is_file():

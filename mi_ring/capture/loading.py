@@ -13,6 +13,7 @@ from mi_ring.capture.capture import Capture, views_of
 from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.masks import find_masks
 from mi_ring.capture.pixels import Pixels, Reader
+from mi_ring.capture.scenefile import require_parts
 from mi_ring.errors import InputError, SceneError, require_file
 from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
@@ -123,6 +124,7 @@ def require_xml(path: Path) -> None:
         root = ElementTree.fromstring(content)
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # of XML, of an encoding that is unknown
         raise InputError(f"{path}: is no XML ({error}); give the XML file of a scene, in UTF-8") from error
+    require_parts(root)
     for sensor in root.iterfind(".//sensor[@type='photograph']"):
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,8 +54,8 @@ def cluster(resources: Resources) -> Iterator[Any]:
         ray.shutdown()
 
 
-def fit_all(jobs: Sequence[Job], resources: Resources, retries: int, look: Callable[[], None]) -> None:
-    """Fit them all; what became of each is in its record. `look` is called now and then, and at the end.
+def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, look: Callable[[], None]) -> None:
+    """Fit them all, given with their fingerprints; what became of each is in its record. `look` is called now and then.
 
     A worker of Ray that dies is replaced, and the fit that it had goes on from its last checkpoint.
     """
@@ -68,7 +68,7 @@ def fit_all(jobs: Sequence[Job], resources: Resources, retries: int, look: Calla
         while waiting or running:
             while waiting and len(running) < resources.workers:
                 job = waiting.pop(0)
-                running[fit.remote(job, retries, ("--threads", str(resources.cpus)))] = job
+                running[fit.remote(job, jobs[job], retries, ("--threads", str(resources.cpus)))] = job
             done, _ = ray.wait(list(running), timeout=POLL)
             for reference in done:
                 job = running.pop(reference)

@@ -16,12 +16,13 @@ MISTAKE = 2  #: exit status of a fit for what the user can mend, and no second t
 DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
 
 
-def fit_to_the_end(job: Job, retries: int, extra: tuple[str, ...] = ()) -> Record:
+def fit_to_the_end(job: Job, fingerprint: str, retries: int, extra: tuple[str, ...] = ()) -> Record:
     """Fit a scene, or go on with its fit, until it is done, has failed, or has died so often without getting further.
 
-    `extra`: options that change nothing of the result. Whoever is killed while at it may call it again.
+    `fingerprint`: the job's. `extra`: options that change nothing of the result. Whoever is killed while at
+    it may call it again.
     """
-    fingerprint, record = job.fingerprint(), job.record
+    record = job.record
     if record.fingerprint != fingerprint:  # the fit moves results of another aside, as soon as it begins
         record = Record(fingerprint=fingerprint, since=time.time(), done=record.done, written=record.written)
     if record.state in ("failed", "done"):  # before: a new batch tries anew
@@ -49,7 +50,9 @@ def run(command: list[str], job: Job) -> tuple[int, str]:
         output.write(b"\n$ " + " ".join(command).encode(errors="replace") + b"\n")
         output.flush()
         begun = output.tell()
-        status = subprocess.call(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, **dying())
+        place = job.place if job.place.is_dir() else None  # a worker of a cluster is elsewhere, or has no such folder
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
+        status = subprocess.call(command, cwd=place, **streams, **dying())
     with job.output.open("rb") as output:
         output.seek(begun)
         lines = [line.strip() for line in re.split(r"[\r\n]+", output.read().decode(errors="replace")) if line.strip()]

@@ -33,11 +33,12 @@ class Record:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, the folder of its results, and options of `mi_ring.fit`; paths are absolute."""
+    """A scene, the folder of its results, and options of `mi_ring.fit`; the first two paths are absolute."""
 
     scene: Path
     folder: Path
     options: tuple[str, ...] = ()
+    place: Path = Path()  #: the folder that paths in `options` are relative to
 
     @property
     def name(self) -> str:
@@ -71,7 +72,7 @@ class Job:
             result.update(text)
             words = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", text)
             named = {self.scene.parent / (a or b).decode(errors="replace") for a, b in words}
-            given = (Path(option.partition("=")[2] or option) for option in self.options)
+            given = (self.place / (option.partition("=")[2] or option) for option in self.options)
             for file in sorted({*named, *given}):
                 with contextlib.suppress(OSError):
                     if file.is_file():
@@ -130,5 +131,5 @@ def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[J
         folder = out.resolve() / name
         if folder in scene.resolve().parents:
             raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
-        jobs[name] = Job(scene.resolve(), folder, tuple(options))
+        jobs[name] = Job(scene.resolve(), folder, tuple(options), Path.cwd())
     return list(jobs.values())

@@ -47,6 +47,7 @@ class Colmap(Photogrammetry):
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what it has to say is in the exception
             reconstruction = pycolmap.Reconstruction(str(model))
             registered = {*reconstruction.reg_image_ids()}
+            named = sorted((image.name, key) for key, image in reconstruction.images.items())  # names may be no text
         except Exception as error:
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
         if not reconstruction.num_reg_images():
@@ -55,18 +56,20 @@ class Colmap(Photogrammetry):
         images = self.images or next((f for f in beside if f.is_dir()), None)
         if images is None and self.photographs is None:
             raise InputError(f"{self.src}: --images: no folder images beside or above {model}; give it")
-        for key, image in sorted(reconstruction.images.items(), key=lambda item: item[1].name):
+        for photograph, key in named:
+            image = reconstruction.images[key]
             if key not in registered:
-                self.left_out.add(image.name)
+                self.left_out.add(photograph)
                 continue
             if images and self.photographs is None:
-                path: Path | None = existing(images / image.name, "photograph")
+                path: Path | None = existing(images / photograph, "photograph")
             else:
-                path = self.photograph(image.name, str(model))
+                path = self.photograph(photograph, str(model))
             if path is None:
                 continue
-            pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
-            name = Path(splitext(image.name)[0]).as_posix().replace("/", "_")
+            turn, shift = np.split(image.cam_from_world().matrix(), [3], axis=1)
+            pose = np.vstack([np.hstack([turn.T, -turn.T @ shift]), [0, 0, 0, 1]])
+            name = Path(splitext(photograph)[0]).as_posix().replace("/", "_")
             own = reconstruction.cameras[image.camera_id]
             lens = Lens(own.model_name, (own.width, own.height), own.params)
-            yield image.name, Frame(path, lens, pose, name=name)
+            yield photograph, Frame(path, lens, pose, name=name)

@@ -20,8 +20,14 @@ from mi_ring.system.files import relative_to, write_file
 from mi_ring.version import __version__
 
 SIDE = 160  #: of the pictures, at most [px]
-#: Figures of the page, by their names in a report.
-FIGURES = {"PSNR of the photographs": "PSNR", "Silhouettes": "silhouettes", "Mesh": "mesh", "Fit time": "time"}
+#: Figures of the page by their names in a report, and what they are.
+FIGURES = {
+    "PSNR of the photographs": ("PSNR", "of the predicted photographs, sRGB; the more the better"),
+    "Silhouettes": ("silhouettes", "intersection over union of the predicted ones and the masks; 1 is the best"),
+    "Mesh": ("mesh", "its size"),
+    "Fit time": ("time", "of the fit, without start and report"),
+}
+UNEXPLAINED = "unexplained", "share of the photographs' light that the fit does not predict, last; the less the better"
 
 
 class Entry(NamedTuple):
@@ -31,6 +37,7 @@ class Entry(NamedTuple):
     state: str  #: waiting, running, failed or done
     text: str
     folder: Path
+    log: Path  #: what the fit has printed
 
 
 def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
@@ -41,8 +48,9 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
     page = jinja2.Environment(autoescape=True).from_string(template)
     counts = {state: states.count(state) for state in ("done", "running", "waiting", "failed") if state in states}
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / "index.html", page.render(rows=rows, figures=[*FIGURES.values(), "unexplained"], counts=counts,
-                                               running=running, version=__version__))  # fmt: skip
+    figures = dict([*FIGURES.values(), UNEXPLAINED])
+    write_file(out / "index.html", page.render(rows=rows, figures=figures, counts=counts, running=running,
+                                               version=__version__))  # fmt: skip
 
 
 def row_of(entry: Entry, out: Path) -> dict:
@@ -53,9 +61,14 @@ def row_of(entry: Entry, out: Path) -> dict:
         told, picture = shown_of(report, report.stat().st_mtime_ns)
         figures |= told
     with contextlib.suppress(OSError, LookupError, TypeError, ValueError):
-        figures["unexplained"] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
-    link = quote(relative_to(out.resolve(), report.resolve())) if report.is_file() else None
-    return {**entry._asdict(), "figures": figures, "picture": picture, "link": link}
+        figures[UNEXPLAINED[0]] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
+    return {**entry._asdict(), "figures": figures, "picture": picture, "link": link_to(report, out),
+            "log": link_to(entry.log, out)}  # fmt: skip
+
+
+def link_to(file: Path, out: Path) -> str | None:
+    """As the page in `out` has it; None if there is no such file."""
+    return quote(relative_to(out.resolve(), file.resolve())) if file.is_file() else None
 
 
 @functools.lru_cache(maxsize=4096)
@@ -69,7 +82,8 @@ def figures_of(report: str) -> dict[str, str]:
     """The figures of a report, the explanations in brackets left out."""
     cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", report)
     told = {html.unescape(name): html.unescape(value) for name, value in cells}
-    return {short: re.split(r" \(|, | intersection", told[name])[0] for name, short in FIGURES.items() if name in told}
+    return {short: re.split(r" \(|, | intersection", told[name])[0]
+            for name, (short, _) in FIGURES.items() if name in told}  # fmt: skip
 
 
 def thumbnail_of(report: str) -> str | None:

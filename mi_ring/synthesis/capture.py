@@ -13,7 +13,6 @@ from typing import NamedTuple, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.loading import reason
 from mi_ring.capture.scenefile import (
     Element,
     add_pose,
@@ -26,8 +25,9 @@ from mi_ring.capture.scenefile import (
     scene_element,
 )
 from mi_ring.errors import InputError
+from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
-from mi_ring.images import to_bytes, write_image
+from mi_ring.images import read_image, to_bytes, write_image
 from mi_ring.rendering.lights import Light
 from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import poses
@@ -102,10 +102,10 @@ class Production:
         upright = np.eye(4)
         upright[:3, :3] = Rotation.align_vectors([self.config.axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
         add_pose(element, upright)
-        try:
+        with reading(f"{file}: --environment", "a picture of latitude and longitude"):
+            if file.suffix.lower() == ".exr":
+                read_image(file)  # which bounds its memory
             load_element(element)
-        except RuntimeError as error:
-            raise InputError(f"{file}: --environment: cannot be read ({reason(error)})") from error
         return element
 
     def stage(self, folder: Path) -> Stage:

@@ -153,6 +153,8 @@ def require_options(config: SynthesizeConfig) -> None:
         raise InputError("--wrong-light: is of places, which distant lights have none of; leave it out")
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
+    if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
+        raise InputError("--clipped: is what the exposure is chosen by; leave it out, or --exposure")
     if not np.linalg.norm(config.offset) < 1:
         raise InputError("--offset: reaches the object; it is in distances from camera to object, for instance 0.1 0 0")
     if config.environment:

@@ -69,10 +69,22 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
             return mi.load_dict({"type": "merl", "filename": str(path.resolve()), **values})
         found = mi.load_dict(plugin(text, field, coloured))
     except RuntimeError as error:
-        raise InputError(f"{field}: {text}: {reason(error)}") from error
+        raise InputError(f"{field}: {text}: {complaint(str(error))}") from error
     if not isinstance(found, mi.BSDF):
         raise InputError(f"{field}: {text}: is no BSDF; give {FORMS}")
     return found
+
+
+def complaint(said: str) -> str:
+    """What Mitsuba has said about a plugin and its parameters, in the words of a command line."""
+    if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", said, re.M):
+        return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
+    if kind := re.search(r"Plugin \"(.*?)\" not found", said):
+        return f"Mitsuba has no plugin {kind[1]}; give {FORMS}"
+    if wrong := re.search(r"property \"(.*?)\" has the wrong type \(expected (.*?), got (.*?)\)", said):
+        wanted = "a number or a colour R,G,B" if "color" in wrong[2] else wrong[2].replace("float", "a number")
+        return f"{wrong[1]} is a {wrong[3]}, must be {wanted}"
+    return re.sub(r"^.*? plugin of type \"\w*\": (\[.*?\] )?", "", reason(RuntimeError(said)))
 
 
 def load_snippet(path: Path, field: str) -> mi.BSDF:
@@ -92,6 +104,8 @@ def plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
         name, *words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{field}: is {text!r} ({error}); give {FORMS}") from error
+    if name in ("bitmap", "blendbsdf"):  # without what has no place here Mitsuba crashes of them
+        raise InputError(f"{field}: {text}: has parts that are no numbers and colours; give {FORMS}")
     result: dict[str, Any] = {"type": name}
     for word in words:
         key, sign, value = word.partition("=")

@@ -62,20 +62,38 @@ class Lines(io.TextIOBase):
     """Standard error where it is a file: a bar's state now and then, each a line of its own."""
 
     def __init__(self) -> None:
-        self.last = -math.inf  #: when the last was written [s]
+        self.last, self.shown = -math.inf, ""  #: when the last was written [s], and what it was
 
     def write(self, text: str) -> int:
         """Write it, if there is anything to be seen in it and the last was a while ago."""
-        line, now = text.strip(), time.monotonic()
-        if sys.stderr and line and now - self.last >= QUIET:
-            sys.stderr.write(f"{line}\n")
-            self.last = now
+        if text.strip() and time.monotonic() - self.last >= QUIET:
+            self.put(text.strip())
         return len(text)
+
+    def put(self, line: str) -> None:
+        """Write a line, unless it is there already."""
+        if sys.stderr and line != self.shown:
+            sys.stderr.write(f"{line}\n")
+            self.last, self.shown = time.monotonic(), line
 
     def flush(self) -> None:
         """Flush standard error."""
         if sys.stderr:
             sys.stderr.flush()
+
+
+class LastLine(tqdm):
+    """A bar that is lines, of which the last says how far it came; tqdm leaves that out, or wipes it off."""
+
+    def __init__(self, *arguments: Any, file: Lines, **options: Any) -> None:
+        self.lines = file
+        super().__init__(*arguments, file=file, **options)
+
+    def close(self) -> None:
+        """Say it, if anything was said before."""
+        if not self.disable and self.lines.shown:
+            self.lines.put(str(self).strip())
+        super().close()
 
 
 def progress(
@@ -85,7 +103,9 @@ def progress(
 
     In a terminal it is a bar; else a line is written twice a minute, and none of what takes less than two seconds.
     """
+    kind = tqdm
     if not getattr(sys.stderr, "isatty", bool)():
+        kind = LastLine
         options |= {"file": Lines(), "delay": PATIENCE, "ascii": " #", "position": 0}
     columns, rows = shutil.get_terminal_size()  # 80 x 24 where a terminal says 0 x 0: tqdm would show nothing
-    return tqdm(things, what, total, leave=leave, ncols=columns, nrows=rows, **options)
+    return kind(things, what, total, leave=leave, ncols=columns, nrows=rows, **options)

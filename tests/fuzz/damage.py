@@ -72,8 +72,8 @@ LARGEST = 2**20  #: bytes of what comes out
 def damaged(content: bytes, name: str, random: Random) -> bytes:
     """The content of a file of this name with one to four things wrong."""
     inside = INSIDE.get(Path(name).suffix.lower(), in_bytes)
-    for _ in range(random.choice((1, 1, 1, 2, 2, 3, 4))):
-        kind = inside if random.random() < 0.75 else in_bytes
+    kinds = [inside if random.random() < 0.75 else in_bytes for _ in range(random.choice((1, 1, 1, 2, 2, 3, 4)))]
+    for kind in sorted(kinds, key=lambda kind: kind is in_bytes):  # last: what looks inside crashes of some damage, too
         try:
             content = kind(content, random)
         except Exception:  # it is beyond what it was meant to be already

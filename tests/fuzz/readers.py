@@ -43,6 +43,8 @@ from mi_ring.photogrammetry.folder import Picture
 from mi_ring.rendering.measured import CELLS, Network, Table
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.synthesis.capture import Production
+from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.system.files import write_state
 
 SIZE = W, H = 7, 5  #: of pictures [px]
@@ -328,6 +330,24 @@ def networks(folder: Path) -> Reader:
     return Reader([path], lambda: plugin_error(lambda: Network(path, "one")))
 
 
+def synthesized(folder: Path) -> Reader:
+    """All that `synthesize` reads: a mesh with colours, two materials, the picture of a pattern, an environment."""
+    mi.set_variant("llvm_ad_rgb")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.visual.vertex_colors = np.random.default_rng(1).integers(0, 255, (len(ball.vertices), 3), np.uint8)
+    photographs(folder, ["pattern.png", "colours.png"])
+    names = ("ball.ply", "material.xml", "networks.npz", "pattern.png", "sky.exr")
+    files = mesh_file, material, measured, pattern, sky = [folder / name for name in names]
+    ball.export(mesh_file)
+    material.write_text('<bsdf type="principled"><float name="roughness" value="0.3"/><texture type="bitmap" '
+                        'name="base_color"><string name="filename" value="colours.png"/></texture></bsdf>')  # fmt: skip
+    test_merl.networks(measured)
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
+    config = SynthesizeConfig(mesh_file, folder / "out", material=str(material), second=f"{measured}:one",
+                              pattern=str(pattern), environment=sky)  # fmt: skip
+    return Reader(files, lambda: Production(config))
+
+
 def plugin_error(call: Callable[[], object]) -> None:
     """Plugins raise ValueError, which Mitsuba passes on; with the name of the file it is documented."""
     try:
@@ -352,7 +372,8 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "middlebury": middlebury, "sfmdata-alicevision": alicevision, "sfmdata-openmvg": openmvg, "transforms": transforms,
     "neus": neus, "wildlight": wildlight, "iron": iron, "diligent-mv": diligent, "colmap-text": colmap_text,
     "colmap-binary": colmap_binary, "detect": detected, "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
-    "results": results, "merl-networks": networks, "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
+    "results": results, "merl-networks": networks, "synthesize": synthesized,
+    "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
     "stl": mesh(".stl"), "glb": mesh(".glb"),
     "png": picture("a.png", lambda path: photographs(path.parent, ["a.png"])),
     "png-16": picture("a.png", lambda path: mi.Bitmap(colours(1, np.uint16, 4)).write(str(path))),

@@ -17,6 +17,7 @@ import datetime
 import faulthandler
 import json
 import mmap
+import multiprocessing
 import os
 import platform
 import resource
@@ -27,6 +28,7 @@ import sys
 import tempfile
 import time
 import traceback
+from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
 
@@ -39,6 +41,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 SLOWEST = 20  #: seconds that a case may take
+PATIENCE = 0.2  #: seconds that a native reader may take, which needs some ms for whole files
 ROOM = 2 * 2**30  #: bytes that a case may ask for
 LIFE = 50_000  #: cases of a process, which Mitsuba's objects outlive
 ALIKE = 3  #: findings of one kind of which the files are kept
@@ -168,26 +171,51 @@ def fuzz(name: str, options: argparse.Namespace, keep: Path) -> tuple[int, int, 
     return number, int.from_bytes(count[8:], "little"), findings, time.monotonic() - start
 
 
-class Forked:
-    """As much of `subprocess` as `foreign` asks for: a trial in a fork, for a new process takes 100 times as long."""
+class Trials:
+    """As much of `subprocess` as `foreign` asks for: one process tries case after case, until one of them ends it.
+
+    A new process for each, as readers have it, takes 100 times as long.
+    """
 
     TimeoutExpired = subprocess.TimeoutExpired
 
-    @staticmethod
-    def run(command: list[str], timeout: float, **_: object) -> subprocess.CompletedProcess:
-        if not (child := os.fork()):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            signal.alarm(int(timeout))
-            sys.argv = command[2:]
-            try:
-                exec(command[2], {})
-            except BaseException:
-                os._exit(1)
-            os._exit(0)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        if code == -signal.SIGALRM:
+    def __init__(self) -> None:
+        self.child, self.pipe = 0, None
+
+    def run(self, command: list[str], timeout: float, **_: object) -> subprocess.CompletedProcess:
+        """Run the Python of `python -c PYTHON ARGUMENTS…`."""
+        if not self.child:
+            self.pipe, own = multiprocessing.Pipe()
+            if not (child := os.fork()):
+                self.pipe.close()
+                self.serve(own)
+            self.child = child
+            own.close()
+        self.pipe.send(command[2:])
+        with contextlib.suppress(EOFError):
+            if self.pipe.poll(timeout):
+                return subprocess.CompletedProcess(command, self.pipe.recv(), "", "cannot be read")
+            os.kill(self.child, signal.SIGKILL)
+        code = os.waitstatus_to_exitcode(os.waitpid(self.child, 0)[1])
+        self.child = 0
+        if code == -signal.SIGKILL:
             raise subprocess.TimeoutExpired(command, timeout)
         return subprocess.CompletedProcess(command, code, "", "cannot be read")
+
+    @staticmethod
+    def serve(pipe: Connection) -> None:
+        """The life of the process. Its memory is bounded as the first case asks for."""
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        while True:
+            try:
+                sys.argv = pipe.recv()
+            except EOFError:
+                os._exit(0)
+            try:
+                exec(sys.argv[0], {})
+                pipe.send(0)
+            except BaseException:
+                pipe.send(1)
 
 
 def child_of(name: str, options: argparse.Namespace, keep: Path, count: mmap.mmap, words: Path, left: float) -> None:
@@ -200,7 +228,7 @@ def child_of(name: str, options: argparse.Namespace, keep: Path, count: mmap.mma
         os.dup2(output.fileno(), 2)
         faulthandler.enable()
         dr.set_thread_count(2)
-        foreign.subprocess, foreign.PATIENCE = Forked, 2.0
+        foreign.subprocess, foreign.PATIENCE = Trials(), PATIENCE
         try:
             bench = Bench(name, keep, count)
             work(bench, options, left)
