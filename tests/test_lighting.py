@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from conftest import AXES, CENTER
+from conftest import AXES
 
 import mi_ring
 from mi_ring import synthesize
@@ -18,7 +18,9 @@ from mi_ring.images import read_image, write_image
 from mi_ring.rendering.rooms import BASIS, seen_from_within
 from mi_ring.rendering.shading import is_room
 
-TINY = {"levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3}
+TINY = {
+    "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
+}  # fmt: skip
 TOWARD = np.array([0.48, 0.6, -0.64])  #: the brightest direction of `lobe`, a unit vector
 
 
@@ -34,7 +36,7 @@ def lobe(path):
 
 @pytest.fixture(autouse=True)
 def short_trials(monkeypatch):
-    monkeypatch.setattr(lighting, "COARSE", lighting.COARSE | {"iterations": 16, "batch": 4})
+    monkeypatch.setattr(lighting, "COARSE", lighting.COARSE | {"iterations": 24})
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +92,16 @@ def test_a_lamp_begins_where_the_environment_is_brightest():
     import drjit as dr
 
     harmonics = np.array([np.ravel(value)[0] for value in dr.sh_eval(mi.Vector3f(*TOWARD.tolist()), 1)])
-    sensors = [
-        SimpleNamespace(camera=SimpleNamespace(position=CENTER + p)) for p in ([0, 3, 4], [0, 0, 5.0], [6, 8, 0.0])
-    ]
+    center = np.array([0.3, -0.2, 0.5])
+    cameras = [SimpleNamespace(position=center + p) for p in ([0, 3, 4], [0, 0, 5.0], [6, 8, 0.0])]
+    sensors = [SimpleNamespace(camera=camera) for camera in cameras]
     room = torch.zeros(BASIS, 3)
     room[:4] = torch.from_numpy(harmonics).float()[:, None] * torch.tensor([1.0, 0.5, 0.2])
-    fit = SimpleNamespace(ring=SimpleNamespace(center=torch.from_numpy(CENTER)), capture=SimpleNamespace(sensors=sensors),
-                          calibration=SimpleNamespace(room=SimpleNamespace(harmonics=room)))  # fmt: skip
-    np.testing.assert_allclose(brightest(fit), CENTER + 5 * TOWARD, atol=1e-5)
+    fit = SimpleNamespace(
+        ring=SimpleNamespace(center=torch.from_numpy(center)), capture=SimpleNamespace(sensors=sensors),
+        calibration=SimpleNamespace(room=SimpleNamespace(harmonics=room)),
+    )  # fmt: skip
+    np.testing.assert_allclose(brightest(fit), center + 5 * TOWARD, atol=1e-5)
 
 
 def test_a_lamp_is_one_for_all_and_as_strong_as_makes_the_albedo_a_half(small_capture):
@@ -110,6 +114,14 @@ def test_a_lamp_is_one_for_all_and_as_strong_as_makes_the_albedo_a_half(small_ca
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamp"))
     assert fit.calibration.refined == ("light", "ambient")
     assert len(fit.calibration.light) == 1  # one place for all photographs
+
+
+def test_other_reflectances_than_cooktorrance_are_refused(small_capture, tmp_path):
+    scene = small_capture.with_name("diffuse.xml")
+    scene.write_text(small_capture.read_text().replace('<bsdf type="cooktorrance"/>', '<bsdf type="diffuse"/>'))
+    capture = mi_ring.load_capture(scene)
+    with pytest.raises(InputError, match="bsdf: --light environment is for cooktorrance alone"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", light="environment"))
 
 
 def test_axes_are_those_of_the_light(small_capture):

@@ -73,8 +73,8 @@ class Room(nn.Module):
         missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
         which, now = around.which, self.harmonics[around.which]
         basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.harmonics])  # (which, n, 3)
-        free = torch.einsum("jnhwc,jc->nhwc", around.free, now)
-        missing = missing + pooled(free, coarser)[inside]
+        lit = torch.einsum("jnhwc,jc->nhwc", around.free, now)
+        missing = missing + pooled(lit, coarser)[inside]
         scale = light + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now)
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2

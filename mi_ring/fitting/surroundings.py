@@ -28,7 +28,10 @@ def with_surroundings(
     lit = calibration is not None or photographs.room is not None
     if not (fit.ring.indirect or lit):
         return predicted
-    which = calibration.room.which if calibration else np.flatnonzero(photographs.room.any(1)).tolist() if lit else []
+    if calibration:
+        which = calibration.room.which
+    else:
+        which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
     around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=which,
                                  indirect=fit.ring.indirect)  # fmt: skip
     if fit.ring.indirect and fit.surface.table is not None:

@@ -41,7 +41,8 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     if torch.cpu._is_amx_tile_supported():
         return told == "DEFAULT" or "AMX" in told
     # By AVX512-BF16 alone products are twice as fast as in float32 on AMD's (Zen 4), half as fast on Intel's.
-    amd = "AMD" in getattr(torch.cpu, "get_capabilities", dict)().get("cpu_name", "")  # from PyTorch 2.10 on
+    told_of: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # from PyTorch 2.10 on
+    amd = "AMD" in told_of.get("cpu_name", "")
     return amd and torch.cpu._is_avx512_bf16_supported() and (told == "DEFAULT" or "BF16" in told or "AMX" in told)
 
 

@@ -1,0 +1,168 @@
+"""How well is an object found whose light is unknown? As Markdown: normals, light and relit pictures by environment.
+
+    python benchmarks/environments.py MESH … [--views 50] [--width 512] [--spp 64] [--maps overcast indoor sun]
+        [--out out/environments] [-- OPTIONS OF FIT]
+
+Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an overcast sky
+(its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps, and a clear
+sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light. Then the object
+is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after one factor for
+each colour, over the object's pixels). The light's direction: how far the brightest place of the map that was found is
+from that of the true map, both as harmonics of order 4. A flash capture of the same views stands beside them.
+"""
+
+import argparse
+import datetime
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import mi_ring
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+import trimesh
+from accuracy import processor, product_speed, table
+
+from mi_ring.images import read_image, write_image
+from mi_ring.rendering.rooms import BASIS, COUNT, ORDER, seen_from_within
+
+ROWS = 128  #: of a map
+PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
+RELIT = 4  #: photographs under another light
+
+
+def directions(rows: int = ROWS) -> np.ndarray:
+    """(rows, 2 rows, 3) of a map by latitude and longitude as Mitsuba's `envmap` has it, y up."""
+    polar, azimuth = np.meshgrid((np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows,
+                                 indexing="ij")  # fmt: skip
+    return np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)], -1)
+
+
+def window(away: np.ndarray, azimuth: float, elevation: float, size: tuple[float, float], rgb: tuple) -> np.ndarray:
+    """A bright rectangle of a room [degrees]."""
+    east = np.degrees(np.arctan2(away[..., 0], -away[..., 2]))
+    high = np.degrees(np.arcsin(away[..., 1]))
+    inside = (np.abs((east - azimuth + 180) % 360 - 180) < size[0]) & (np.abs(high - elevation) < size[1])
+    return inside[..., None] * np.array(rgb)
+
+
+def maps() -> dict[str, np.ndarray]:
+    """The environments, (H, W, 3) radiance."""
+    away = directions()
+    up = away[..., 1:]
+    ground = up < 0
+    overcast = np.where(ground, [0.1, 0.11, 0.09], (1 + 2 * up) / 3 * [0.95, 1.0, 1.08])
+    indoor = (0.7 + 0.3 * up) * [0.12, 0.11, 0.1] + window(away, 50, 15, (22, 18), (4, 4.4, 5.2))
+    indoor += window(away, -110, 40, (10, 8), (5, 4, 2.6)) + window(away, 170, -5, (14, 10), (0.6, 0.5, 0.4))
+    sky = np.where(ground, [0.15, 0.13, 0.1], 0.35 * (1.3 - 0.6 * up) * [0.55, 0.75, 1.15])
+    toward = np.array([0.5, 0.75, 0.45]) / np.linalg.norm([0.5, 0.75, 0.45])
+    sun = np.degrees(np.arccos((away @ toward).clip(-1, 1)))[..., None] < 3.5
+    return {"overcast": overcast, "indoor": indoor, "sun": sky + sun * np.array([55.0, 50, 42])}
+
+
+def as_harmonics(radiance: np.ndarray) -> np.ndarray:
+    """(BASIS, 3) of a map, by a sum over its pixels."""
+    away = directions(len(radiance)).reshape(-1, 3).astype(np.float32)
+    weight = np.sqrt(1 - away[:, 1] ** 2) * 2 * (math.pi / len(radiance)) ** 2 / 2
+    values = dr.sh_eval(mi.Vector3f(*away.T), ORDER)
+    basis = np.stack([np.array(value) + np.zeros(len(away)) for value in values])
+    room = np.zeros((BASIS, 3))
+    room[:COUNT] = basis * weight @ radiance.reshape(-1, 3)
+    return room
+
+
+def brightest(room: np.ndarray) -> np.ndarray:
+    """(3,) the direction in which harmonics are brightest."""
+    grey = seen_from_within(room, np.eye(4)).mean(-1)
+    return directions(len(grey)).reshape(-1, 3)[grey.argmax()]
+
+
+def run(*arguments: object) -> str:
+    """What a command of ours prints."""
+    command = [sys.executable, "-m", *map(str, arguments)]
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+def relit_psnr(fit: Path, truth: Path) -> float:
+    """Of pictures of a fit under the light of a scene, after one factor for each colour."""
+    run("mi_ring.render", fit, truth / "scene.xml", fit / "relit", "--spp", 64)
+    ours, theirs = [], []
+    for path in sorted((truth / "images").glob("*.exr")):
+        inside = read_image(truth / "masks" / f"{path.stem}.png").squeeze() > 127
+        ours.append(read_image(fit / "relit" / path.name)[inside])
+        theirs.append(read_image(path)[inside])
+    mine, right = np.concatenate(ours).astype(float), np.concatenate(theirs).astype(float)
+    mine *= (mine * right).sum(0) / (mine**2).sum(0)
+    white = np.quantile(right, 0.99)
+    return float(-10 * np.log10(np.mean((mine.clip(0, white) - right.clip(0, white)) ** 2) / white**2))
+
+
+def main() -> None:
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("meshes", nargs="+", type=Path)
+    parser.add_argument("--views", type=int, default=50)
+    parser.add_argument("--width", type=int, default=512)
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--maps", nargs="+", choices=list(maps()), default=list(maps()))
+    parser.add_argument("--flash", action="store_true", help="fit a flash capture of each mesh, too")
+    parser.add_argument("--out", type=Path, default=Path("out/environments"))
+    args, options = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
+    args.out.mkdir(parents=True, exist_ok=True)
+    own = maps()
+    for name, radiance in own.items():
+        write_image(radiance.astype(np.float32), args.out / f"{name}.exr")
+    speed = product_speed(4096, 4096, torch.float32) / 1e9
+    print(f"{processor()}, {speed:.0f} GFLOP/s; {datetime.date.today()}; {args.views} photographs of {args.width}²; "
+          f"mi_ring.fit --light environment {' '.join(options)}\n", flush=True)  # fmt: skip
+    rows = []
+    for mesh in args.meshes:
+        name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
+        up = np.argmin(trimesh.load(mesh).extents) if name == "pot2" else 1
+        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--up", "xyz"[up], "--spp", args.spp]
+        for light in [*args.maps, *(["flash"] if args.flash else [])]:
+            capture, fit = args.out / f"{name}-{light}", args.out / f"{name}-{light}-fit"
+            lit = [] if light == "flash" else ["--environment", args.out / f"{light}.exr", "--wrong-room"]
+            run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--novel", 0, *usual, *lit)
+            found = [] if light == "flash" else ["--light", "environment"]
+            run("mi_ring.fit", capture / "scene.xml", "--out", fit, *found, *options)
+            truth = capture / "truth/mesh.ply"
+            numbers = json.loads(run("mi_ring.evaluate", fit, "--mesh", truth))
+            seconds = json.loads((fit / "log.jsonl").read_text().splitlines()[-1])["seconds"]
+            row = [name, light, f"{numbers['normal_mean']:.2f}", f"{numbers['normal_median']:.2f}",
+                   f"{numbers['depth_mean']:.2f}"]  # fmt: skip
+            if light == "flash":
+                row += ["–", "–"]
+            else:
+                other = list(own)[(list(own).index(light) + 1) % len(own)]
+                relit = args.out / f"{name}-in-{other}"
+                run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--novel", 0, "--seed", 7, *usual,
+                    "--environment", args.out / f"{other}.exr")  # fmt: skip
+                calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
+                turn = np.eye(3) if up == 1 else np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # of synthesize: y to z
+                true = turn.T @ brightest(as_harmonics(own[light]))
+                off = np.degrees(np.arccos(np.clip(true @ brightest(calibrated.photographs.room), -1, 1)))
+                row += [f"{off:.1f}", f"{relit_psnr(fit, relit):.1f}"]
+            rows.append([*row, f"{seconds:.0f}"])
+            print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
+    heads = [
+        "mesh",
+        "light",
+        "normals, mean °",
+        "median °",
+        "depth, mean %",
+        "light's direction °",
+        "relit dB",
+        "fit s",
+    ]
+    print(table(heads, rows))
+
+
+if __name__ == "__main__":
+    main()
