@@ -3,9 +3,9 @@
     python benchmarks/environments.py MESH … [--views 50] [--width 512] [--spp 64] [--maps overcast indoor sun]
         [--out out/environments] [-- OPTIONS OF FIT]
 
-Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an overcast sky
-(its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps, and a clear
-sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light. Then the object
+Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an
+overcast sky (its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps,
+and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light. Then the object
 is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after one factor for
 each colour, over the object's pixels). The light's direction: how far the brightest place of the map that was found is
 from that of the true map, both as harmonics of order 4. A flash capture of the same views stands beside them.
@@ -26,7 +26,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch
-import trimesh
 from accuracy import processor, product_speed, table
 
 from mi_ring.images import read_image, write_image
@@ -104,6 +103,7 @@ def relit_psnr(fit: Path, truth: Path) -> float:
 
 
 def main() -> None:
+    """The command."""
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("meshes", nargs="+", type=Path)
@@ -124,8 +124,7 @@ def main() -> None:
     rows = []
     for mesh in args.meshes:
         name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
-        up = np.argmin(trimesh.load(mesh).extents) if name == "pot2" else 1
-        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--up", "xyz"[up], "--spp", args.spp]
+        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--spp", args.spp]
         for light in [*args.maps, *(["flash"] if args.flash else [])]:
             capture, fit = args.out / f"{name}-{light}", args.out / f"{name}-{light}-fit"
             lit = [] if light == "flash" else ["--environment", args.out / f"{light}.exr", "--wrong-room"]
@@ -145,8 +144,7 @@ def main() -> None:
                 run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--novel", 0, "--seed", 7, *usual,
                     "--environment", args.out / f"{other}.exr")  # fmt: skip
                 calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
-                turn = np.eye(3) if up == 1 else np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # of synthesize: y to z
-                true = turn.T @ brightest(as_harmonics(own[light]))
+                true = brightest(as_harmonics(own[light]))
                 off = np.degrees(np.arccos(np.clip(true @ brightest(calibrated.photographs.room), -1, 1)))
                 row += [f"{off:.1f}", f"{relit_psnr(fit, relit):.1f}"]
             rows.append([*row, f"{seconds:.0f}"])
