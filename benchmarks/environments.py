@@ -5,8 +5,8 @@
 
 Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an
 overcast sky (its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps,
-and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light. Then the object
-is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after one factor for
+and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light.
+Then the object is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after one factor for
 each colour, over the object's pixels). The light's direction: how far the brightest place of the map that was found is
 from that of the true map, both as harmonics of order 4. A flash capture of the same views stands beside them.
 """
@@ -54,7 +54,7 @@ def window(away: np.ndarray, azimuth: float, elevation: float, size: tuple[float
 def maps() -> dict[str, np.ndarray]:
     """The environments, (H, W, 3) radiance."""
     away = directions()
-    up = away[..., 1:]
+    up = away[..., 1:2]
     ground = up < 0
     overcast = np.where(ground, [0.1, 0.11, 0.09], (1 + 2 * up) / 3 * [0.95, 1.0, 1.08])
     indoor = (0.7 + 0.3 * up) * [0.12, 0.11, 0.1] + window(away, 50, 15, (22, 18), (4, 4.4, 5.2))
