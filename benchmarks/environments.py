@@ -6,9 +6,10 @@
 Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an
 overcast sky (its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps,
 and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light.
-Then the object is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after one factor for
-each colour, over the object's pixels). The light's direction: how far the brightest place of the map that was found is
-from that of the true map, both as harmonics of order 4. A flash capture of the same views stands beside them.
+Then the object is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after
+one factor for each colour, over the object's pixels). The light's direction: how far the brightest place of the map
+that was found is from that of the true map, both as harmonics of order 4. With `--flash` a flash capture of the same
+views stands beside them.
 """
 
 import argparse
