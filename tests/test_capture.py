@@ -15,6 +15,7 @@ from mi_ring.capture import capture, decoding, loading
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
+from mi_ring.fitting.checkpoint import digests
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.importers.reading import pixels_of
@@ -52,6 +53,30 @@ def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
     scene = loading.load_capture(path)
     rgb = scene.observe([2])[0]
     np.testing.assert_allclose(rgb[0].numpy(), pixels / 65535.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["auto", "srgb"])
+def test_ambient_light_is_subtracted(broken_capture, encoding):
+    """In linear light; where either photograph is clipped the difference is at least as bright as can be told."""
+    path, edit = broken_capture
+    random = np.random.default_rng(2)
+    ambient, lit = (random.integers(low, high, (40, 56, 3), np.uint8) for low, high in ((0, 90), (100, 255)))
+    lit[3, 5], lit[4, 6], ambient[7, 8] = 255, 10, 200
+    lit[7, 8] = 150
+    for name, pixels in (("images/002.png", lit), ("images/dark.png", ambient)):
+        mi.Bitmap(pixels).write(str(path.parent / name))
+    said = '<string name="ambient" value="images/dark.png"/>'
+    said += '<string name="encoding" value="srgb"/>' if encoding == "srgb" else ""
+    edit('value="images/002.png"/>', 'value="images/002.png"/>' + said)
+    capture = loading.load_capture(path)
+    rgb, clipped, *_ = capture.observe([2])
+    v = np.stack([lit, ambient]) / 255.0
+    linear = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    expected = (linear[0] - linear[1]).clip(0)
+    assert clipped[0, 3, 5].all() and not clipped[0, 4, 6].any() and not expected[7, 8].any()
+    expected[3, 5] = 1
+    np.testing.assert_allclose(rgb[0].numpy(), expected, atol=2e-6)
+    assert "images/dark.png" in digests(capture, Config())
 
 
 def test_tiff_files_are_read_with_all_bits(broken_capture):

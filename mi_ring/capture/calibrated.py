@@ -30,6 +30,7 @@ def with_calibration(
             None if sensor.encoding == "auto" else sensor.encoding, sensor.saturation,
             sensor.valid and str(sensor.valid), sensor.gamma * gamma,
             falloff=cone, vignetting=sensor.vignetting + vignetting, contrast=sensor.contrast * contrast,
+            ambient=sensor.ambient and str(sensor.ambient),
         )  # fmt: skip
         sensors.append(load_element(element))
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))

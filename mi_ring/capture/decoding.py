@@ -83,10 +83,26 @@ def require_size(size: tuple[int, ...], path: Path, field: str, sensor: Any) -> 
 
 
 def read_photograph(sensor: Any, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph; one without colours is grey, and what is transparent is black."""
-    pixels = read_pixels(sensor.filename, "filename", sensor, scene)
+    """Encoded pixels (H, W, 3) of a photograph, without the ambient light if it says what that shows, then float32."""
+    image = read_colours(sensor, sensor.filename, "filename", scene)
+    if not sensor.ambient:
+        return image
+    if (sensor.gamma, sensor.contrast) != (1, 1):
+        raise InputError(f'{scene}: photograph "{sensor.id()}", ambient: cannot be subtracted where the camera has a '
+                         "curve; leave out gamma and contrast, or subtract it before")  # fmt: skip
+    pictures = [image, read_colours(sensor, sensor.ambient, "ambient", scene)]
+    (lit, clipped), (ambient, too) = (decode(p, is_linear(sensor, p), sensor.saturation) for p in pictures)
+    # Where either is clipped nothing is known but that it is bright.
+    value = np.where(clipped | too, np.float32(1.0), np.maximum(lit - ambient, 0))
+    difference = linear_to_srgb(value) if sensor.encoding == "srgb" else value
+    return np.where(clipped | too, np.float32(sensor.saturation), difference).astype(np.float32)
+
+
+def read_colours(sensor: Any, file: Path, field: str, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, 3) of a picture; one without colours is grey, and what is transparent is black."""
+    pixels = read_pixels(file, field, sensor, scene)
     if sensor.encoding == "linear" and pixels.dtype == np.uint8:
-        raise InputError(f'{scene}: photograph "{sensor.id()}", encoding: is linear, but {sensor.filename.name} has 8 '
+        raise InputError(f'{scene}: photograph "{sensor.id()}", encoding: is linear, but {file.name} has 8 '
                          "bits, as sRGB has; leave it out, or give 16 bits or EXR if it is linear indeed")  # fmt: skip
     channels = pixels.shape[2]
     rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)

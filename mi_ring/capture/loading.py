@@ -67,7 +67,8 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     many = sum(width * height for width, height in (s.size for s in sensors)) > MANY
     for k, sensor in enumerate(progress(sensors, "reading", unit="photograph", disable=None)):
         if many and k:  # decoded as they are needed; the first tells what all are like
-            for field, file in (("filename", sensor.filename), ("mask", sensor.mask), ("valid", sensor.valid)):
+            for field in ("filename", "mask", "valid", "ambient"):
+                file = getattr(sensor, field)
                 if file and (field != "mask" or masks != "none"):
                     require_header(file, field, sensor, path)
         else:

@@ -20,7 +20,7 @@ from mi_ring.system.files import relative_to
 Element = ElementTree.Element
 
 #: Properties of plugins, Mitsuba's and ours, that name a file. A value of another one may only look like a name.
-FILES = "filename", "mask", "valid", "domain", "weights"
+FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 
 #: What a photograph says of lens, curve and flash by one number each, and what it says by saying nothing.
 USUAL = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
@@ -30,10 +30,12 @@ def photograph_element(
     name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
     encoding: str | None = None, saturation: float | None = None, valid: str | None = None, gamma: float = 1.0,
     calibrated: bool = False, falloff: float = 0.0, vignetting: float = 0.0, contrast: float = 1.0,
+    ambient: str | None = None,
 ) -> Element:  # fmt: skip
     """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
     element = ElementTree.Element("sensor", type="photograph", id=name)
-    for field, value in {"filename": filename, "mask": mask, "valid": valid, "encoding": encoding}.items():
+    files = {"filename": filename, "mask": mask, "valid": valid, "ambient": ambient}
+    for field, value in (files | {"encoding": encoding}).items():
         if value:
             ElementTree.SubElement(element, "string", name=field, value=value)
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))

@@ -27,6 +27,9 @@ class Photograph(mi.Sensor):
     ``valid``        string       mask file of the same size: 0 where the photograph shows nothing, for
                                   instance beyond the border of a lens whose distortion was undone.
                                   Default: none, all of it shows something
+    ``ambient``      string       image file of the same view without the photograph's own light, equally
+                                  exposed: is subtracted, so that this light alone is left. Default:
+                                  none
     ``fx``, ``fy``   float        focal lengths [px]
     ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the
                                   centre of the first pixel is (0.5, 0.5). Default: the middle of the
@@ -105,6 +108,7 @@ class Photograph(mi.Sensor):
         self.filename = beside_scene(props["filename"])
         self.mask = beside_scene(props["mask"]) if "mask" in props else None
         self.valid = beside_scene(props["valid"]) if "valid" in props else None
+        self.ambient = beside_scene(props["ambient"]) if "ambient" in props else None
         self.encoding = props.get("encoding", "auto")
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
@@ -166,7 +170,7 @@ class Photograph(mi.Sensor):
     @property
     def files(self) -> set[Path]:
         """All that it names, resolved."""
-        return {file.resolve() for file in (self.filename, self.mask, self.valid) if file}
+        return {file.resolve() for file in (self.filename, self.mask, self.valid, self.ambient) if file}
 
     @property
     def camera(self) -> Camera:
