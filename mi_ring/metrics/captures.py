@@ -82,7 +82,7 @@ def measure(
     """The rows of all photographs."""
     lights, rows = capture.photographs.lights, []
     of_each = zip(capture.sensors, capture.names, lights.toward(center), lights.distances(center),
-                  lights.irradiance(center).mean(1))  # fmt: skip
+                  received_by(capture, center))  # fmt: skip
     for k, (sensor, name, to_light, away, received) in enumerate(of_each):
         to_camera = sensor.camera.position - center
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
@@ -103,6 +103,12 @@ def measure(
             brightness=level / max(received, 1e-30), agreement=agreement.get(capture.outline(k)),
         ))  # fmt: skip
     return rows
+
+
+def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
+    """(N,) what light the object gets in each photograph, or as much in all, where that is unknown."""
+    received = capture.photographs.irradiance(center).mean(1)
+    return received if received.any() else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:
@@ -165,7 +171,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if odd:
         found.append(f"{odd}: so strong is the light that the fit has found, by the others': did the flash fire?")
     found += filter(None, [units(capture, center)])
-    received = capture.photographs.lights.irradiance(center).mean(1)
+    received = received_by(capture, center)
     lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind
     typical = np.median([row.brightness for row in lit]) if lit else 1.0
     for row in lit:

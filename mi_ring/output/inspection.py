@@ -64,4 +64,6 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     mend = [f"To mend: {line}" for line in found] or ["Nothing to mend found."]
     unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
     place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
-    return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *mend]), found, page)
+    dark = capture.photographs.dark and capture.photographs.room is None
+    light = ["Light: photographs have none of their own; mi-ring fit --light auto finds one"] if dark else []
+    return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *light, *mend]), found, page)
