@@ -23,10 +23,15 @@ from mi_ring.synthesis.config import SynthesizeConfig
 DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its photographs are to be had
 MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
 WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
+#: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.
+SMALL: dict[str, dict[str, Any]] = {
+    "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
+    "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
+}
 VIEWS = 5, 10, 15, 25, 35, 50
 BANDS = 6  #: of the stripes
 #: Of rising gloss, and those of the stripes, where no others are given.
-GLOSSY = tuple(f"principled base_color=0.5,0.25,0.12 roughness={r} specular=0.6" for r in (0.7, 0.4, 0.2))
+GLOSSY = tuple(f"principled base_color=0.5,0.25,0.12 roughness={r} specular=0.6" for r in (0.7, 0.5, 0.3))
 STRIPED = ("principled base_color=0.55,0.1,0.08 roughness=0.3 specular=0.6", "diffuse reflectance=0.2,0.35,0.5")
 
 NORMALS = {"normal_mean": Column("normals, mean °"), "normal_median": Column("median °")}
@@ -56,8 +61,8 @@ def captures(asked: Asked) -> list[Recipe]:
 
 def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = "", **options: Any) -> Synthetic:
     """A capture as the paper's: 50 photographs, 60° wide, flash at the camera, overexposed in parts, of 8 bits."""
-    small = {"views": 16, "novel": 4, "size": (128, 128), "spp": 16} if asked.quick else {}
-    name = f"{name or mesh.stem if mesh else name}{'-quick' * asked.quick}"
+    small = SMALL["quick"] if asked.quick else SMALL.get(asked.preset, {})
+    name = "-".join([name or (mesh.stem if mesh else "pot"), *(["quick"] if asked.quick else small and [asked.preset])])
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **small, **options}
     return Synthetic(name, SynthesizeConfig(Path(), Path(), material, **settings), mesh)
 
@@ -165,8 +170,13 @@ def views(asked: Asked) -> list[Run]:
     return seeded([
         Run(f"{recipe.name}-{count}", Part(f"{recipe.name}-part-{count}", recipe, count),
             {"capture": recipe.name, "views": count})
-        for recipe in captures(asked) for count in ((5, 25) if asked.quick else VIEWS)
+        for recipe in captures(asked) for count in counts(asked, recipe.photographs)
     ], asked)  # fmt: skip
+
+
+def counts(asked: Asked, most: int) -> list[int]:
+    """Of photographs to take from so many."""
+    return sorted({count for count in (VIEWS[:1] if asked.quick else VIEWS) if count < most} | {most})
 
 
 def genus(asked: Asked) -> list[Run]:

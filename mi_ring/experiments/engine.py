@@ -53,7 +53,6 @@ def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[st
         if outcomes[k].failed:
             print(f"{outcome.run.name}: failed: {outcomes[k].failed}", flush=True)
         show(experiment, outcomes, out, said)
-    show(experiment, outcomes, out, said)
     return sum(outcome.failed not in ("", NOT_RUN) for outcome in outcomes)
 
 

@@ -77,7 +77,7 @@ def slices(done: list[Outcome]) -> Figure:
 
 def pictures(done: list[Outcome]) -> Figure:
     """Of each run a photograph, what the fit predicts for it, and the error of its normals."""
-    heads = "photograph", "fit", f"error of normals, white: {WORST:.0f}° or more"
+    heads = "photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"
     return grid([(title_of(outcome), three_pictures(outcome)) for outcome in done], heads)
 
 

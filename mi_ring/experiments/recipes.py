@@ -21,7 +21,7 @@ from mi_ring.capture.scenefile import (
     scene_element,
 )
 from mi_ring.errors import InputError, require_file
-from mi_ring.foreign import load_npz
+from mi_ring.foreign import load_npz, reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import write_image
 from mi_ring.importers.conversion import write_scene
@@ -31,7 +31,7 @@ from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.synthesis.capture import claim, write_capture
 from mi_ring.synthesis.config import SynthesizeConfig, require_options
 from mi_ring.synthesis.degradation import miscalibrated
-from mi_ring.synthesis.example import pot, write_example
+from mi_ring.synthesis.example import VIEWS, pot, write_example
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, write_file, writing
 
@@ -55,6 +55,11 @@ class Recipe:
         """The folder of mesh.ply and, perhaps, of scene.xml with novel views."""
         return captures / self.name / "truth"
 
+    @property
+    def photographs(self) -> int:
+        """How many it has."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class Given(Recipe):
@@ -68,6 +73,10 @@ class Given(Recipe):
     def truth(self, captures: Path) -> Path:
         return truth_of(self.scene)
 
+    @property
+    def photographs(self) -> int:
+        return sensors_of(self.scene)
+
 
 def given(path: Path) -> Given:
     """The capture that is meant, where its folder is given, too. Raises InputError without scene file or truth."""
@@ -75,6 +84,12 @@ def given(path: Path) -> Given:
     require_file(scene, "the folder of a capture with scene.xml and truth/mesh.ply, or its scene file")
     truth_of(scene)
     return Given(scene_name(scene), scene)
+
+
+def sensors_of(scene: Path) -> int:
+    """How many sensors a scene file has. Raises InputError if it is no XML."""
+    with reading(scene, "XML"):
+        return len(ElementTree.parse(scene).getroot().findall("sensor"))
 
 
 def truth_of(scene: Path) -> Path:
@@ -110,6 +125,10 @@ class Example(Recipe):
     def made(self, captures: Path) -> Path:
         return filled(captures / self.name, write_example)
 
+    @property
+    def photographs(self) -> int:
+        return VIEWS
+
 
 def own() -> Recipe:
     """The capture that is at hand without any other data: pot2 in a checkout, else the example's pot."""
@@ -122,6 +141,10 @@ class Synthetic(Recipe):
 
     config: SynthesizeConfig
     mesh: Path | None = None
+
+    @property
+    def photographs(self) -> int:
+        return self.config.views
 
     def complete(self, captures: Path) -> SynthesizeConfig:
         """With mesh and folder."""
