@@ -1,6 +1,7 @@
 """The experiments: each is a list of runs, and what columns and figure are made of them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +71,13 @@ def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = ""
 def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
     """Each run once for each seed."""
     many = len(asked.seeds) > 1
-    return [
-        Run(f"{run.name}-{seed}" if many else run.name, run.recipe, {**run.labels, **({"seed": seed} if many else {})},
-            {**run.changes, "seed": seed}, run.measure, run.watched)
-        for run in runs for seed in asked.seeds
-    ]  # fmt: skip
+
+    def own_seed(run: Run, seed: int) -> Run:
+        labels = {**run.labels, **({"seed": seed} if many else {})}
+        name = f"{run.name}-{seed}" if many else run.name
+        return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
+
+    return [own_seed(run, seed) for run in runs for seed in asked.seeds]
 
 
 def varied(asked: Asked, label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> list[Run]:

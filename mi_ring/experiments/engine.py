@@ -45,25 +45,30 @@ def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[st
     for run in runs:
         run.config(asked)
     outcomes = [Outcome(run) for run in runs]
-    for k, outcome in enumerate(outcomes):
-        if only and outcome.run.name not in only:
-            continue
-        print(f"{k + 1} of {len(runs)}: {outcome.run.name}", flush=True)
-        outcomes[k] = attempted(outcome.run, asked, out)
-        if outcomes[k].failed:
-            print(f"{outcome.run.name}: failed: {outcomes[k].failed}", flush=True)
-        show(experiment, outcomes, out, said)
+    for k, run in enumerate(runs):
+        wanted = not only or run.name in only
+        if wanted:
+            print(f"{k + 1} of {len(runs)}: {run.name}", flush=True)
+        outcomes[k] = attempted(run, asked, out, wanted)
+        if outcomes[k].failed not in ("", NOT_RUN):
+            print(f"{run.name}: failed: {outcomes[k].failed}", flush=True)
+        if wanted or k == len(runs) - 1:
+            show(experiment, outcomes, out, said)
     return sum(outcome.failed not in ("", NOT_RUN) for outcome in outcomes)
 
 
-def attempted(run: Run, asked: Asked, out: Path) -> Outcome:
-    """Make and measure one run. Whatever goes wrong is its own."""
+def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome:
+    """Make and measure one run; one that is not `wanted` only if its fit is there. Whatever goes wrong is its own."""
     try:
-        captures = out.parent / "captures"
-        scene, folder = run.recipe.made(captures), out.resolve() / "runs" / run.name
+        captures, folder = out.parent / "captures", out.resolve() / "runs" / run.name
+        if not wanted and not run.recipe.place(captures).is_file():
+            return Outcome(run)
+        scene = run.recipe.made(captures)
         made = Made(folder, scene, run.recipe.truth(captures), captures, asked)
         job = Job(scene.resolve(), folder, run.options(asked))
         if not job.is_done(job.fingerprint()):
+            if not wanted:
+                return Outcome(run)
             print(f"fitting, see {job.output}", flush=True)
             job.output.parent.mkdir(parents=True, exist_ok=True)
             record = watched(run, job, made) if run.watched else fit_to_the_end(job, RETRIES, threads(asked))
@@ -85,7 +90,7 @@ def measured(run: Run, made: Made) -> list[Row]:
     """The rows of a finished fit; those of before if it is the same."""
     measure: Callable[[Run, Made], list[Row]] = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": made.asked.spp, "written": written(made.folder / "ring.pt"),
-          "truth": str(made.truth.resolve())}  # fmt: skip
+          "truth": str(made.truth.resolve()), "true": written(made.truth / "mesh.ply")}  # fmt: skip
     before = read_json(made.folder / NUMBERS)
     if not (isinstance(before, dict) and before.get("of") == of):
         before = {"of": of, "rows": rounded(measure(run, made))}

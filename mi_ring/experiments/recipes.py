@@ -47,8 +47,12 @@ class Recipe:
 
     name: str
 
+    def place(self, captures: Path) -> Path:
+        """Where the scene file is, or will be."""
+        return captures / self.name / "scene.xml"
+
     def made(self, captures: Path) -> Path:
-        """The scene file. Raises InputError if there can be none."""
+        """The scene file, which is written if it is not there. Raises InputError if there can be none."""
         raise NotImplementedError
 
     def truth(self, captures: Path) -> Path:
@@ -66,6 +70,9 @@ class Given(Recipe):
     """A capture of the user's, with its truth: in truth/ beside the scene file, or in NAME/truth/ beside NAME.xml."""
 
     scene: Path
+
+    def place(self, captures: Path) -> Path:
+        return self.scene
 
     def made(self, captures: Path) -> Path:
         return self.scene
@@ -225,7 +232,7 @@ class DiligentObject(Recipe):
     fill_holes: bool = False
 
     def made(self, captures: Path) -> Path:
-        source = DiligentMV(self.folder, captures / self.name / "scene.xml", fill_holes=self.fill_holes)
+        source = DiligentMV(self.folder, self.place(captures), fill_holes=self.fill_holes)
         if source.truth is None:
             raise InputError(f"{self.folder}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
         if not source.scene.is_file():
