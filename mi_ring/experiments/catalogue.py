@@ -25,7 +25,8 @@ DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its p
 MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
 WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
 #: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.
-SMALL: dict[str, dict[str, Any]] = {
+SIZES: dict[str, dict[str, Any]] = {
+    "full": {},
     "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
     "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
 }
@@ -62,10 +63,10 @@ def captures(asked: Asked) -> list[Recipe]:
 
 def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = "", **options: Any) -> Synthetic:
     """A capture as the paper's: 50 photographs, 60° wide, flash at the camera, overexposed in parts, of 8 bits."""
-    small = SMALL["quick"] if asked.quick else SMALL.get(asked.preset, {})
-    name = "-".join([name or (mesh.stem if mesh else "pot"), *(["quick"] if asked.quick else small and [asked.preset])])
-    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **small, **options}
-    return Synthetic(name, SynthesizeConfig(Path(), Path(), material, **settings), mesh)
+    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[asked.size], **options}
+    return Synthetic(
+        name or (mesh.stem if mesh else "pot"), SynthesizeConfig(Path(), Path(), material, **settings), mesh
+    )
 
 
 def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:

@@ -60,7 +60,7 @@ def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[st
 def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome:
     """Make and measure one run; one that is not `wanted` only if its fit is there. Whatever goes wrong is its own."""
     try:
-        captures, folder = out.parent / "captures", out.resolve() / "runs" / run.name
+        captures, folder = out.parent / "captures" / asked.size, out.resolve() / "runs" / run.name
         if not wanted and not run.recipe.place(captures).is_file():
             return Outcome(run)
         scene = run.recipe.made(captures)

@@ -43,6 +43,11 @@ class Asked:
         return dict(QUICK) if self.quick else {}
 
     @property
+    def size(self) -> str:
+        """Of captures that are made: quick, fast or full."""
+        return "quick" if self.quick else "fast" if self.preset == "fast" else "full"
+
+    @property
     def spp(self) -> int:
         """Samples per pixel of predicted photographs."""
         return 4 if self.quick else 16
