@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.experiment import Outcome, Row
-from mi_ring.experiments.measures import ANGLES
+from mi_ring.experiments.measures import ANGLES, errors_from_one_side
+from mi_ring.experiments.recipes import SingleView
 from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.surfaces import hits, load_true_mesh
 from mi_ring.rendering import bridge
@@ -117,11 +118,11 @@ def three_pictures(outcome: Outcome) -> list[np.ndarray]:
     picture, scale = predicted(outcome, load_fit(made.folder))
     capture = load_capture(made.scene)
     observed = linear_to_srgb(capture.observe([0], scale).rgb[0].numpy())
+    if isinstance(outcome.run.recipe, SingleView):
+        return [observed.clip(0, 1), picture, errors_from_one_side(outcome.run, made)[0]]
     photograph = capture.photograph(0, scale)
-    mesh = made.truth / "mesh.ply"
-    if not mesh.is_file():  # of photographs from one side normals alone are known
-        return [observed.clip(0, 1), picture]
-    found, true = (hits(load_true_mesh(path)[1], photograph) for path in (made.folder / "mesh.ply", mesh))
+    meshes = made.folder / "mesh.ply", made.truth / "mesh.ply"
+    found, true = (hits(load_true_mesh(mesh)[1], photograph) for mesh in meshes)
     error = np.degrees(np.arccos(np.clip((found[2] * true[2]).sum(1), -1, 1)))
     error = np.where(found[0] & true[0], error, np.where(found[0] ^ true[0], 90.0, np.nan))
     return [observed.clip(0, 1), picture, error.reshape(observed.shape[:2])]

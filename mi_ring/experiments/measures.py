@@ -99,18 +99,28 @@ def course(run: Run, made: Made) -> list[Row]:
 
 def normals_from_one_side(run: Run, made: Made) -> list[Row]:
     """Errors of the normals that the only camera of DiLiGenT's photographs sees; 90° where it misses the surface."""
+    angles, missed = errors_from_one_side(run, made)
+    known = np.isfinite(angles)
+    return [{
+        "normal_mean": float(angles[known].mean()), "normal_median": float(np.median(angles[known])),
+        "missed": 100 * float(missed[known].mean()), "seconds": read_log(made.folder)[-1]["seconds"],
+    }]  # fmt: skip
+
+
+def errors_from_one_side(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray]:
+    """The same of each pixel (H, W) [deg], NaN where no normal was measured, and whether the surface is missed there.
+
+    Along the cat's outline none was measured.
+    """
     assert isinstance(run.recipe, SingleView)
     data = run.recipe.read()
+    shape = data["mask"].shape
     _, surface = load_true_mesh(made.folder / "mesh.ply")
     seen, _, normals, _ = hits(surface, load_capture(made.scene, images=False).photograph(0))
-    inside = ((data["mask"] > 0) & data["normal_gt"].any(-1)).ravel()  # along the cat's outline none are measured
-    angles = np.full(len(inside), 90.0)
     cosine = (normals * AXES * data["normal_gt"].reshape(-1, 3)).sum(1)
-    angles[seen] = np.degrees(np.arccos(np.clip(cosine[seen], -1, 1)))
-    return [{
-        "normal_mean": float(angles[inside].mean()), "normal_median": float(np.median(angles[inside])),
-        "missed": 100 * float((~seen[inside]).mean()), "seconds": read_log(made.folder)[-1]["seconds"],
-    }]  # fmt: skip
+    angles = np.where(seen, np.degrees(np.arccos(np.clip(cosine, -1, 1))), 90.0).reshape(shape)
+    known = (data["mask"] > 0) & data["normal_gt"].any(-1)
+    return np.where(known, angles, np.nan), ~seen.reshape(shape)
 
 
 def with_slices(run: Run, made: Made) -> list[Row]:
