@@ -89,14 +89,13 @@ def require_valid(experiment, data, known_capture):
     ):
         runs = experiment.runs(asked)
         assert runs and len({run.name for run in runs}) == len(runs)
-        assert all(Path(run.name).name == run.name for run in runs)  # folders
         for run in runs:
-            config, words = run.config(asked), run.options(asked)
-            command = parse_options([str(known_capture / "scene.xml"), *words])
-            for field in dataclasses.fields(Config):
-                assert getattr(command, field.name) == getattr(config, field.name), field.name
+            config = run.config(asked)
+            assert Path(run.name).name == run.name and set(experiment.columns).isdisjoint(run.labels)
             assert config.iterations == QUICK["iterations"] or not asked.quick
-        assert all(set(experiment.columns).isdisjoint(run.labels) for run in runs)
+            if len(asked.seeds) == 1:  # reading options takes a while
+                command = parse_options([str(known_capture / "scene.xml"), *run.options(asked)])
+                assert {f.name: getattr(command, f.name) for f in dataclasses.fields(Config)} == vars(config)
 
 
 def test_what_the_paper_compares_is_what_runs_differ_in(known_capture):
