@@ -10,7 +10,6 @@ from mi_ring.experiments import figures, measures, published
 from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
 from mi_ring.experiments.recipes import (
     DiligentObject,
-    Example,
     Part,
     Perturbed,
     Recipe,
@@ -221,9 +220,8 @@ def steps(asked: Asked) -> list[Run]:
 
 def swap(asked: Asked) -> list[Run]:
     """Two captures or more from a sphere."""
-    recipes = captures(asked) if asked.data else [own(), Example("example")]
-    recipes = list({recipe.name: recipe for recipe in recipes}.values())
-    if len(recipes) < 2 and asked.data:
+    recipes = captures(asked) if asked.data else [own(), traced(asked, None, GLOSSY[-1])]
+    if len(recipes) < 2:
         raise InputError("DATA: is one capture; swap exchanges the materials of two or more")
     return [Run(r.name, r, {"capture": r.name}, {"domain": "sphere", "seed": asked.seeds[0]}) for r in recipes]
 
