@@ -16,7 +16,7 @@ from mi_ring.version import __version__
 #: Modules of the package; the first line of each says what the command does and ends in how it is called.
 COMMANDS = (
     "example", "synthesize", "board", "photos", "convert", "check", "fit", "batch", "render", "export", "evaluate",
-    "validate", "doctor",
+    "paper", "validate", "doctor",
 )  # fmt: skip
 
 

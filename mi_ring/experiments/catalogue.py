@@ -1,0 +1,326 @@
+"""The experiments: each is a list of runs, and what columns and figure are made of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mi_ring.errors import InputError
+from mi_ring.experiments import figures, measures, published
+from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
+from mi_ring.experiments.recipes import (
+    DiligentObject,
+    Part,
+    Perturbed,
+    Recipe,
+    SingleView,
+    Synthetic,
+    given,
+    own,
+)
+from mi_ring.synthesis.config import SynthesizeConfig
+
+DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its photographs are to be had
+MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
+WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
+#: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.
+SIZES: dict[str, dict[str, Any]] = {
+    "full": {},
+    "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
+    "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
+}
+VIEWS = 5, 10, 15, 25, 35, 50
+BANDS = 6  #: of the stripes
+#: Of rising gloss, and those of the stripes, where no others are given.
+GLOSSY = tuple(f"principled base_color=0.5,0.25,0.12 roughness={r} specular=0.6" for r in (0.7, 0.5, 0.3))
+STRIPED = ("principled base_color=0.55,0.1,0.08 roughness=0.3 specular=0.6", "diffuse reflectance=0.2,0.35,0.5")
+
+NORMALS = {"normal_mean": Column("normals, mean °"), "normal_median": Column("median °")}
+DEPTHS = {"depth_mean": Column("depth, mean %", 3), "depth_median": Column("median %", 3)}
+PHOTOGRAPHS = {"psnr_input": Column("PSNR, input dB", 1), "psnr_novel": Column("novel dB", 1)}
+FLAWS = {"inside_out": Column("inside out %", 3), "crossing": Column("crossing %", 3)}
+TIME = {"seconds": Column("fit s", 0)}
+USUAL = {**NORMALS, **DEPTHS, **PHOTOGRAPHS, **TIME}
+SHAPE = {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **FLAWS, **TIME}
+CAPTURES = "folders of captures with scene.xml and truth/mesh.ply"
+
+
+def captures(asked: Asked) -> list[Recipe]:
+    """Those that are given, else the one at hand; a mesh is path traced with a material of its own."""
+    meshes = [path for path in asked.data if path.suffix.lower() in MESHES]
+    if asked.materials and not meshes:
+        raise InputError("--materials: are what meshes are made of; give meshes as DATA")
+    found: list[Recipe] = []
+    for path in asked.data:
+        if path in meshes:
+            material = asked.materials[meshes.index(path) % len(asked.materials)] if asked.materials else None
+            found.append(traced(asked, path, material))
+        else:
+            found.append(given(path))
+    return found or [own()]
+
+
+def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = "", **options: Any) -> Synthetic:
+    """A capture as the paper's: 50 photographs, 60° wide, flash at the camera, overexposed in parts, of 8 bits."""
+    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[asked.size], **options}
+    return Synthetic(
+        name or (mesh.stem if mesh else "pot"), SynthesizeConfig(Path(), Path(), material, **settings), mesh
+    )
+
+
+def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
+    """Each run once for each seed."""
+    many = len(asked.seeds) > 1
+
+    def own_seed(run: Run, seed: int) -> Run:
+        labels = {**run.labels, **({"seed": seed} if many else {})}
+        name = f"{run.name}-{seed}" if many else run.name
+        return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
+
+    return [own_seed(run, seed) for run in runs for seed in asked.seeds]
+
+
+def varied(asked: Asked, label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> list[Run]:
+    """Each capture by each of some settings, of which --quick takes some."""
+    chosen = quick if asked.quick and quick else settings
+    return seeded([
+        Run(f"{recipe.name}-{key}".replace(", ", "-").replace(" ", ""), recipe,
+            {"capture": recipe.name, label: key}, settings[key])
+        for recipe in captures(asked) for key in chosen
+    ], asked)  # fmt: skip
+
+
+def table1(asked: Asked) -> list[Run]:
+    """Each capture."""
+    return seeded([Run(r.name, r, {"capture": r.name}) for r in captures(asked)], asked)
+
+
+def table2(asked: Asked) -> list[Run]:
+    """Each object of DiLiGenT-MV; those that are not there fail."""
+    if len(asked.data) != 1:
+        raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
+                         f"from its authors: {DILIGENT}/mv")  # fmt: skip
+    root = asked.data[0] / "mvpmsData" if (asked.data[0] / "mvpmsData").is_dir() else asked.data[0]
+    folders = {folder.name.removesuffix("PNG"): folder for folder in sorted(root.glob("*PNG"))}
+    if not any((folder / "Calib_Results.mat").is_file() for folder in folders.values()):
+        raise InputError(f"{asked.data[0]}: has no mvpmsData/bearPNG/Calib_Results.mat or the like; give the folder of "
+                         "DiLiGenT-MV as it is unpacked")  # fmt: skip
+    names = [str(row["object"]) for row in published.TABLE2]
+    return seeded([
+        Run(name, DiligentObject(f"diligent-{name}", folders.get(name, root / f"{name}PNG"), name == "bear"),
+            {"object": name}, measure=measures.in_millimetres)
+        for name in sorted({*names, *folders})
+    ], asked)  # fmt: skip
+
+
+def table3(asked: Asked) -> list[Run]:
+    """Each capture with poses that are exact, wrong, and wrong but refined."""
+    runs = []
+    for recipe in captures(asked):
+        for seed in asked.seeds:
+            wrong = Perturbed(f"{recipe.name}-wrong-{seed}", recipe, WRONG, seed)
+            for cameras, source, refine in (
+                ("exact", recipe, "none"), ("wrong", wrong, "none"), ("refined", wrong, "cameras"),
+            ):  # fmt: skip
+                seeds = {"seed": seed} if len(asked.seeds) > 1 else {}
+                runs.append(Run(f"{recipe.name}-{cameras}-{seed}", source,
+                                {"capture": recipe.name, "cameras": cameras, **seeds},
+                                {"refine": (refine,), "seed": seed}, measures.aligned))  # fmt: skip
+    return runs
+
+
+def specularity(asked: Asked) -> list[Run]:
+    """One mesh of each material."""
+    mesh = one_mesh(asked)
+    materials = asked.materials or (GLOSSY[::2] if asked.quick else GLOSSY)
+    return seeded([
+        Run(f"{k}", traced(asked, mesh, material, f"gloss-{mesh.stem if mesh else 'pot'}-{short(material)}"),
+            {"material": short(material)}, measure=measures.with_slices)
+        for k, material in enumerate(materials)
+    ], asked)  # fmt: skip
+
+
+def stripes(asked: Asked) -> list[Run]:
+    """One mesh of two materials."""
+    mesh, materials = one_mesh(asked), asked.materials or STRIPED
+    if len(materials) != 2:
+        raise InputError(f"--materials: are {len(materials)}, stripes need two")
+    first, second = materials
+    name = f"stripes-{mesh.stem if mesh else 'pot'}-{short(first)}-{short(second)}"
+    recipe = traced(asked, mesh, first, name, second=second, bands=BANDS)
+    labels = {"materials": f"{short(first)} and {short(second)}"}
+    return seeded([Run("stripes", recipe, labels, measure=measures.with_slices)], asked)
+
+
+def one_mesh(asked: Asked) -> Path | None:
+    """That is given, if one is."""
+    if len(asked.data) > 1 or any(path.suffix.lower() not in MESHES for path in asked.data):
+        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
+    return asked.data[0] if asked.data else None
+
+
+def short(material: str) -> str:
+    """A name for a material that is fit for a file."""
+    if ".npz:" in material:
+        return material.rpartition(":")[2]
+    words = material.split()
+    values = [word.replace("roughness=", "r") for word in words[1:] if word.startswith("roughness=")]
+    return "-".join([Path(words[0]).stem, *values])
+
+
+def views(asked: Asked) -> list[Run]:
+    """Each capture by so many of its photographs."""
+    return seeded([
+        Run(f"{recipe.name}-{count}", Part(f"{recipe.name}-part-{count}", recipe, count),
+            {"capture": recipe.name, "views": count})
+        for recipe in captures(asked) for count in counts(asked, recipe.photographs)
+    ], asked)  # fmt: skip
+
+
+def counts(asked: Asked, most: int) -> list[int]:
+    """Of photographs to take from so many."""
+    return sorted({count for count in (VIEWS[:1] if asked.quick else VIEWS) if count < most} | {most})
+
+
+def genus(asked: Asked) -> list[Run]:
+    """Each capture from a sphere and from a hull."""
+    starts = {"sphere": {"domain": "sphere"}, "hull": {"domain": "hull"}}
+    return varied(asked, "start", starts)
+
+
+def ablation(asked: Asked) -> list[Run]:
+    """The ring and ResNets from a sphere, and the ring from a hull, as fits usually begin."""
+    sphere = {"domain": "sphere"}
+    networks: dict[Any, dict[str, Any]] = {
+        "ring, T = 3": sphere,
+        "resnet, T = 3": {**sphere, "shape_net": "resnet"},
+        "wide-resnet, T = 3": {**sphere, "shape_net": "wide-resnet"},
+        "resnet, T = 20": {**sphere, "shape_net": "resnet", "steps": 20},
+        "ring, hull": {"domain": "hull"},
+    }
+    return varied(asked, "network", networks, list(networks)[:2])
+
+
+def encoding(asked: Asked) -> list[Run]:
+    """Each capture by each encoding."""
+    encodings: dict[Any, dict[str, Any]] = {
+        "linear, 16": {},
+        "linear, 5": {"frequencies": 5},
+        "octaves, 5": {"encoding": "octaves", "frequencies": 5},
+        "octaves, 10": {"encoding": "octaves", "frequencies": 10},
+        "none": {"encoding": "none"},
+    }
+    return varied(asked, "encoding", encodings, ("linear, 16", "octaves, 5", "none"))
+
+
+def steps(asked: Asked) -> list[Run]:
+    """Each capture by so many Euler steps."""
+    return varied(asked, "T", {t: {"steps": t} for t in (1, 2, 3, 5, 10, 20, 40)}, (1, 3, 10))
+
+
+def swap(asked: Asked) -> list[Run]:
+    """Two captures or more from a sphere."""
+    recipes = captures(asked) if asked.data else [own(), traced(asked, None, GLOSSY[-1])]
+    if len(recipes) < 2:
+        raise InputError("DATA: is one capture; swap exchanges the materials of two or more")
+    return [Run(r.name, r, {"capture": r.name}, {"domain": "sphere", "seed": asked.seeds[0]}) for r in recipes]
+
+
+def resolution(asked: Asked) -> list[Run]:
+    """Each capture, sampled at several levels."""
+    return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.by_level) for r in captures(asked)], asked)
+
+
+def timing(asked: Asked) -> list[Run]:
+    """Each capture, looked at in the course of its fit."""
+    return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.course, watched=True)
+                   for r in captures(asked)], asked)  # fmt: skip
+
+
+def single(asked: Asked) -> list[Run]:
+    """Each object that is seen from one side."""
+    if not asked.data:
+        raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/paper.md says; "
+                         f"get them from its authors: {DILIGENT}/single")  # fmt: skip
+    recipes = [SingleView(f"single-{file.stem}", file) for file in asked.data]
+    for recipe in recipes:
+        recipe.read()
+    return seeded([Run(r.file.stem, r, {"object": r.file.stem}, measure=measures.normals_from_one_side)
+                   for r in recipes], asked)  # fmt: skip
+
+
+_ERROR = "normal_mean", "error of normals, mean [°]"
+_MATERIAL = {"slice_error": Column("BRDF slices, relative error %", 1)}
+
+EXPERIMENTS = {
+    "table1": Experiment(
+        "The paper's table 1: accuracy on captures with measured materials.", table1, USUAL,
+        figures.bars(_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"), ("psnr_novel", "novel [dB]")),
+        published.TABLE1, "seed", data=f"{CAPTURES}, or meshes",
+    ),
+    "table2": Experiment(
+        "DiLiGenT-MV: normals and depths of pixels that see both surfaces; Chamfer distance of what any photograph "
+        "shows, the mean of both directions, to the other surface and not to points of it.",
+        table2,
+        {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
+        figures.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published.TABLE2, "object",
+        data="the folder of DiLiGenT-MV",
+    ),
+    "table3": Experiment(
+        "The paper's table 3: poses wrong by 0.5° and 0.5 % of the distance, and refined; after rigid alignment.",
+        table3,
+        {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
+        figures.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published.TABLE3, "seed",
+        data=f"{CAPTURES}, or meshes",
+    ),
+    "specularity": Experiment(
+        "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
+        specularity, {**USUAL, **_MATERIAL}, figures.slices, mean_over="seed", data="one mesh",
+    ),
+    "stripes": Experiment(
+        "Two materials in stripes: normals, and whether each place has the right one.", stripes,
+        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, figures.pictures, mean_over="seed",
+        data="one mesh",
+    ),
+    "views": Experiment(
+        "Accuracy by the number of photographs.", views, USUAL,
+        figures.curves(("views", "photographs"), _ERROR, "capture"), mean_over="seed", data=f"{CAPTURES}, or meshes",
+    ),
+    "ablation": Experiment(
+        "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.", ablation,
+        SHAPE, figures.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR), mean_over="seed",
+        data=f"{CAPTURES}, or meshes",
+    ),
+    "encoding": Experiment(
+        "Positional encodings: linear frequencies, powers of two, none.", encoding, {**USUAL, **FLAWS},
+        figures.bars(_ERROR, ("psnr_novel", "novel [dB]")), mean_over="seed", data=f"{CAPTURES}, or meshes",
+    ),
+    "steps": Experiment(
+        "Steps of the flow, the paper's T.", steps, {**USUAL, **FLAWS},
+        figures.curves(("T", "T"), _ERROR, "capture", True), mean_over="seed", data=f"{CAPTURES}, or meshes",
+    ),
+    "genus": Experiment(
+        "An object with a handle, from a sphere and from the masks' visual hull.", genus,
+        {**SHAPE, "genus": Column("genus", 0), "genus_true": Column("true genus", 0)}, figures.pictures,
+        mean_over="seed", data=f"{CAPTURES}, or meshes",
+    ),
+    "swap": Experiment(
+        "Materials exchanged between fits from one domain, the sphere.", swap, USUAL, figures.swapped,
+        data=f"two or more {CAPTURES}, or meshes",
+    ),
+    "resolution": Experiment(
+        "One fit, sampled at several levels: the networks are functions.", resolution,
+        {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
+        figures.curves(("vertices", "vertices"), _ERROR, "capture", True), data=f"{CAPTURES}, or meshes",
+    ),
+    "timing": Experiment(
+        "The error of normals in the course of a fit.", timing,
+        {"iteration": Column("iteration", 0), **TIME, **NORMALS, "depth_mean": DEPTHS["depth_mean"]},
+        figures.curves(("seconds", "fit [s]"), _ERROR, "capture"), data=f"{CAPTURES}, or meshes",
+    ),
+    "single": Experiment(
+        "DiLiGenT's photographs from one side: errors of normals, 90° where the camera misses the surface.", single,
+        {**NORMALS, "missed": Column("missed %"), **TIME}, figures.pictures, mean_over="seed",
+        data=".npz files of DiLiGenT's photographs from one side",
+    ),
+}  # fmt: skip

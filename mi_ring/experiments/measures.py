@@ -1,0 +1,204 @@
+"""What is measured of the fits of experiments."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
+from mi_ring.experiments.experiment import Made, Row, Run
+from mi_ring.experiments.recipes import AXES, Perturbed, SingleView, Synthetic
+from mi_ring.metrics.embedding import exactly_crossing, inside_out
+from mi_ring.metrics.evaluation import evaluate_fit
+from mi_ring.metrics.surfaces import compare_surfaces, hits, load_true_mesh
+from mi_ring.output.results import read_log
+from mi_ring.rendering.crossings import crossing_triangles
+from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import load_fit
+from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.system.optional import installed
+
+COURSE = "course.json"  #: of a fit that was watched
+POINTS = 8  #: of its course
+LEVELS = 3, 4, 5, 6, 7  #: that a fit is sampled at
+ANGLES = np.radians(np.arange(0, 76, 5))  #: θh of slices, light and camera at one place
+SAMPLED = 3  #: level of the points whose material is looked at
+
+
+def evaluated(run: Run, made: Made, align: str | None = None, seen: bool = False) -> list[Row]:
+    """What `mi-ring evaluate` tells, and how long the fit took; `crossing`: crossing triangles, in % of all.
+
+    They are counted exactly where libigl is installed.
+    """
+    novel = made.truth / "scene.xml"
+    numbers = evaluate_fit(
+        made.folder, made.truth / "mesh.ply", novel if novel.is_file() else None, made.asked.spp, seen, align
+    )
+    row = {key: value for key, value in numbers.items() if not isinstance(value, list)}
+    mesh, _ = load_true_mesh(made.folder / "mesh.ply")
+    crossing = exactly_crossing if installed("igl") else crossing_triangles
+    row["crossing"] = 100 * float(np.mean(crossing(mesh.vertices, mesh.faces)))
+    row["inside_out"] = 100 * row["inside_out"] / len(mesh.faces)
+    row["seconds"] = read_log(made.folder)[-1]["seconds"]
+    return [row]
+
+
+def in_millimetres(run: Run, made: Made) -> list[Row]:
+    """As `evaluated`, of what is seen; depth and Chamfer distance in scene units, too, which are millimetres."""
+    mesh, _ = load_true_mesh(made.truth / "mesh.ply")
+    diagonal = float(np.linalg.norm(mesh.extents))
+    (row,) = evaluated(run, made, seen=True)
+    return [
+        row | {f"{key}_mm": row[of] * diagonal / 100 for key, of in (("depth", "depth_mean"), ("chamfer", "chamfer"))}
+    ]
+
+
+def aligned(run: Run, made: Made) -> list[Row]:
+    """As `evaluated` after rigid alignment, and the root mean square of what is left of cameras' turns [°]."""
+    (row,) = evaluated(run, made, align="rigid")
+    exact = run.recipe.exact if isinstance(run.recipe, Perturbed) else run.recipe
+    return [row | {"turned": turns(exact.made(made.captures), made.folder / "scene.xml")}]
+
+
+def turns(a: Path, b: Path) -> float:
+    """Root mean square of the angles [°] between the cameras of two scenes, after the turn that all have in common."""
+    first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).sensors] for x in (a, b))
+    between = Rotation.from_matrix([x @ y.T for x, y in zip(first, second, strict=True)])
+    return float(np.degrees(np.sqrt(np.mean((between * between.mean().inv()).magnitude() ** 2))))
+
+
+def by_level(run: Run, made: Made) -> list[Row]:
+    """Of one fit as sampled at several levels."""
+    ring, capture = load_fit(made.folder), load_capture(made.scene, images=False)
+    mesh, truth = load_true_mesh(made.truth / "mesh.ply")
+    rows = []
+    for level in LEVELS:
+        s, faces = ring.domain.sample(level)
+        with torch.no_grad():
+            vertices = ring.surface(s).numpy()
+        numbers, _ = compare_surfaces(capture, scene_of(vertices, faces), truth, float(np.linalg.norm(mesh.extents)))
+        turned = 100 * float(inside_out(ring, s, faces).mean())
+        crossing = 100 * float(crossing_triangles(vertices, faces).mean())
+        rows.append({"level": level, "vertices": len(vertices), **numbers, "inside_out": turned, "crossing": crossing})
+    return rows
+
+
+def course(run: Run, made: Made) -> list[Row]:
+    """Of a fit that was watched: errors in the course of time."""
+    return json.loads((made.folder / COURSE).read_text())
+
+
+def normals_from_one_side(run: Run, made: Made) -> list[Row]:
+    """Errors of the normals that the only camera of DiLiGenT's photographs sees; 90° where it misses the surface."""
+    angles, missed = errors_from_one_side(run, made)
+    known = np.isfinite(angles)
+    return [{
+        "normal_mean": float(angles[known].mean()), "normal_median": float(np.median(angles[known])),
+        "missed": 100 * float(missed[known].mean()), "seconds": read_log(made.folder)[-1]["seconds"],
+    }]  # fmt: skip
+
+
+def errors_from_one_side(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray]:
+    """The same of each pixel (H, W) [deg], NaN where no normal was measured, and whether the surface is missed there.
+
+    Along the cat's outline none was measured.
+    """
+    assert isinstance(run.recipe, SingleView)
+    data = run.recipe.read()
+    shape = data["mask"].shape
+    _, surface = load_true_mesh(made.folder / "mesh.ply")
+    seen, _, normals, _ = hits(surface, load_capture(made.scene, images=False).photograph(0))
+    cosine = (normals * AXES * data["normal_gt"].reshape(-1, 3)).sum(1)
+    angles = np.where(seen, np.degrees(np.arccos(np.clip(cosine, -1, 1))), 90.0).reshape(shape)
+    known = (data["mask"] > 0) & data["normal_gt"].any(-1)
+    return np.where(known, angles, np.nan), ~seen.reshape(shape)
+
+
+def with_slices(run: Run, made: Made) -> list[Row]:
+    """As `evaluated`, and how near the material is: `slice_error`, `right_material` as `compare_slices` has them.
+
+    The slices themselves are written beside the fit, for the figure: slices.npz.
+    """
+    (row,) = evaluated(run, made)
+    found, truth, other = slices_of(run, made)
+    np.savez(made.folder / "slices.npz", found=np.median(found, 0), truth=np.median(truth, 0))
+    return [row | compare_slices(found, truth, other)]
+
+
+def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
+    """Of slices (V, angles, 3) at as many points of the surface.
+
+    `slice_error`: mean over angles and channels of |found / true − 1| [%], median over the points. `right_material`:
+    share of points [%] whose slice, as logarithms, is nearer to the true one than to that of the `other` material.
+    """
+    error = np.abs(found / np.maximum(truth, 1e-9) - 1).mean((1, 2))
+    row = {"slice_error": 100 * float(np.median(error))}
+    if other is not None:
+        logs = [np.log(np.maximum(f, 1e-6)) for f in (found, truth, other)]
+        near, far = (np.square(logs[0] - log).sum((1, 2)) for log in logs[1:])
+        row["right_material"] = 100 * float((near < far).mean())
+    return row
+
+
+def slices_of(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """BRDFs (V, angles, 3) [1/sr] by θh, light and camera at one place, at points of the surface.
+
+    That of the fit, the true one, and that of the other material where there are two. Which is the true
+    one the nearest vertex of the true mesh says.
+    """
+    assert isinstance(run.recipe, Synthetic)
+    config = run.recipe.complete(made.captures)
+    ring = load_fit(made.folder)
+    s, _ = ring.domain.sample(SAMPLED)
+    with torch.no_grad():
+        vertices, material = ring(s)
+    mesh, _ = load_true_mesh(made.truth / "mesh.ply")
+    near = cKDTree(mesh.vertices).query(vertices.numpy())[1]
+    found = slices(bsdf_of(ring, {name: value.numpy() for name, value in material.items()}), len(s))
+    true = [slices(load_material(str(m), "--materials", False), 1) for m in (config.material, config.second) if m]
+    if len(true) == 1:
+        return found, true[0], None
+    second = second_at(config, np.asarray(mesh.vertices))[near][:, None, None]
+    return found, np.where(second, true[1], true[0]), np.where(second, true[0], true[1])
+
+
+def bsdf_of(ring: Ring, material: dict[str, np.ndarray]) -> mi.BSDF:
+    """A material (V, 3) or (V,) by name as the BSDF of a strip of V pixels."""
+    snippet = ElementTree.fromstring(ring.bsdf)
+    if snippet.get("type") != "cooktorrance":
+        raise InputError(f"BSDF: is {snippet.get('type')}, slices are of cooktorrance; leave out --parameters")
+    strips = {name: mi.Bitmap(np.ascontiguousarray(value.reshape(1, len(value), -1), np.float32))
+              for name, value in material.items()}  # fmt: skip
+    return mi.load_dict({"type": "cooktorrance", **{
+        name: {"type": "bitmap", "bitmap": strip, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+        for name, strip in strips.items()
+    }})  # fmt: skip
+
+
+def slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
+    """BRDF (count, angles, 3) [1/sr] at `ANGLES` from the normal, light and camera at one place, along a strip."""
+    angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
+    si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.wi = mi.Vector3f(mi.Float(np.sin(angle)), 0, mi.Float(np.cos(angle)))
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, si.wi)).reshape(3, count, len(ANGLES))
+    return np.moveaxis(value, 0, -1) / np.cos(ANGLES)[:, None]
+
+
+def second_at(config: SynthesizeConfig, vertices: np.ndarray) -> np.ndarray:
+    """Which vertices (V,) of the true mesh are of the second material."""
+    pattern = pattern_of(config.pattern, vertices, config.bands, "xyz".index(config.up), "--pattern")
+    black, white = (mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": v}}) for v in (0.0, 1.0))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(vertices))
+    si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv.T)), mi.Vector3f(0, 0, 1)
+    return np.array(pattern.of(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi

@@ -1,0 +1,289 @@
+"""Where the captures of experiments come from: given, path traced, converted, made from others."""
+
+import os
+import shutil
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.capture.calibrated import with_calibration
+from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import (
+    Element,
+    move_names,
+    photograph_element,
+    recalibrated_xml,
+    scene_bytes,
+    scene_element,
+)
+from mi_ring.errors import InputError, require_file
+from mi_ring.foreign import load_npz, reading
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import write_image
+from mi_ring.importers.conversion import write_scene
+from mi_ring.importers.diligent_mv import DiligentMV
+from mi_ring.rendering.lights import Light, Lights
+from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.synthesis.capture import claim, write_capture
+from mi_ring.synthesis.config import SynthesizeConfig, require_options
+from mi_ring.synthesis.degradation import miscalibrated
+from mi_ring.synthesis.example import VIEWS, pot, write_example
+from mi_ring.system.command import scene_name
+from mi_ring.system.files import locked, write_file, writing
+
+POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: of a checkout
+DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
+AXES = np.array([-1.0, 1.0, -1.0])  #: from x right, y up, z back to Mitsuba's camera
+SINGLE = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: arrays, dimensions
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A capture that is there, or is made when it is needed, in a folder of its name beside the others."""
+
+    name: str
+
+    def place(self, captures: Path) -> Path:
+        """Where the scene file is, or will be."""
+        return captures / self.name / "scene.xml"
+
+    def made(self, captures: Path) -> Path:
+        """The scene file, which is written if it is not there. Raises InputError if there can be none."""
+        raise NotImplementedError
+
+    def truth(self, captures: Path) -> Path:
+        """The folder of mesh.ply and, perhaps, of scene.xml with novel views."""
+        return captures / self.name / "truth"
+
+    @property
+    def photographs(self) -> int:
+        """How many it has."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Given(Recipe):
+    """A capture of the user's, with its truth: in truth/ beside the scene file, or in NAME/truth/ beside NAME.xml."""
+
+    scene: Path
+
+    def place(self, captures: Path) -> Path:
+        return self.scene
+
+    def made(self, captures: Path) -> Path:
+        return self.scene
+
+    def truth(self, captures: Path) -> Path:
+        return truth_of(self.scene)
+
+    @property
+    def photographs(self) -> int:
+        return sensors_of(self.scene)
+
+
+def given(path: Path) -> Given:
+    """The capture that is meant, where its folder is given, too. Raises InputError without scene file or truth."""
+    scene = path / "scene.xml" if path.is_dir() else path
+    require_file(scene, "the folder of a capture with scene.xml and truth/mesh.ply, or its scene file")
+    truth_of(scene)
+    return Given(scene_name(scene), scene)
+
+
+def sensors_of(scene: Path) -> int:
+    """How many sensors a scene file has. Raises InputError if it is no XML."""
+    with reading(scene, "XML"):
+        return len(ElementTree.parse(scene).getroot().findall("sensor"))
+
+
+def truth_of(scene: Path) -> Path:
+    """The folder with the truth of a scene file. Raises InputError if there is none."""
+    folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
+    for folder in folders:
+        if (folder / "mesh.ply").is_file():
+            return folder
+    raise InputError(f"{scene}: has no truth, neither {folders[0]}/mesh.ply nor {folders[1]}/mesh.ply; an experiment "
+                     "compares with it, and mi-ring synthesize writes it")  # fmt: skip
+
+
+def filled(folder: Path, write: Callable[[Path], object]) -> Path:
+    """scene.xml of a folder that is written by a function, whole or not at all, unless it is there."""
+    if not (folder / "scene.xml").is_file():
+        with writing(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            try:
+                write(growing)
+                growing.chmod(0o755)
+                shutil.rmtree(folder, ignore_errors=True)  # of one that somebody has taken the scene file from
+                os.replace(growing, folder)
+            finally:
+                shutil.rmtree(growing, ignore_errors=True)
+    return folder / "scene.xml"
+
+
+@dataclass(frozen=True)
+class Example(Recipe):
+    """The small capture of a pot that `mi-ring example` writes."""
+
+    def made(self, captures: Path) -> Path:
+        return filled(captures / self.name, write_example)
+
+    @property
+    def photographs(self) -> int:
+        return VIEWS
+
+
+def own() -> Recipe:
+    """The capture that is at hand without any other data: pot2 in a checkout, else the example's pot."""
+    return Given("pot2", POT2) if POT2.is_file() else Example("example")
+
+
+@dataclass(frozen=True)
+class Synthetic(Recipe):
+    """A capture that `mi-ring synthesize` would make; without a mesh that of the example's pot."""
+
+    config: SynthesizeConfig
+    mesh: Path | None = None
+
+    @property
+    def photographs(self) -> int:
+        return self.config.views
+
+    def complete(self, captures: Path) -> SynthesizeConfig:
+        """With mesh and folder."""
+        return replace(self.config, mesh=self.mesh or captures / "pot.ply", out=captures / self.name)
+
+    def made(self, captures: Path) -> Path:
+        config = self.complete(captures)
+        require_options(config)
+        if not self.mesh and not config.mesh.is_file():
+            captures.mkdir(parents=True, exist_ok=True)
+            vertices, faces, _ = pot()
+            mesh_of(vertices, faces, normals=False).write_ply(str(config.mesh))
+        claim(config.out, config)
+        if not (config.out / "scene.xml").is_file():  # which is written last
+            with locked(config.out, "OUT"):
+                write_capture(config)
+        return config.out / "scene.xml"
+
+
+@dataclass(frozen=True)
+class Part(Recipe):
+    """So many of a capture's photographs, evenly from the first to the last."""
+
+    whole: Recipe
+    count: int
+
+    def made(self, captures: Path) -> Path:
+        return filled(captures / self.name, lambda folder: self.write(self.whole.made(captures), folder, captures))
+
+    def truth(self, captures: Path) -> Path:
+        return self.whole.truth(captures)
+
+    def write(self, scene: Path, folder: Path, captures: Path) -> None:
+        """Its scene file, of the same photographs."""
+        root = ElementTree.parse(scene).getroot()
+        move_names(root, scene.parent, captures / self.name)
+        sensors = root.findall("sensor")
+        kept = {round(k) for k in np.linspace(0, len(sensors) - 1, min(self.count, len(sensors)))}
+        for k, sensor in enumerate(sensors):
+            if k not in kept:
+                root.remove(sensor)
+        write_file(folder / "scene.xml", scene_bytes(root))
+
+
+@dataclass(frozen=True)
+class Perturbed(Recipe):
+    """A capture whose cameras are wrong, as `mi_ring.synthesis.degradation.miscalibrated` makes them."""
+
+    exact: Recipe
+    degrees: float
+    seed: int
+
+    def made(self, captures: Path) -> Path:
+        return filled(captures / self.name, lambda folder: self.write(self.exact.made(captures), folder, captures))
+
+    def truth(self, captures: Path) -> Path:
+        return self.exact.truth(captures)
+
+    def write(self, scene: Path, folder: Path, captures: Path) -> None:
+        """Its scene file, of the same photographs, which no longer says that it is calibrated."""
+        capture = load_capture(scene, images=False)
+        center, _ = capture.sphere()
+        cameras, found = [sensor.camera for sensor in capture.sensors], Lights.of(capture.sensors)
+        lights = [found[k] for k in range(len(cameras))]
+        random = np.random.default_rng(self.seed)
+        wrong = with_calibration(capture, *miscalibrated(cameras, lights, center, random, turned=self.degrees))
+        root = ElementTree.parse(scene).getroot()
+        move_names(root, scene.parent, captures / self.name)
+        content = recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)
+        write_file(folder / "scene.xml", content)
+
+
+@dataclass(frozen=True)
+class DiligentObject(Recipe):
+    """An object of DiLiGenT-MV, from its own folder."""
+
+    folder: Path
+    fill_holes: bool = False
+
+    def made(self, captures: Path) -> Path:
+        source = DiligentMV(self.folder, self.place(captures), fill_holes=self.fill_holes)
+        if source.truth is None:
+            raise InputError(f"{self.folder}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
+        if not source.scene.is_file():
+            write_scene(source)
+        return source.scene
+
+
+@dataclass(frozen=True)
+class SingleView(Recipe):
+    """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
+
+    It has `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z to
+    the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes, 0 where none is known) and `K` (3, 3).
+    """
+
+    file: Path
+
+    def read(self) -> dict[str, np.ndarray]:
+        """The arrays. Raises InputError if one is missing."""
+        require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
+        arrays = load_npz(self.file)
+        for name, dimensions in SINGLE.items():
+            if name not in arrays or arrays[name].ndim != dimensions:
+                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
+        return arrays
+
+    def made(self, captures: Path) -> Path:
+        return filled(captures / self.name, self.write)
+
+    def write(self, folder: Path) -> None:
+        """As a scene with 16-bit photographs, the camera at the origin looking along z, 1.5 m from the object."""
+        data = self.read()
+        mask, K = data["mask"] > 0, data["K"]
+        height, width = mask.shape
+        focal, centre = np.array([K[0, 0], K[1, 1]]), np.array([K[0, 2], K[1, 2]])
+        camera = Camera(np.eye(4), focal, centre + 0.5, (width, height))
+        (folder / "images").mkdir(parents=True)
+        write_image(mask[..., None].astype(np.uint8) * 255, folder / "mask.png")
+        elements: list[Element] = []
+        for k, (pixels, to_light, rgb) in enumerate(zip(data["pixels_uint16"], data["light_dir"], data["light_int"])):
+            image = np.zeros((height, width, 3), np.uint16)
+            image[mask] = pixels
+            file = f"images/{k:03}.png"
+            write_image(image, folder / file)
+            light = Light("directional", -AXES * to_light, np.asarray(rgb, float))
+            elements.append(photograph_element(f"{k:03}", file, camera, light, "mask.png"))
+        root = scene_element(elements)
+        place = DISTANCE * (centre - np.argwhere(mask).mean(0)[::-1]) / focal
+        shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
+        x, y = map(str, place)
+        ElementTree.SubElement(shape, "point", name="center", x=x, y=y, z=str(DISTANCE))
+        radius = np.sqrt(mask.sum() / np.pi) * DISTANCE / focal[0]
+        ElementTree.SubElement(shape, "float", name="radius", value=str(radius))
+        write_file(folder / "scene.xml", scene_bytes(root))

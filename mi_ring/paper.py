@@ -1,0 +1,82 @@
+"""Reproduce a table or figure of the paper, ours beside it: `python -m mi_ring.paper NAME`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from mi_ring.errors import InputError
+from mi_ring.experiments.catalogue import EXPERIMENTS
+from mi_ring.experiments.engine import perform
+from mi_ring.experiments.experiment import Asked
+from mi_ring.system import command
+from mi_ring.system.files import locked
+from mi_ring.system.machine import set_variant
+
+Name: Any = Literal[tuple(EXPERIMENTS)]
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
+
+    Each run is a fit whose results are in OUT/NAME/runs/; table.csv, table.md and figure.png beside it are there after
+    each. The same command again goes on where it stopped. A run that fails is shown as such and does not stop the
+    others; the exit status is then 1.
+    """
+
+    name: Positional[Annotated[Name, arg(metavar="NAME")]]
+    """table1: accuracy; table2: DiLiGenT-MV; table3: poses that are refined; specularity: materials of rising gloss;
+    stripes: two materials; views: 5 to 50 photographs; ablation: the ring against plain ResNets; encoding; steps: the
+    paper's T; genus: from a sphere and from a hull; swap: materials exchanged; resolution: one fit at several levels;
+    timing: errors in the course of a fit; single: DiLiGenT's photographs from one side."""
+    data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]] = ()
+    """Folders of captures (scene.xml, truth/mesh.ply) or meshes; one mesh for specularity and stripes; the folder of
+    DiLiGenT-MV for table2, .npz files for single. Default, but for these two: what is at hand, pot2 or the example's
+    pot."""
+    materials: tuple[str, ...] = ()
+    """What meshes are made of, as mi-ring synthesize has them: in turn, all on the one mesh of specularity, two in
+    stripes."""
+    out: Path = Path("out/paper")
+    """Folder of the results of all experiments, each in a folder of its name, and of the captures that they make."""
+    preset: Literal["fast", "default", "fine", "paper"] = "default"
+    """Of the fits, as mi-ring fit has them."""
+    seeds: tuple[int, ...] = (0,)
+    """Random seeds: each run once with each, and the mean."""
+    only: tuple[str, ...] = ()
+    """Names of runs to make now, the others later. Default: all."""
+    quick: bool = False
+    """A small version of everything, in minutes: few runs, few iterations of small photographs. Its results are in a
+    folder of their own, NAME-quick."""
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
+    """Variant of Mitsuba: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
+    threads: int = 0
+    """Processor threads of each fit; 0: all."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command. Returns its exit status: 1 if a run has failed."""
+    config = command.parse(PaperConfig, arguments, "mi_ring.paper")
+    if config.threads < 0 or not config.seeds or len({*config.seeds}) < len(config.seeds):
+        name, value = ("threads", config.threads) if config.threads < 0 else ("seeds", config.seeds)
+        raise InputError(f"--{name}: is {value}, must be {'0 or more' if name == 'threads' else 'different numbers'}")
+    if missing := next((path for path in config.data if not path.exists()), None):
+        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
+    preset = "fast" if config.quick else config.preset
+    variant = set_variant(config.variant)
+    asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
+    out = config.out / f"{config.name}{'-quick' * config.quick}"
+    settings = "--quick" if config.quick else f"--preset {preset}"
+    seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
+    with locked(out):
+        failed = perform(
+            EXPERIMENTS[config.name], asked, out, config.only, f"mi-ring paper {config.name} {settings}{seeds}"
+        )
+    print(f"{out}/table.md and figure.png{f'; {failed} runs failed' * bool(failed)}")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    command.run("mi_ring.paper", main)

@@ -1,0 +1,301 @@
+"""`mi-ring paper`: the experiments are valid, and the engine shows what has become of each run."""
+
+import csv
+import dataclasses
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import AXES, CENTER
+from scipy.spatial.transform import Rotation
+
+from mi_ring import paper
+from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
+from mi_ring.experiments import engine, measures, published, recipes, tables
+from mi_ring.experiments.catalogue import EXPERIMENTS
+from mi_ring.experiments.experiment import QUICK, Asked, Column, Experiment, Made, Outcome, Run
+from mi_ring.experiments.figures import bars
+from mi_ring.fit import parse_options
+from mi_ring.fitting.config import Config
+from mi_ring.ring.ring import Ring
+from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.synthesis.stage import shape_of
+
+TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
+
+
+@pytest.fixture(scope="module")
+def known_capture(small_capture, tmp_path_factory):
+    """A folder with the small capture and its truth."""
+    folder = tmp_path_factory.mktemp("known") / "egg"
+    shutil.copytree(small_capture.parent, folder)
+    (folder / "small.xml").rename(folder / "scene.xml")
+    (folder / "truth").mkdir()
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    trimesh.Trimesh(CENTER + ball.vertices * AXES @ turn.T, ball.faces).export(folder / "truth" / "mesh.ply")
+    return folder
+
+
+@pytest.fixture
+def photographed_ball(tmp_path):
+    """An .npz of "photographs" of a ball from one side, with the true normals, by the formulas of a pinhole."""
+    height, width, focal, centre, radius = 40, 56, 400.0, np.array([29.0, 18.0]), 60.0
+    y, x = np.mgrid[:height, :width]
+    rays = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones((height, width))], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)  # OpenCV's axes: x right, y down, z forward
+    middle = np.array([2.0, -3.0, recipes.DISTANCE])
+    along = rays @ middle
+    inside = along**2 - middle @ middle + radius**2
+    mask = inside > 0
+    points = rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None]
+    normals = np.where(mask[..., None], (points - middle) / radius, 0) * [1, -1, -1]  # x right, y up, z to the viewer
+    lights = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.6, 0.8]])
+    pixels = (20000 * np.maximum(normals[mask] @ lights.T, 0)).T[..., None].repeat(3, -1).astype(np.uint16)
+    K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+    file = tmp_path / "ball.npz"
+    np.savez(file, mask=mask, pixels_uint16=pixels, light_dir=lights, light_int=np.ones((3, 3)), normal_gt=normals, K=K)
+    return file, middle * [-1, -1, 1], radius  # as Mitsuba's camera, at the origin, has it
+
+
+def data_for(name, known_capture, ball, tmp_path):
+    """DATA of an experiment."""
+    if name == "table2":
+        (tmp_path / "mvpmsData" / "bearPNG").mkdir(parents=True)
+        (tmp_path / "mvpmsData" / "bearPNG" / "Calib_Results.mat").touch()
+        return (tmp_path,)
+    return {"single": (ball,), "specularity": (), "stripes": (), "swap": ()}.get(name, (known_capture,))
+
+
+# The experiments.
+
+
+def test_every_run_is_one_that_a_fit_takes(known_capture, photographed_ball, tmp_path):
+    for name, experiment in EXPERIMENTS.items():
+        require_valid(experiment, data_for(name, known_capture, photographed_ball[0], tmp_path), known_capture)
+
+
+def require_valid(experiment, data, known_capture):
+    for asked in (
+        Asked(data, seeds=(3,)),
+        Asked(data, preset="paper", seeds=(0, 1)),
+        Asked(data, (), "fast", quick=True),
+    ):
+        runs = experiment.runs(asked)
+        assert runs and len({run.name for run in runs}) == len(runs)
+        for run in runs:
+            config = run.config(asked)
+            assert Path(run.name).name == run.name and set(experiment.columns).isdisjoint(run.labels)
+            assert config.iterations == QUICK["iterations"] or not asked.quick
+            if len(asked.seeds) == 1:  # reading options takes a while
+                command = parse_options([str(known_capture / "scene.xml"), *run.options(asked)])
+                assert {f.name: getattr(command, f.name) for f in dataclasses.fields(Config)} == vars(config)
+
+
+def test_what_the_paper_compares_is_what_runs_differ_in(known_capture):
+    def of(name, *fields):
+        return {tuple(getattr(run.config(asked), f) for f in fields) for run in EXPERIMENTS[name].runs(asked)}
+
+    asked = Asked((known_capture,))
+    assert of("steps", "steps") == {(t,) for t in (1, 2, 3, 5, 10, 20, 40)}
+    assert {("ring", "sphere"), ("resnet", "sphere"), ("wide-resnet", "sphere")} <= of(
+        "ablation", "shape_net", "domain"
+    )
+    assert {("linear", 16), ("octaves", 10), ("none", 16)} <= of("encoding", "encoding", "frequencies")
+    assert of("genus", "domain") == {("sphere",), ("hull",)}
+    assert of("table3", "refine") == {(("none",),), (("cameras",),)}
+    assert [run.labels["views"] for run in EXPERIMENTS["views"].runs(asked)] == [5, 10, 12]  # it has twelve
+
+
+def test_published_figures():
+    bunny, *_, teapot, tool = published.TABLE1
+    assert bunny == {"capture": "bunny", "by": "paper", "normal_mean": 3.61, "normal_median": 2.21, "depth_mean": 0.18,
+                     "depth_median": 0.09, "psnr_input": 33.9, "psnr_novel": 33.5}  # fmt: skip
+    assert (teapot["normal_mean"], teapot["psnr_novel"], tool["psnr_input"]) == (5.75, 27.6, 33.1)
+    assert np.mean([row["normal_mean"] for row in published.TABLE1]) == pytest.approx(29.16 / 7)
+    assert {row["object"]: (row["normal_mean"], row["depth_mm"]) for row in published.TABLE2} == {
+        "bear": (4.42, 0.75), "buddha": (12.08, 0.67), "cow": (4.21, 0.77), "pot2": (6.63, 0.58),
+        "reading": (7.61, 0.58),
+    }  # fmt: skip
+    wrong, refined = published.TABLE3
+    assert (wrong["normal_mean"], wrong["depth_mean"], wrong["psnr_novel"]) == (10.3, 1.34, 25.6)
+    assert (refined["normal_mean"], refined["depth_mean"], refined["psnr_novel"]) == (6.6, 0.65, 32.9)
+
+
+MISTAKES = [
+    (["nonsense"], "name: is nonsense; must be one of table1, table2"),
+    (["table1", "nowhere"], "nowhere: DATA: is not there; table1 takes folders of captures"),
+    (["table1", "--seeds", "1", "1"], "--seeds: is .1, 1., must be different"),
+    (["table1", "--threads", "-1"], "--threads: is -1, must be 0 or more"),
+    (["table1", "EMPTY"], "scene.xml"),
+    (["table1", "--only", "other"], "--only: has other, must be of"),
+    (["table2"], "DATA: table2 needs one folder, that of DiLiGenT-MV"),
+    (["table2", "EMPTY"], "has no mvpmsData/bearPNG/Calib_Results.mat"),
+    (["single"], "DATA: single needs .npz files"),
+    (["single", "EMPTY"], "is a folder"),
+    (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
+    (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
+    (["specularity", "EMPTY"], "DATA: must be one mesh"),
+    (["swap", "KNOWN"], "DATA: is one capture; swap exchanges"),
+    (["table1", "KNOWN", "KNOWN"], "two captures of one name would both be egg"),
+]  # fmt: skip
+
+
+def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
+    (tmp_path / "empty").mkdir()
+    places = {"EMPTY": str(tmp_path / "empty"), "KNOWN": str(known_capture)}
+    for arguments, message in MISTAKES:
+        with pytest.raises(InputError, match=message):
+            paper.main([*(places.get(word, word) for word in arguments), "--out", str(tmp_path / "out")])
+    assert not list((tmp_path).rglob("table.md"))
+
+
+def test_a_capture_without_truth_is_refused(small_capture):
+    with pytest.raises(InputError, match="has no truth, neither"):
+        recipes.given(small_capture)
+
+
+# The engine.
+
+
+def trial(runs):
+    columns = {"normal_mean": Column("normals °"), "iou": Column("IoU", 3)}
+    reference = [{"capture": "egg", "by": "somebody", "normal_mean": 5.0}]
+    return Experiment("A trial.", lambda asked: runs, columns, bars(("normal_mean", "°")), reference, "seed")
+
+
+def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, tmp_path, monkeypatch):
+    asked, out = Asked(preset="fast", threads=1, quick=True), tmp_path / "trial"
+    egg, broken = recipes.given(known_capture), recipes.Given("cup", tmp_path / "cup.xml")
+    runs = [Run(f"egg-{k}", egg, {"capture": "egg", "seed": k}, TINY | {"seed": k}, watched=k == 1) for k in (0, 1)]
+    runs.insert(1, Run("cup", broken, {"capture": "cup", "seed": 0}, TINY))
+
+    assert engine.perform(trial(runs), asked, out, ["egg-0"]) == 0
+    rows = list(csv.DictReader((out / "table.csv").open()))
+    assert [row["state"] for row in rows] == ["", "not run", "not run", "", ""]  # with the mean of one
+    ring = (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns
+
+    measured = []
+
+    def evaluated(run, made):
+        measured.append(run.name)
+        return measures.evaluated(run, made)
+
+    monkeypatch.setattr(engine, "evaluated", evaluated)
+    assert engine.perform(trial(runs), asked, out) == 1
+    assert measured == ["egg-1"] and (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns == ring
+    rows = list(csv.DictReader((out / "table.csv").open()))
+    assert [(row["capture"], row["seed"], row["by"]) for row in rows] == [
+        ("egg", "0", "ours"), ("cup", "0", "ours"), ("egg", "1", "ours"), ("egg", "mean of 2", "ours"),
+        ("egg", "", "somebody"),
+    ]  # fmt: skip
+    assert rows[1]["state"].startswith("failed: ") and "cup.xml" in rows[1]["state"] and not rows[1]["normal_mean"]
+    for name in ("normal_mean", "iou"):
+        own = [float(row[name]) for row in rows if row["capture"] == "egg" and row[name]]
+        assert own[2] == pytest.approx((own[0] + own[1]) / 2)
+        assert own[0] > 0
+    text = (out / "table.md").read_text()
+    assert text.startswith("A trial.") and f"| egg | 0 | ours | {float(rows[0]['normal_mean']):.2f} |" in text
+    assert (out / "figure.png").stat().st_size > 1000
+
+    # The second was looked at in its course, which ends with its result.
+    made = Made(out / "runs" / "egg-1", egg.scene, egg.truth(out), out, asked)
+    course = measures.course(runs[2], made)
+    assert [row["iteration"] for row in course] == [1, 2] and 0 < course[0]["seconds"] < course[1]["seconds"]
+    monkeypatch.setattr(measures, "LEVELS", (1, 2, 3))
+    levels = measures.by_level(runs[2], made)
+    assert [row["vertices"] for row in levels] == [10 * 4**k + 2 for k in (1, 2, 3)]
+    for row in (course[-1], levels[TINY["subdivisions"] - 1]):
+        assert row["normal_mean"] == pytest.approx(float(rows[2]["normal_mean"]), abs=1e-3)
+
+
+def test_numbers_that_are_none_are_shown():
+    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    other = dataclasses.replace(run, name="b", labels={"capture": "egg", "seed": 1})
+    outcomes = [Outcome(run, None, [{"normal_mean": float("nan")}], ""), Outcome(other, failed="it | burst")]
+    experiment = trial([run, other])
+    rows = tables.table_of(experiment, outcomes)
+    names = tables.headings(experiment, outcomes, rows)
+    assert list(names.values()) == ["capture", "seed", "by", "normals °", "state"]
+    text = tables.markdown(experiment, names, rows, "said")
+    assert "| egg | 0 | ours | nan |  |" in text and "| egg | 1 | ours |  | failed: it / burst |" in text
+    assert "| egg | mean of 1 of 2 | ours | nan |  |" in text and "| egg |  | somebody | 5.00 |  |" in text
+
+
+# What is measured, and the captures.
+
+
+def test_slices_are_those_of_equation_1():
+    random = np.random.default_rng(1)
+    material = {"diffuse": random.uniform(0.1, 0.5, (5, 3)), "specular": random.uniform(0.02, 0.2, 5),
+                "roughness": random.uniform(0.2, 0.8, 5)}  # fmt: skip
+    found = measures.slices(measures.bsdf_of(Ring(torch.zeros(3), 1.0), material), 5)
+    cosine, r = np.cos(measures.ANGLES), material["roughness"][:, None]
+    d = r**2 / (cosine**2 * (r**2 - 1) + 1) ** 2
+    g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(measures.ANGLES) ** 2))) ** 2
+    gloss = material["specular"][:, None] * d * g / np.pi / cosine**2
+    np.testing.assert_allclose(found, material["diffuse"][:, None] + gloss[..., None], rtol=1e-3)
+    grey = measures.slices(load_material("diffuse reflectance=0.3,0.6,0.9", "--material", False), 1)
+    np.testing.assert_allclose(grey, np.broadcast_to(np.array([0.3, 0.6, 0.9]) / np.pi, grey.shape), rtol=1e-5)
+
+
+def test_errors_of_slices():
+    truth, other = np.full((4, 2, 3), 0.2), np.full((4, 2, 3), 0.8)
+    found = truth * np.array([1.1, 0.9, 1.3, 5.0])[:, None, None]
+    row = measures.compare_slices(found, truth, other)
+    assert row["slice_error"] == pytest.approx(20) and row["right_material"] == pytest.approx(75)
+    assert "right_material" not in measures.compare_slices(found, truth, None)
+
+
+def test_places_of_the_second_material_are_where_it_is_seen():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    config = SynthesizeConfig(Path(), Path(), "diffuse reflectance=0,0,0", "diffuse reflectance=1,1,1", bands=5)
+    black, white = (load_material(str(m), "", False) for m in (config.material, config.second))
+    pattern = pattern_of("stripes", np.asarray(ball.vertices), 5, 1, "")
+    scene = mi.load_dict({"type": "scene", "ball": shape_of(ball, None, pattern.of(black, white), pattern)})
+    points = ball.triangles_center
+    out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))
+    seen = np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi))[0] > 0.1
+    found = measures.second_at(config, np.concatenate([ball.vertices, points]))[len(ball.vertices) :]
+    assert np.array_equal(found, seen) and 0.3 < found.mean() < 0.7
+
+
+def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp_path):
+    file, middle, radius = photographed_ball
+    recipe = recipes.SingleView("single-ball", file)
+    scene = recipe.made(tmp_path / "captures")
+    center, size = load_capture(scene).sphere()
+    assert np.linalg.norm(center - middle) < 3 and size == pytest.approx(radius, rel=0.05)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    trimesh.Trimesh(middle + radius * ball.vertices, ball.faces).export(folder / "mesh.ply")
+    (folder / "log.jsonl").write_text('{"seconds": 7.0}\n')
+    made = Made(folder, scene, tmp_path / "none", tmp_path / "captures", Asked())
+    (row,) = measures.normals_from_one_side(Run("ball", recipe, {}), made)
+    assert row["normal_mean"] < 0.5 and row["missed"] < 2 and row["seconds"] == 7
+    with pytest.raises(InputError, match="has no array light_dir of 2 dimensions"):
+        np.savez(file, **{k: v for k, v in np.load(file).items() if k != "light_dir"})
+        recipe.read()
+
+
+def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture, tmp_path):
+    egg = recipes.given(known_capture)
+    whole = load_capture(egg.scene)
+    part = recipes.Part("part", egg, 5)
+    some = load_capture(part.made(tmp_path))
+    assert [sensor.id() for sensor in some.sensors] == ["000", "003", "006", "008", "011"]
+    assert part.truth(tmp_path) == known_capture / "truth"
+    torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
+    wrong = recipes.Perturbed("wrong", egg, 0.5, 0)
+    other = load_capture(wrong.made(tmp_path))
+    torch.testing.assert_close(other.observe([3]).rgb, whole.observe([3]).rgb)
+    assert 0.4 < measures.turns(egg.scene, other.path) < 1.4  # √3 · 0.5° but for chance
+    assert measures.turns(egg.scene, egg.scene) < 1e-3
