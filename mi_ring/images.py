@@ -3,10 +3,12 @@
 import contextlib
 import math
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import drjit as dr
 import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
@@ -21,6 +23,7 @@ from mi_ring.system.files import write_file
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
+ENOUGH, ONE_AT_A_TIME = 2, threading.Lock()  #: threads for an EXR; who changes their number
 EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader holds some, however low the picture is
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
@@ -135,7 +138,8 @@ def read_image(path: Path) -> np.ndarray:
     elif suffix == ".exr":
         width, height, channels = exr_size(path)
         require_room(path, 4 * width * max(height, EXR_CHUNK) * channels)
-        pixels = np.array(mi.Bitmap(str(path)), copy=True)
+        with threads_for_exr():
+            pixels = np.array(mi.Bitmap(str(path)), copy=True)
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
         with opened(path) as image:
             pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
@@ -145,6 +149,21 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
+
+
+@contextlib.contextmanager
+def threads_for_exr() -> Iterator[None]:
+    """Threads enough for Mitsuba to read or write an EXR: on a single one it waits forever."""
+    if dr.thread_count() >= ENOUGH:
+        yield
+        return
+    with ONE_AT_A_TIME:
+        before = dr.thread_count()
+        dr.set_thread_count(ENOUGH)
+        try:
+            yield
+        finally:
+            dr.set_thread_count(before)
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
@@ -164,5 +183,6 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
-    mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
+    with threads_for_exr() if kind == formats.OpenEXR else contextlib.nullcontext():
+        mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
     write_file(path, stream.raw_buffer())

@@ -222,3 +222,18 @@ def test_fits_that_torchrun_starts_see_one_gpu_each_and_other_programs_all_of_th
     monkeypatch.setattr(sys, "orig_argv", words)
     gpus.choose_gpu()
     assert there["CUDA_VISIBLE_DEVICES"] == seen and (gpus.OWN in there) == (seen == "7")
+
+
+def test_an_exr_is_written_and_read_on_a_single_thread(tmp_path):
+    """In a process of its own: Mitsuba would wait forever."""
+    script = f"""
+import mi_ring, numpy as np
+from pathlib import Path
+from mi_ring.images import read_image, write_image
+from mi_ring.system.machine import set_threads
+set_threads(1)
+pixels, path = np.arange(105, dtype=np.float32).reshape(5, 7, 3), Path({str(tmp_path / "a.exr")!r})
+write_image(pixels, path)
+assert (read_image(path) == pixels).all()
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

@@ -59,7 +59,7 @@ class Fit:
     `Term` or a function of an `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration`
     when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there.
 
-    A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand, once the capture is read.
+    A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand.
 
     Raises InputError where capture, settings, terms and networks do not go together.
     """

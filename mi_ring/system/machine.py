@@ -156,8 +156,7 @@ def set_threads(count: int = 0) -> None:
 def threads_of(count: int = 0) -> Iterator[None]:
     """So many threads of torch and Dr.Jit, by default all `cores`, and those of before at the end.
 
-    Parallel sums depend on the order in which threads finish: one thread is what determinism costs. Not for reading: on
-    one, Mitsuba waits forever for an EXR.
+    Parallel sums depend on the order in which threads finish: one thread is what determinism costs.
     """
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(count)
