@@ -66,12 +66,15 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
         scene = run.recipe.made(captures)
         made = Made(folder, scene, run.recipe.truth(captures), captures, asked)
         job = Job(scene.resolve(), folder, run.options(asked))
-        if not job.is_done(job.fingerprint()):
+        fingerprint = job.fingerprint()
+        if not job.is_done(fingerprint):
             if not wanted:
                 return Outcome(run)
             print(f"fitting, see {job.output}", flush=True)
             job.output.parent.mkdir(parents=True, exist_ok=True)
-            record = watched(run, job, made) if run.watched else fit_to_the_end(job, RETRIES, threads(asked))
+            record = (
+                watched(run, job, made) if run.watched else fit_to_the_end(job, fingerprint, RETRIES, threads(asked))
+            )
             if record.state != "done":
                 return Outcome(run, failed=record.message)
         return Outcome(run, made, measured(run, made), "")
