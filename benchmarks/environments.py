@@ -34,7 +34,7 @@ from mi_ring.rendering.rooms import BASIS, COUNT, ORDER, seen_from_within
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
-RELIT = 4  #: photographs under another light
+RELIT, SMOOTH = 4, 256  #: photographs under another light, and paths per pixel, lest noise be all that they show
 
 
 def directions(rows: int = ROWS) -> np.ndarray:
@@ -91,7 +91,7 @@ def run(*arguments: object) -> str:
 
 def relit_psnr(fit: Path, truth: Path) -> float:
     """Of pictures of a fit under the light of a scene, after one factor for each colour."""
-    run("mi_ring.render", fit, truth / "scene.xml", fit / "relit", "--spp", 64)
+    run("mi_ring.render", fit, truth / "scene.xml", fit / "relit", "--spp", SMOOTH)
     ours, theirs = [], []
     for path in sorted((truth / "images").glob("*.exr")):
         inside = read_image(truth / "masks" / f"{path.stem}.png").squeeze() > 127
@@ -143,7 +143,7 @@ def main() -> None:
                 other = list(own)[(list(own).index(light) + 1) % len(own)]
                 relit = args.out / f"{name}-in-{other}"
                 run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--novel", 0, "--seed", 7, *usual,
-                    "--environment", args.out / f"{other}.exr")  # fmt: skip
+                    "--spp", SMOOTH, "--environment", args.out / f"{other}.exr")  # fmt: skip
                 calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
                 true = brightest(as_harmonics(own[light]))
                 off = np.degrees(np.arccos(np.clip(true @ brightest(calibrated.photographs.room), -1, 1)))

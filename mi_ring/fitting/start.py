@@ -1,6 +1,7 @@
 """Where a fit starts: the networks, the surface that is deformed, and the sphere that normalises it."""
 
 import math
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,8 @@ def starting_ring(
     domain, center, radius = starting_surface(capture, config.domain)
     require_view_from_outside(capture, domain, center, radius)
     parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
+    if config.light != "capture":
+        bsdf = with_fresnel(bsdf)
     scale = capture.reflectance(center, exposure)
     bounded = all(math.isfinite(p.high) for p in parameters)
     if math.pi * scale >= 1 and bounded:
@@ -59,6 +62,17 @@ def starting_ring(
                 networks, capture.shape.ground, capture.shape.up, capture.shape.metres, config.material_at)  # fmt: skip
     require_networks(ring)
     return ring
+
+
+def with_fresnel(bsdf: str) -> str:
+    """A `cooktorrance` as XML, that reflects more at grazing angles unless it says something of that itself.
+
+    A flash at the camera does not see it, light from the other side does.
+    """
+    element = ElementTree.fromstring(bsdf)
+    if element.find("boolean[@name='fresnel']") is None:
+        ElementTree.SubElement(element, "boolean", name="fresnel", value="true")
+    return ElementTree.tostring(element, "unicode")
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
