@@ -125,11 +125,11 @@ def main() -> None:
     rows = []
     for mesh in args.meshes:
         name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
-        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--spp", args.spp]
+        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--novel", 0]
         for light in [*args.maps, *(["flash"] if args.flash else [])]:
             capture, fit = args.out / f"{name}-{light}", args.out / f"{name}-{light}-fit"
             lit = [] if light == "flash" else ["--environment", args.out / f"{light}.exr", "--wrong-room"]
-            run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--novel", 0, *usual, *lit)
+            run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--spp", args.spp, *usual, *lit)
             found = [] if light == "flash" else ["--light", "environment"]
             run("mi_ring.fit", capture / "scene.xml", "--out", fit, *found, *options)
             truth = capture / "truth/mesh.ply"
@@ -142,8 +142,8 @@ def main() -> None:
             else:
                 other = list(own)[(list(own).index(light) + 1) % len(own)]
                 relit = args.out / f"{name}-in-{other}"
-                run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--novel", 0, "--seed", 7, *usual,
-                    "--spp", SMOOTH, "--environment", args.out / f"{other}.exr")  # fmt: skip
+                run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--seed", 7, *usual, "--spp", SMOOTH,
+                    "--environment", args.out / f"{other}.exr")  # fmt: skip
                 calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
                 true = brightest(as_harmonics(own[light]))
                 off = np.degrees(np.arccos(np.clip(true @ brightest(calibrated.photographs.room), -1, 1)))
