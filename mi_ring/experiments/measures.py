@@ -137,8 +137,9 @@ def with_slices(run: Run, made: Made) -> list[Row]:
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
     """Of slices (V, angles, 3) at as many points of the surface.
 
-    `slice_error`: mean over angles and channels of |found / true − 1| [%], median over the points. `right_material`:
-    share of points [%] whose slice, as logarithms, is nearer to the true one than to that of the `other` material.
+    `slice_error`: absolute value of found / true − 1, mean over angles and channels, median over the points [%].
+    `right_material`: share of points [%] whose slice, as logarithms, is nearer to the true one than to that of the
+    `other` material.
     """
     error = np.abs(found / np.maximum(truth, 1e-9) - 1).mean((1, 2))
     row = {"slice_error": 100 * float(np.median(error))}
