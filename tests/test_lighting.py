@@ -13,9 +13,9 @@ import mi_ring
 from mi_ring import synthesize
 from mi_ring.errors import InputError
 from mi_ring.fitting import lighting
-from mi_ring.fitting.lighting import Lighting, brightest, frames, lit
+from mi_ring.fitting.lighting import Lighting, brightest, lit
 from mi_ring.images import read_image, write_image
-from mi_ring.rendering.rooms import BASIS, seen_from_within
+from mi_ring.rendering.rooms import BASIS, frames_of, seen_from_within
 from mi_ring.rendering.shading import is_room
 
 TINY = {
@@ -76,6 +76,40 @@ def test_an_environment_is_found_and_written(in_an_environment, tmp_path):
     assert 0.3 < albedo < 0.8
 
 
+def test_coarse_fits_find_that_it_is_an_environment(in_an_environment):
+    capture = mi_ring.load_capture(in_an_environment)
+    assert mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="auto")).lighting.kind == "environment"
+
+
+def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_path):
+    capture = mi_ring.load_capture(in_an_environment)
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="turntable"))
+    list(fit)
+    fit.save(tmp_path)
+    again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
+    assert frames_of(again.scene) == {"camera"}
+    np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
+
+
+def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environment):
+    """Without a light of their own nothing says how much the object reflects: the fit begins with a half."""
+    scene = in_an_environment.with_name("known.xml")
+    lamp = '<emitter type="envmap"><string name="filename" value="../lobe.exr"/></emitter></scene>'
+    scene.write_text(in_an_environment.read_text().replace("</scene>", lamp))
+    capture = mi_ring.load_capture(scene)
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 4}))
+    assert fit.albedo == pytest.approx(0.5)
+    assert all(np.isfinite(it.loss) for it in fit)
+    with pytest.raises(InputError, match="take the lamps of the scene out"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
+
+
+def test_what_does_not_go_together_is_said(in_an_environment, small_capture):
+    capture = mi_ring.load_capture(in_an_environment)
+    with pytest.raises(InputError, match="--refine power: is of the photographs' own lights"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", light="environment", refine=("power",)))
+
+
 def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
     capture = mi_ring.load_capture(in_an_environment)
     config = mi_ring.Config.preset("fast", **TINY, light="environment")
@@ -122,12 +156,6 @@ def test_other_reflectances_than_cooktorrance_are_refused(small_capture, tmp_pat
     capture = mi_ring.load_capture(scene)
     with pytest.raises(InputError, match="bsdf: --light environment is for cooktorrance alone"):
         mi_ring.Fit(capture, mi_ring.Config.preset("fast", light="environment"))
-
-
-def test_axes_are_those_of_the_light(small_capture):
-    capture = mi_ring.load_capture(small_capture)
-    assert list(frames(capture, Lighting("environment"))) == ["world"]
-    assert list(frames(capture, Lighting("turntable"))) == ["camera"]
 
 
 def test_a_flash_capture_is_found_to_be_one(small_capture):

@@ -1,6 +1,7 @@
 """A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
 
 import functools
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -179,8 +180,12 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights."""
-        return float(exposure / np.median(self.photographs.irradiance(center).mean(1)))
+        """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights.
+
+        An albedo of one half where photographs have no light of their own: what others bring nobody knows.
+        """
+        received = float(np.median(self.photographs.irradiance(center).mean(1)))
+        return exposure / received if received > 0 else 0.5 / math.pi
 
     @property
     def up(self) -> np.ndarray:

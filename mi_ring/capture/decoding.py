@@ -92,9 +92,10 @@ def read_photograph(sensor: Any, scene: Path) -> np.ndarray:
                          "curve; leave out gamma and contrast, or subtract it before")  # fmt: skip
     pictures = [image, read_colours(sensor, sensor.ambient, "ambient", scene)]
     (lit, clipped), (ambient, too) = (decode(p, is_linear(sensor, p), sensor.saturation) for p in pictures)
+    difference = lit - ambient  # noise about 0 and all
+    if sensor.encoding == "srgb":
+        difference = linear_to_srgb(difference.clip(min=0))
     # Where either is clipped nothing is known but that it is bright.
-    value = np.where(clipped | too, np.float32(1.0), np.maximum(lit - ambient, 0))
-    difference = linear_to_srgb(value) if sensor.encoding == "srgb" else value
     return np.where(clipped | too, np.float32(sensor.saturation), difference).astype(np.float32)
 
 

@@ -73,7 +73,9 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
             print(f"fitting, see {job.output}", flush=True)
             job.output.parent.mkdir(parents=True, exist_ok=True)
             record = (
-                watched(run, job, made) if run.watched else fit_to_the_end(job, fingerprint, RETRIES, threads(asked))
+                watched(run, job, fingerprint, made)
+                if run.watched
+                else fit_to_the_end(job, fingerprint, RETRIES, threads(asked))
             )
             if record.state != "done":
                 return Outcome(run, failed=record.message)
@@ -101,7 +103,7 @@ def measured(run: Run, made: Made) -> list[Row]:
     return before["rows"]
 
 
-def watched(run: Run, job: Job, made: Made) -> Record:
+def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
     """Fit in this process, and write what the errors of normals and depth were in its course."""
     mesh, truth = load_true_mesh(made.truth / "mesh.ply")
     rows: list[Row] = []
@@ -122,7 +124,7 @@ def watched(run: Run, job: Job, made: Made) -> Record:
         fit.save(job.folder)
     write_file(job.folder / COURSE, json.dumps(rows))
     ring = written(job.folder / "ring.pt")
-    return job.note(replace(job.record, state="done", done=job.fingerprint(), written=ring))
+    return job.note(replace(job.record, state="done", done=fingerprint, written=ring))
 
 
 def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) -> None:

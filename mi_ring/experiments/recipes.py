@@ -217,7 +217,8 @@ class Perturbed(Recipe):
         cameras, found = [sensor.camera for sensor in capture.sensors], Lights.of(capture.sensors)
         lights = [found[k] for k in range(len(cameras))]
         random = np.random.default_rng(self.seed)
-        wrong = with_calibration(capture, *miscalibrated(cameras, lights, center, random, turned=self.degrees))
+        moved = miscalibrated(cameras, lights, center, random, turned=self.degrees)
+        wrong = with_calibration(capture, *moved, room=capture.photographs.room)
         root = ElementTree.parse(scene).getroot()
         move_names(root, scene.parent, captures / self.name)
         content = recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)

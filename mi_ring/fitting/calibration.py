@@ -52,6 +52,8 @@ UNKNOWNS: dict[str, dict[str, float]] = {
 #: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
 #: the reflectance, and takes the flash's place and the room along (docs/phone.md).
 AUTO = "light", "power", "ambient"
+#: What is of the photographs' own lights, which an unknown environment takes the place of.
+OF_LIGHTS = {"light", "power", "falloff", "scale"}
 ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 START = 0.2  #: progress of the fit when refinement begins
@@ -66,8 +68,8 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     """
     names: set[str] = set(config.refine)
     unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamp": {"light", "ambient"}}.get(config.light)
-    if unknown:  # nothing else can be told of them
-        names = (names - {"auto"}) | unknown
+    if unknown:
+        names = (names - {"auto"} - (OF_LIGHTS if "light" not in unknown else set())) | unknown
     if "auto" in names and not capture.known:
         untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
         names |= {*AUTO, "scale"} if untold else {*AUTO}
@@ -259,7 +261,7 @@ class Calibration(nn.Module):
         curve = self.curve_now
         return curve.linear(recorded, index, self.cosines(index, scale) if curve.shading else None)
 
-    def photographs(self, photographs: Photographs, calibrated: Sequence[Tensor]) -> Photographs:
+    def as_found(self, photographs: Photographs, calibrated: Sequence[Tensor]) -> Photographs:
         """Photographs with cameras and lights as `calibrated`, and the room as it is by now; without gradients."""
         room = self.roomlight().double().numpy(force=True)
         return replace(bridge.calibrated(photographs, calibrated), room=room if room.any() else None)

@@ -57,7 +57,8 @@ class Fit:
     `networks`: (Shape-Net, BRDF-Net), others than the paper's, which are trained in place, as
     `mi_ring.nets.shapenet.Flow` and `mi_ring.nets.brdfnet.ReflectanceMap` say. `terms`: of the loss, by name, each a
     `Term` or a function of an `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration`
-    when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there.
+    when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there. `lighting`: what lights
+    the photographs, where that is known better than `Config.light` says.
 
     A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand.
 
@@ -67,7 +68,7 @@ class Fit:
     def __init__(
         self, capture: Capture, config: Config | None = None, networks: tuple[Flow, ReflectanceMap] | None = None,
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
-        state: dict | None = None,
+        state: dict | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
         self.capture = capture
         self.config: Config = config or Config()
@@ -81,23 +82,26 @@ class Fit:
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
         if not capture.images:
             raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
-        #: What lights the photographs; `capture` is under these lights.
-        self.lighting = Lighting(*state["lighting"]) if state else lighting_of(capture, self.config, Fit)
-        capture = self.capture = lit(capture, self.lighting)
-        chosen = replace(self.config, light=self.lighting.kind)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
+        if {"curve", "contrast"} & set(self.config.refine) and any(sensor.ambient for sensor in capture.sensors):
+            raise InputError(f"{capture.path}: ambient: is subtracted by the curve that the scene says; leave out "
+                             "--refine curve and contrast")  # fmt: skip
         if "masks" in self.config.refine and capture.threshold is not None:
             raise InputError(f"{capture.path}: --refine masks: they are those of a dark room, found by brightness; "
                              "leave it out, or give others")  # fmt: skip
-        if self.config.deterministic:
-            recompute_normals(capture.scene)
-        self.random = torch.Generator().manual_seed(self.config.seed)
-        torch.manual_seed(self.config.seed)
         self.held_out = kept_out(capture, self.config.holdout)
         self.fitted = np.setdiff1d(np.arange(len(capture)), self.held_out)  #: all other photographs
+        if self.config.deterministic:
+            recompute_normals(capture.scene)
+        lighting = Lighting(*state["lighting"]) if state else lighting  # under which `capture` is
+        self.lighting = lighting or lighting_of(capture.part(self.fitted), self.config, Fit)
+        capture = self.capture = lit(capture, self.lighting)
+        chosen = replace(self.config, light=self.lighting.kind)
+        self.random = torch.Generator().manual_seed(self.config.seed)
+        torch.manual_seed(self.config.seed)
         seen = capture.part(self.fitted) if len(self.held_out) else capture
         self.exposure = seen.exposure()
         self.ring = ring_of(state["ring"]) if state else starting_ring(seen, chosen, self.exposure, networks)
@@ -191,7 +195,7 @@ class Fit:
         self.surface.set_faces(faces)
         calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
         if self.calibration:
-            photographs = self.calibration.photographs(photographs, calibration)
+            photographs = self.calibration.as_found(photographs, calibration)
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,

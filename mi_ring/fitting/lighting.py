@@ -14,7 +14,7 @@ import numpy as np
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import ALBEDO
+from mi_ring.fitting.calibration import ALBEDO, OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of
@@ -24,8 +24,14 @@ from mi_ring.system.progress import progress
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
-COARSE: dict[str, Any] = {"levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60}  #: settings of a trial
+#: Settings of a trial: those that decide alike, whatever the fit's own are.
+COARSE: dict[str, Any] = {
+    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "weights": {},
+    **{name: getattr(Config(), name) for name in (
+        "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
+}  # fmt: skip
 LAST = 12  #: iterations of a trial that tell how well it explains the photographs
+ALIKE = 1.1  #: times that lights may differ in strength without a word
 #: What the scene says is believed unless another light leaves less of its error than this. An environment that is fixed
 #: in the camera looks much like a flash.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamp": 0.9}
@@ -41,42 +47,64 @@ class Lighting(NamedTuple):
     place: tuple[float, float, float] | None = None  #: of a lamp [scene units]
 
 
-def lighting_of(capture: Capture, config: Config, trial: Callable[[Capture, Config], "Fit"]) -> Lighting:
-    """What `Config.light` asks for; what is to be found out coarse fits by `trial` tell.
-
-    Raises InputError where nothing lights the object, and for a BSDF that shows no environment.
-    """
-    unlit = capture.photographs.dark and capture.photographs.room is None and not lamps(capture.scene)
-    if unlit and config.light == "capture":
-        raise InputError(f"{capture.path}: emitter: nothing lights the object; give lights, or --light auto")
-    if config.light != "capture" and not hasattr(capture.shape.bsdf(), "lobes"):
+def require_unknown(capture: Capture, config: Config) -> None:
+    """Raise InputError for what does not go with `Config.light`."""
+    others = lamps(capture.scene)
+    if config.light == "capture":
+        if unlit(capture) and not others:
+            raise InputError(f"{capture.path}: emitter: nothing lights the object; give lights, or --light auto")
+        return
+    if not hasattr(capture.shape.bsdf(), "lobes"):
         raise InputError(f"{capture.path}: bsdf: --light {config.light} is for cooktorrance alone; give that")
+    if others:
+        raise InputError(f"{capture.path}: emitter: --light {config.light} finds all the light there is; take the "
+                         "lamps of the scene out, or leave --light out")  # fmt: skip
+    wrong = OF_LIGHTS & set(config.refine)
+    if config.light in ("environment", "turntable") and wrong:
+        raise InputError(f"--refine {min(wrong)}: is of the photographs' own lights, which --light {config.light} "
+                         "leaves out; leave it out")  # fmt: skip
+
+
+def unlit(capture: Capture) -> bool:
+    """Have photographs neither lights of their own nor a room?"""
+    return capture.photographs.dark and capture.photographs.room is None
+
+
+def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> Lighting:
+    """What `Config.light` asks for; what is to be found out coarse fits tell, made by `trial`.
+
+    Raises InputError where nothing lights the object, and for what does not go together.
+    """
+    require_unknown(capture, config)
     if config.light in ("capture", "environment", "turntable"):
         return Lighting(config.light)
+    strengths = capture.photographs.lights.rgb().mean(1)
+    if strengths.max() > ALIKE * strengths.min():
+        print(f"Light: those of the scene differ in strength, by up to {strengths.max() / strengths.min():.2g} times; "
+              "an unknown light is taken to be the same in all photographs, equally exposed")  # fmt: skip
 
-    def tried(light: Kind) -> tuple[float, "Fit"]:
+    def tried(lighting: Lighting) -> tuple[float, "Fit"]:
         """The error that a coarse fit leaves, and the fit."""
-        fit = trial(capture, replace(config, **COARSE, light=light, holdout=0, refine=("none",)))
-        iterations = progress(fit, f"trying --light {light}", fit.iterations, unit="iteration")
+        refine = config.refine if lighting.kind == "capture" else ("none",)
+        fit = trial(capture, replace(config, **COARSE, light=lighting.kind, refine=refine), lighting=lighting)
+        iterations = progress(fit, f"trying --light {lighting.kind}", fit.iterations, unit="iteration")
         errors = [it.terms["rgb"] for it in iterations]
-        return float(np.mean(errors[-LAST:])), fit
+        return float(np.nan_to_num(np.mean(errors[-LAST:]), nan=np.inf)), fit
 
-    environment = tried("environment")
+    environment, fit = tried(Lighting("environment"))
+    lamp = Lighting("lamp", brightest(fit))
     if config.light == "lamp":
-        return Lighting("lamp", brightest(environment[1]))
-    errors: dict[Kind, float] = {
-        "environment": environment[0],
-        "turntable": tried("turntable")[0],
-        "lamp": tried("lamp")[0],
-    }
-    likely = list(errors)
-    if not unlit:
-        errors["capture"] = tried("capture")[0]
-        likely = [light for light in likely if errors[light] < BETTER[light] * errors["capture"]] or ["capture"]
-    best = min(likely, key=lambda light: errors[light])
-    left = ", ".join(f"{light} {error:.3g}" for light, error in errors.items())
-    print(f"Light: taken to be --light {best}; errors that coarse fits leave: {left}")
-    return Lighting(best, brightest(environment[1]) if best == "lamp" else None)
+        return lamp
+    found = {lighting: tried(lighting)[0] for lighting in (Lighting("turntable"), lamp)}
+    found[Lighting("environment")] = environment
+    likely = list(found)
+    if not unlit(capture):
+        capture_error = found[Lighting("capture")] = tried(Lighting("capture"))[0]
+        likely = [one for one in likely if found[one] < BETTER[one.kind] * capture_error] or [Lighting("capture")]
+    best = min(likely, key=lambda lighting: found[lighting])
+    left = ", ".join(f"{lighting.kind} {error:.3g}" for lighting, error in found.items())
+    print(f"Light: taken to be --light {best.kind}; errors that coarse fits leave: {left}")
+    return best
 
 
 def brightest(fit: "Fit") -> tuple[float, float, float]:
@@ -108,4 +136,5 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:
     """In which axes the unknown light of a room is fixed."""
-    return {"environment": ["world"], "turntable": ["camera"]}.get(lighting.kind, frames_of(capture.scene))
+    own = {"environment": ["world"], "lamp": ["world"], "turntable": ["camera"]}
+    return own.get(lighting.kind, frames_of(capture.scene))

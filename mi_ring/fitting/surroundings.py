@@ -28,10 +28,13 @@ def with_surroundings(
     lit = calibration is not None or photographs.room is not None
     if not (fit.ring.indirect or lit):
         return predicted
-    if calibration:
+    looking = calibration is not None and (photographs.dark or fit.iteration / fit.iterations >= LIT)
+    if calibration and looking:
         which = calibration.room.which
     else:
         which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
+    if not (fit.ring.indirect or which):
+        return predicted
     around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=which,
                                  indirect=fit.ring.indirect)  # fmt: skip
     if fit.ring.indirect and fit.surface.table is not None:
@@ -42,7 +45,7 @@ def with_surroundings(
     before = predicted.detach()
     if photographs.room is not None:
         predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
-    if calibration and (photographs.dark or fit.iteration / fit.iterations >= LIT):
+    if calibration and looking:
         telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
         observed = calibration.linear(seen.rgb, index[share.part], scale)
         calibration.room.see(around, before, observed, telling, share, fit.iteration / fit.iterations)

@@ -108,7 +108,7 @@ def measure(
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
     """(N,) what light the object gets in each photograph, or as much in all, where that is unknown."""
     received = capture.photographs.irradiance(center).mean(1)
-    return received if received.any() else np.ones_like(received)
+    return received if np.median(received) > 0 else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:

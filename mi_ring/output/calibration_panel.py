@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.figures import svg_uri
-from mi_ring.rendering.rooms import seen_from_within
+from mi_ring.rendering.rooms import COUNT, seen_from_within
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 LISTED = 6  #: unknowns of one kind that are listed one by one
@@ -95,10 +95,11 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     plan.set_title("cameras and lights (•) from above [scene units]", fontsize=9)
     for bars in others:
         if light is not None:
+            frame = "camera" if light[COUNT:].any() else "world"
             radiance = seen_from_within(light, np.eye(4)).clip(min=0)
             bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
             bars.axis("off")
-            bars.set_title("the environment, by longitude and latitude, y up", fontsize=9)
+            bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)
             continue
         if max(moved) > 0:
             bars.bar(range(len(moved)), moved, color=AFTER)

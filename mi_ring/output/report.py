@@ -99,6 +99,8 @@ def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
     eye = capture.sensors[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
+    if not irradiance.any():  # photographs have no lights of their own
+        irradiance = np.ones(3)
     return {"up": capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}
 
 

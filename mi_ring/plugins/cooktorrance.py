@@ -244,7 +244,9 @@ def gloss_table(variant, distribution, order):
         table = dr.zeros(mi.Float, NODES**2 * len(channels))
         for k, channel in enumerate(channels):
             dr.scatter(table, channel, dr.arange(mi.UInt32, NODES**2) * len(channels) + k)
-        return mi.Texture2f(mi.TensorXf(table, (NODES, NODES, len(channels))), wrap_mode=dr.WrapMode.Clamp)
+        return mi.Texture2f(
+            mi.TensorXf(table, (NODES, NODES, len(channels))), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+        )
 
 
 def legendre(x, order):

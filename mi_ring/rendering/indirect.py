@@ -52,9 +52,9 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=(), tab
 def reflect(scene, si, view, photographs, bounces, random, table=None, known=()):
     """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane.
 
-    And where the paths that escape go: (radiance, their throughput, 0 for those that do not, their direction, and
-    (throughput, direction) of those that do not escape at once although the BSDF at `si` is one of the `known`; such
-    that do escape at once are not among the former). `random`: a source of 2-D samples.
+    Returns (radiance, throughput and direction of the paths that escape, 0 for others, `first`). If the BSDF at `si` is
+    one of the `known`, paths that escape at once are left out, for `reflected` has them; it also has those that do not
+    escape at once, of which `first` are throughput and direction. `random`: a source of 2-D samples.
     """
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)

@@ -88,7 +88,8 @@ class Production:
         focal, size = config.size[0] / 2 / np.tan(np.radians(config.fov / 2)), config.size
         cameras = [Camera(to_world, np.full(2, focal), np.array(size) / 2, size) for to_world in place]
         lights = lamps.lights_of(
-            config.light, cameras, config.offset, config.spread, self.random(3, novel and config.light != "lamp")
+            config.light, cameras, config.offset, config.spread, self.random(3, novel and config.light != "lamp"),
+            config.away,
         )
         return [View(camera, light, f"{k:03}", config.seed * 40_009 + 2 * (k + novel * 10_007))
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
@@ -207,6 +208,8 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
                 cameras, lights, np.zeros(3), production.random(4), config.wrong_cameras, config.wrong_light,
                 config.wrong_power,
             )  # fmt: skip
+            if config.light == "lamp":  # which no camera takes along
+                lights = [light._replace(vector=view.light.vector) for light, view in zip(lights, views)]
         elements = [
             photograph_element(
                 view.name, f"{images}/{photograph_name(config, view)}", camera,

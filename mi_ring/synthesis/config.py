@@ -149,8 +149,10 @@ def require_options(config: SynthesizeConfig) -> None:
         raise InputError(f"--distance: is {config.distance}, must be 1.05 to 1000 radii of the object")
     if config.pattern != "stripes" and not config.second:
         raise InputError(f"--pattern: is {config.pattern}, for which a second material is missing; give --second")
-    if config.light == "distant" and config.wrong_light:
-        raise InputError("--wrong-light: is of places, which distant lights have none of; leave it out")
+    if config.light in ("distant", "lamp") and config.wrong_light:
+        raise InputError(
+            f"--wrong-light: is of places in the cameras' axes, which {config.light} has none of; leave it out"
+        )
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:

@@ -19,19 +19,18 @@ DARKEST = 0.15  #: radiance of a room in its darkest direction, by its mean
 
 def lights_of(
     kind: LightKind, cameras: list[Camera], offset: tuple[float, float, float], spread: float,
-    random: np.random.Generator,
+    random: np.random.Generator, distance: float = 1.0,
 ) -> list[Light]:  # fmt: skip
     """Lights so strong that they bring 1 W/m² to a surface at the origin that faces them, in the median.
 
     Every point light has the same intensity. `offset`: of a flash from the lens, left, up and forward, by the distance
     from the camera to the origin; `spread`: how far others are from the camera at most, seen from the origin [degrees].
-    A lamp is in one place for all, about as far away as cameras are.
+    A lamp is in one place for all, at this `distance`.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
     elif kind == "lamp":
         away = random.normal(size=3)
-        distance = np.median([np.linalg.norm(camera.position) for camera in cameras])
         places = [distance * away / np.linalg.norm(away)] * len(cameras)
     else:
         places = [strayed(camera.position, np.radians(spread), random) for camera in cameras]

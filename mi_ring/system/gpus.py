@@ -12,7 +12,7 @@ def choose_gpu() -> None:
 
     It is not for other programs that import mi_ring: what they do with their GPUs is their business.
     """
-    if not any(word == "mi_ring.fit" or Path(word).stem == "mi-ring" for word in sys.orig_argv):
+    if not any(word in ("mi_ring", "mi_ring.fit") or Path(word).stem == "mi-ring" for word in sys.orig_argv):
         return
     here, rank = int(os.environ.get("LOCAL_WORLD_SIZE", 1)), int(os.environ.get("LOCAL_RANK", 0))
     if here == 1 or OWN in os.environ:
