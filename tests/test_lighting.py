@@ -36,7 +36,7 @@ def lobe(path):
 
 @pytest.fixture(autouse=True)
 def short_trials(monkeypatch):
-    monkeypatch.setattr(lighting, "COARSE", lighting.COARSE | {"iterations": 24})
+    monkeypatch.setattr(lighting, "COARSE", lighting.COARSE | {"iterations": 18, "batch": 4})
 
 
 @pytest.fixture(scope="module")

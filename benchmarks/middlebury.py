@@ -1,0 +1,110 @@
+"""Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw what is found.
+
+    python benchmarks/middlebury.py FOLDER [--light lamp] [--out out/middlebury] [-- OPTIONS OF FIT]
+
+FOLDER is the data set as it is unpacked, of a bright object before a dark background. Masks are what is brighter than a
+tenth of full scale, closed and filled: shadows on the object belong to it. Every eighth photograph is kept out; printed
+is the PSNR of these over the object's pixels, as sRGB. The picture shows some photographs as predicted, and normals.
+"""
+
+import argparse
+import datetime
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mi_ring
+
+# isort: split
+import cv2
+import numpy as np
+import torch
+from accuracy import processor, product_speed
+from scipy import ndimage
+
+from mi_ring.images import linear_to_srgb, read_image, to_bytes, write_image
+from mi_ring.rendering import bridge
+
+DARK, CLOSED = 24, 3  #: brightness (of 255) of what is background; how far gaps are closed [px]
+SHOWN = 1, 5, 8, 12  #: photographs of the picture
+
+
+def mask_of(pixels: np.ndarray) -> np.ndarray:
+    """(H, W, 1) uint8 of what is bright in (H, W, 3), the largest piece of it, without holes."""
+    bright = ndimage.gaussian_filter(pixels.max(-1).astype(float), 1) > DARK
+    bright = ndimage.binary_fill_holes(ndimage.binary_closing(bright, iterations=CLOSED))
+    labels, count = ndimage.label(bright)
+    largest = 1 + np.argmax(ndimage.sum(bright, labels, range(1, count + 1)))
+    return np.where(ndimage.binary_opening(labels == largest, iterations=2), 255, 0).astype(np.uint8)[..., None]
+
+
+def masked_scene(folder: Path, out: Path) -> Path:
+    """The scene of the photographs, with masks."""
+    scene = out / "scene.xml"
+    subprocess.run([sys.executable, "-m", "mi_ring.convert", "middlebury", str(folder), str(scene)], check=True)
+    tree = ElementTree.parse(scene)
+    for sensor in tree.getroot().findall("sensor"):
+        file = out / sensor.find("string[@name='filename']").get("value")
+        (out / "masks").mkdir(exist_ok=True)
+        write_image(mask_of(read_image(file)), out / "masks" / f"{file.stem}.png")
+        ElementTree.SubElement(sensor, "string", name="mask", value=f"masks/{file.stem}.png")
+    tree.write(scene)
+    return scene
+
+
+def draw(run: Path, picture: Path) -> list[float]:
+    """Write the picture; returns the PSNR of the photographs that were kept out [dB]."""
+    capture, ring = mi_ring.load_capture(run / "scene.xml"), mi_ring.load_fit(run)
+    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    columns, found = [], []
+    for k in range(len(capture)):
+        photograph, seen = capture.photograph(k), capture.observe([k])
+        rgb, coverage = bridge.draw(surface, photograph, 8, indirect=ring.indirect)
+        inside, shown = seen.mask[0].numpy() > 0.5, linear_to_srgb(rgb[0].numpy().clip(0, 1))
+        if k % 8 == 4:
+            error = (shown - linear_to_srgb(seen.rgb[0].numpy().clip(0, 1)))[inside]
+            found.append(float(-10 * np.log10(np.mean(error**2))))
+        if k in SHOWN:
+            alpha = coverage[0].numpy()[..., None]
+            normals = bridge.maps(surface, photograph)["normal"][0] / 2 + 0.5
+            columns.append(np.concatenate([part * alpha + 1 - alpha for part in (shown, normals)]))
+    image = to_bytes(np.concatenate(columns, 1))
+    small = cv2.resize(image, None, fx=0.45, fy=0.45, interpolation=cv2.INTER_AREA)
+    write_image(small, picture)
+    return found
+
+
+def main() -> None:
+    """The command."""
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--light", default="lamp")
+    parser.add_argument("--out", type=Path, default=Path("out/middlebury"))
+    args, options = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
+    scene = masked_scene(args.folder, args.out)
+    run = args.out / args.light
+    command = [
+        sys.executable,
+        "-m",
+        "mi_ring.fit",
+        scene,
+        "--light",
+        args.light,
+        "--holdout",
+        8,
+        "--out",
+        run,
+        *options,
+    ]
+    subprocess.run(list(map(str, command)), check=True)
+    found = draw(run, args.out / f"{args.light}.jpg")
+    speed = product_speed(4096, 4096, torch.float32) / 1e9
+    print(f"{processor()}, {speed:.0f} GFLOP/s; {datetime.date.today()}; {' '.join(map(str, command[3:]))}: kept out "
+          + ", ".join(f"{value:.1f} dB" for value in found))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
