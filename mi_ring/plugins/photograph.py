@@ -27,9 +27,9 @@ class Photograph(mi.Sensor):
     ``valid``        string       mask file of the same size: 0 where the photograph shows nothing, for
                                   instance beyond the border of a lens whose distortion was undone.
                                   Default: none, all of it shows something
-    ``ambient``      string       image file of the same view without the photograph's own light, equally
-                                  exposed: is subtracted, so that this light alone is left. Default:
-                                  none
+    ``ambient``      string       image file of the same view without the photograph's own light, and
+                                  as long exposed: is subtracted, so that this light alone is left.
+                                  Default: none
     ``fx``, ``fy``   float        focal lengths [px]
     ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the
                                   centre of the first pixel is (0.5, 0.5). Default: the middle of the

@@ -19,9 +19,9 @@ class Room(mi.Emitter):
     ============= ======= ============================================================================= =====
     Parameter     Type    Description                                                                   Flags
     ============= ======= ============================================================================= =====
-    ``harmonics`` string  R, G, B of the radiance in each real harmonic, in the order of ``dr.sh_eval``
+    ``harmonics`` string  R, G, B of the radiance in each real harmonic, in the order of ``dr.sh_eval``   P, ∂
                           (l, m = 0, 0; 1, −1; 1, 0; … 2, 2; …): 3, 12, 27, 48 or 75 numbers. Exposed
-                          as an array                                                                   P, ∂
+                          as an array
     ``frame``     string  in which axes: ``world``, or ``camera``, those of the `photograph` being
                           rendered (black while another kind of sensor is). Default: ``world``
     ============= ======= ============================================================================= =====
