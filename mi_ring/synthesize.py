@@ -16,8 +16,9 @@ def main(arguments: Sequence[str]) -> None:
         write_capture(config)
     out = config.out
     said = "" if config.exact else f"\nWhat its calibration should say is in {out}/truth/exact.xml."
+    light = " --light environment" if config.environment and config.wrong_room else ""
     print(f"{out}/scene.xml, and the true surface in {out}/truth/mesh.ply{said}\n"
-          f"Now: mi-ring check {out}/scene.xml; mi-ring fit {out}/scene.xml")  # fmt: skip
+          f"Now: mi-ring check {out}/scene.xml; mi-ring fit {out}/scene.xml{light}")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -142,7 +142,8 @@ def values(tmp_path):
     return {
         "photograph": [{
             "filename": "a.png", "mask": "b.png", "valid": "c.png", "ambient": "d.png",
-            "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0, "to_world": moved, "encoding": "linear", "saturation": 0.9, "gamma": 1.1, "contrast": 1.2,
+            "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0, "to_world": moved,
+            "encoding": "linear", "saturation": 0.9, "gamma": 1.1, "contrast": 1.2,
             "vignetting": 2.0, "distortion": -0.01, "falloff": 3.0, "calibrated": True,
             "film": film, "emitter": light,
         }],

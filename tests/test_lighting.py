@@ -1,5 +1,6 @@
 """Unknown light: what a fit takes it to be, finds, and writes."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting import lighting
 from mi_ring.fitting.lighting import Lighting, brightest, lit
 from mi_ring.images import read_image, write_image
+from mi_ring.rendering import bridge
 from mi_ring.rendering.rooms import BASIS, frames_of, seen_from_within
 from mi_ring.rendering.shading import is_room
 
@@ -89,6 +91,21 @@ def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_p
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert frames_of(again.scene) == {"camera"}
     np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
+
+
+def test_cameras_are_refined_under_unknown_light(in_an_environment, tmp_path):
+    """And photographs without any light are black."""
+    capture = mi_ring.load_capture(in_an_environment)
+    changes = TINY | {"iterations": 3, "light": "environment", "refine": ("cameras",)}
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **changes))
+    list(fit)
+    summary = fit.summary(fit.calibrated())
+    assert summary["refined"] == ["cameras", "ambient"]
+    spread = [entry["std"]["turned_degrees"] for entry in summary["photographs"].values()]
+    assert np.isfinite(spread).all() and min(spread) > 0
+    dark = replace(capture.photograph(0), room=None)
+    rgb, coverage = bridge.draw(fit.surface, dark, 1)
+    assert not rgb.any() and coverage.any()
 
 
 def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environment):

@@ -112,22 +112,26 @@ def compare(
 ) -> None:  # fmt: skip
     """Photographs `index`, all of one size, with their predictions, at what was found and beside it."""
     seen = fit.capture.observe(index, scale)
-    photographs = replace(fit.capture.photographs.select(index, fit.capture.sensors[index[0]].size, scale), room=None)
+    photographs = fit.capture.photographs.select(index, fit.capture.sensors[index[0]].size, scale)
+    room = calibration.roomlight().cpu()
+    # Where it is the only light it is part of what moves.
+    photographs = replace(photographs, room=room.double().numpy() if photographs.dark else None)
 
     def calibrated() -> Photographs:
         return bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
 
     def direct() -> tuple[Tensor, Tensor]:
-        return bridge.draw(fit.surface, calibrated(), SPP, shadows=fit.config.shadows and fit.capture.shadows)
+        shadows = fit.config.shadows and fit.capture.shadows
+        return bridge.draw(fit.surface, calibrated(), SPP, shadows=shadows, in_the_way=False)
 
     lit, coverage = direct()
-    room = calibration.roomlight().cpu()
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
         around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
                                      indirect=fit.ring.indirect, room=calibration.room.which)  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
-        roomlight = around.room(room.to(fit.device)).cpu() if room.any() else roomlight
+        added = around.in_the_way if photographs.dark else around.room
+        roomlight = added(room.to(fit.device)).cpu() if room.any() else roomlight
 
     def picture(lit: Tensor, bounced: Tensor = bounced) -> Tensor:
         return perceived(calibration.recorded(lit + bounced + roomlight, index, scale), fit.exposure, "log")

@@ -223,13 +223,14 @@ def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photo
 
 def draw(
     surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
-    indirect: bool = False, paths: int = 32,
+    indirect: bool = False, paths: int = 32, in_the_way: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Like `render`, of the surface as last written, without gradients, in the processor's memory.
 
     `indirect`: with interreflection, of so many `paths` for each pixel of a picture 128 pixels wide; the light of the
-    photographs' room is always part of them. However many pixels and samples, it takes about a gigabyte
-    (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures themselves take; `indirect` or a room add
+    photographs' room is always part of them, without `in_the_way` as if nothing were in its way. However many pixels
+    and samples, it takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures
+    themselves take; `indirect` or a room add
     about 100 MB for each photograph.
     """
     parts = []
@@ -239,11 +240,11 @@ def draw(
         dr.eval(channels)
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
-    if indirect or photographs.room is not None:
+    if indirect or (in_the_way and photographs.room is not None):
         which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
         around = surroundings(surface, photographs, coverage, seed + 1, 128, paths, indirect, which)
         rgb = rgb + (around.interreflection if indirect else 0)
-        if which:
+        if which and in_the_way:
             rgb = (rgb + around.in_the_way(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
     return rgb.cpu(), coverage.cpu()
 

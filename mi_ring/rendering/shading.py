@@ -26,7 +26,7 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, around=None):
         value = bsdf.eval(context, si, si.to_local(ds.d), lit)
         return dr.select(lit, value * weight, 0)
 
-    radiance = reflected(*light(si), shadows) if light else mi.Color3f(0)
+    radiance = reflected(*light(si), shadows) if light else dr.zeros(mi.Color3f, dr.width(si.t))
     if around:
         radiance += dr.select(active, around(si), 0)
     for emitter in lamps(scene, rooms):

@@ -166,4 +166,4 @@ def require_options(config: SynthesizeConfig) -> None:
             raise InputError("--environment: is instead of the photographs' lights and the room; leave out --light, "
                              "--offset, --room, --wrong-light and --wrong-power")  # fmt: skip
     elif config.room == 0 and config.wrong_room:
-        raise InputError("--wrong-room: there is no room; give --room, for instance 0.1")
+        raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, or --environment")
