@@ -3,12 +3,10 @@
 import contextlib
 import math
 import struct
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import drjit as dr
 import imageio.v3 as imageio
 import mitsuba as mi
 import numpy as np
@@ -20,10 +18,10 @@ from torch.nn import functional as F
 
 from mi_ring.foreign import require_room
 from mi_ring.system.files import write_file
+from mi_ring.system.machine import threads_for_exr
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
-ENOUGH, ONE_AT_A_TIME = 2, threading.Lock()  #: threads for an EXR; who changes their number
 EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader holds some, however low the picture is
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
@@ -149,21 +147,6 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
-
-
-@contextlib.contextmanager
-def threads_for_exr() -> Iterator[None]:
-    """Threads enough for Mitsuba to read or write an EXR: on a single one it waits forever."""
-    if dr.thread_count() >= ENOUGH:
-        yield
-        return
-    with ONE_AT_A_TIME:
-        before = dr.thread_count()
-        dr.set_thread_count(ENOUGH)
-        try:
-            yield
-        finally:
-            dr.set_thread_count(before)
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:

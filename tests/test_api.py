@@ -91,7 +91,7 @@ def test_presets_change_and_weights_that_are_not_given_stay():
     fast = mi_ring.Config.preset("fast", weights={"mask": 10.0})
     off = dict.fromkeys(("normal_variation", "material_variation", "material_rank"), 0.0)
     weights = {"rgb": 1.0, "mask": 10.0, "velocity": 0.01, "calibration": 1e-3} | off
-    assert fast.iterations == 120 and fast.weights == weights
+    assert fast.iterations == 140 and fast.weights == weights
     assert mi_ring.Config(weights={"mask": 10.0}).weights == fast.weights
     paper = mi_ring.Config.preset("paper", weights={"velocity": 0.5}, seed=3)
     assert paper.weights == weights | {"mask": 0.0, "velocity": 0.5}

@@ -12,7 +12,7 @@ RANDOM = np.random.default_rng(3)
 def around(radiance, alpha, factor=2):
     radiance, alpha = torch.tensor(radiance).float(), torch.tensor(alpha).float()
     n, h, w = alpha.shape
-    return Surroundings(radiance, None, alpha, torch.ones(n, factor * h, factor * w), factor)
+    return Surroundings(radiance, [], radiance, radiance, alpha, torch.ones(n, factor * h, factor * w), factor)
 
 
 def test_each_photograph_has_the_average_of_its_own_pictures():

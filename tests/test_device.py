@@ -49,12 +49,19 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
 
 
 @pytest.mark.parametrize(
-    "amx, told, expected",
-    [(True, None, True), (False, None, False), (True, "AVX512_CORE", False), (True, "avx512_core_amx", True)],
-)
-def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, told, expected, monkeypatch):
+    "amx, bf16, name, told, expected",
+    [
+        (True, True, "Intel Xeon", None, True), (True, True, "Intel Xeon", "AVX512_CORE", False),
+        (True, True, "Intel Xeon", "avx512_core_amx", True), (False, True, "Intel Xeon", None, False),
+        (False, True, "AMD EPYC", None, True), (False, False, "AMD EPYC", None, False),
+        (False, True, "AMD EPYC", "AVX512_CORE", False), (False, True, "AMD EPYC", "AVX512_CORE_BF16", True),
+    ],
+)  # fmt: skip
+def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, bf16, name, told, expected, monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: bf16)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": name}, raising=False)
     if told:
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
     else:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from mi_ring import paper
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.experiments import engine, measures, published, recipes, tables
+from mi_ring.experiments import engine, measures, published, recipes, slices, tables
 from mi_ring.experiments.catalogue import EXPERIMENTS
 from mi_ring.experiments.experiment import QUICK, Asked, Column, Experiment, Made, Outcome, Run
 from mi_ring.experiments.figures import bars
@@ -235,13 +235,13 @@ def test_slices_are_those_of_equation_1():
     random = np.random.default_rng(1)
     material = {"diffuse": random.uniform(0.1, 0.5, (5, 3)), "specular": random.uniform(0.02, 0.2, 5),
                 "roughness": random.uniform(0.2, 0.8, 5)}  # fmt: skip
-    found = measures.slices(measures.bsdf_of(Ring(torch.zeros(3), 1.0), material), 5)
-    cosine, r = np.cos(measures.ANGLES), material["roughness"][:, None]
+    found = slices.slices(slices.bsdf_of(Ring(torch.zeros(3), 1.0), material), 5)
+    cosine, r = np.cos(slices.ANGLES), material["roughness"][:, None]
     d = r**2 / (cosine**2 * (r**2 - 1) + 1) ** 2
-    g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(measures.ANGLES) ** 2))) ** 2
+    g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(slices.ANGLES) ** 2))) ** 2
     gloss = material["specular"][:, None] * d * g / np.pi / cosine**2
     np.testing.assert_allclose(found, material["diffuse"][:, None] + gloss[..., None], rtol=1e-3)
-    grey = measures.slices(load_material("diffuse reflectance=0.3,0.6,0.9", "--material", False), 1)
+    grey = slices.slices(load_material("diffuse reflectance=0.3,0.6,0.9", "--material", False), 1)
     np.testing.assert_allclose(grey, np.broadcast_to(np.array([0.3, 0.6, 0.9]) / np.pi, grey.shape), rtol=1e-5)
 
 
@@ -263,7 +263,7 @@ def test_places_of_the_second_material_are_where_it_is_seen():
     out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))
     seen = np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi))[0] > 0.1
-    found = measures.second_at(config, np.concatenate([ball.vertices, points]))[len(ball.vertices) :]
+    found = slices.second_at(config, np.concatenate([ball.vertices, points]))[len(ball.vertices) :]
     assert np.array_equal(found, seen) and 0.3 < found.mean() < 0.7
 
 

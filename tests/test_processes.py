@@ -30,7 +30,8 @@ from mi_ring.system.machine import threads_of
 
 folder, scene = sys.argv[1:3]
 refine = ("cameras", "light", "power", "ambient")
-small = {"levels": (2,), "widths": (28,), "shares": (1.0,), "domain": "sphere", "refine": refine}
+small = {"levels": (2,), "widths": (28,), "shares": (1.0,), "domain": "sphere", "refine": refine,
+         "precision": "float32"}
 
 def step(fit):
     fit.iteration = fit.iterations // 2
@@ -78,7 +79,8 @@ Fit.predict = killed
 sys.exit(command.main(sys.argv[3:]))
 """
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--subdivisions", "3", "--batch", "5",
-         "--iterations", "8", "--deterministic", "--domain", "sphere"]  # fmt: skip
+         "--iterations", "8", "--deterministic", "--domain", "sphere",
+         "--precision", "float32"]  # fmt: skip
 
 
 def torchrun(*arguments):

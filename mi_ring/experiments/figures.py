@@ -8,8 +8,9 @@ from matplotlib.figure import Figure
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.experiment import Outcome, Row
-from mi_ring.experiments.measures import ANGLES, errors_from_one_side
+from mi_ring.experiments.measures import errors_from_one_side
 from mi_ring.experiments.recipes import SingleView
+from mi_ring.experiments.slices import ANGLES
 from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.surfaces import hits, load_true_mesh
 from mi_ring.rendering import bridge

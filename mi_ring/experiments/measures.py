@@ -1,36 +1,30 @@
 """What is measured of the fits of experiments."""
 
 import json
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
-from mi_ring.errors import InputError
 from mi_ring.experiments.experiment import Made, Row, Run
 from mi_ring.experiments.recipes import AXES, Perturbed, SingleView, Synthetic
+from mi_ring.experiments.slices import bsdf_of, second_at, slices
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.metrics.evaluation import evaluate_fit
 from mi_ring.metrics.surfaces import compare_surfaces, hits, load_true_mesh
 from mi_ring.output.results import read_log
 from mi_ring.rendering.crossings import crossing_triangles
 from mi_ring.rendering.plain_mesh import scene_of
-from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
-from mi_ring.synthesis.config import SynthesizeConfig
-from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.synthesis.materials import load_material
 from mi_ring.system.optional import installed
 
 COURSE = "course.json"  #: of a fit that was watched
 POINTS = 8  #: of its course
 LEVELS = 3, 4, 5, 6, 7  #: that a fit is sampled at
-ANGLES = np.radians(np.arange(0, 76, 5))  #: θh of slices, light and camera at one place
 SAMPLED = 3  #: level of the points whose material is looked at
 
 
@@ -170,36 +164,3 @@ def slices_of(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray, np.ndarray 
         return found, true[0], None
     second = second_at(config, np.asarray(mesh.vertices))[near][:, None, None]
     return found, np.where(second, true[1], true[0]), np.where(second, true[0], true[1])
-
-
-def bsdf_of(ring: Ring, material: dict[str, np.ndarray]) -> mi.BSDF:
-    """A material (V, 3) or (V,) by name as the BSDF of a strip of V pixels."""
-    snippet = ElementTree.fromstring(ring.bsdf)
-    if snippet.get("type") != "cooktorrance":
-        raise InputError(f"BSDF: is {snippet.get('type')}, slices are of cooktorrance; leave out --parameters")
-    strips = {name: mi.Bitmap(np.ascontiguousarray(value.reshape(1, len(value), -1), np.float32))
-              for name, value in material.items()}  # fmt: skip
-    return mi.load_dict({"type": "cooktorrance", **{
-        name: {"type": "bitmap", "bitmap": strip, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-        for name, strip in strips.items()
-    }})  # fmt: skip
-
-
-def slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """BRDF (count, angles, 3) [1/sr] at `ANGLES` from the normal, light and camera at one place, along a strip."""
-    angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
-    si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
-    si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)
-    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
-    si.wi = mi.Vector3f(mi.Float(np.sin(angle)), 0, mi.Float(np.cos(angle)))
-    value = np.array(bsdf.eval(mi.BSDFContext(), si, si.wi)).reshape(3, count, len(ANGLES))
-    return np.moveaxis(value, 0, -1) / np.cos(ANGLES)[:, None]
-
-
-def second_at(config: SynthesizeConfig, vertices: np.ndarray) -> np.ndarray:
-    """Which vertices (V,) of the true mesh are of the second material."""
-    pattern = pattern_of(config.pattern, vertices, config.bands, "xyz".index(config.up), "--pattern")
-    black, white = (mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": v}}) for v in (0.0, 1.0))
-    si = dr.zeros(mi.SurfaceInteraction3f, len(vertices))
-    si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv.T)), mi.Vector3f(0, 0, 1)
-    return np.array(pattern.of(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi

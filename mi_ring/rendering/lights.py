@@ -32,10 +32,14 @@ class Lights:
 
     @classmethod
     def of(cls, sensors: Sequence) -> "Lights":
-        """The nested lights of `photograph` sensors. Raises SceneError for one that is none or not positive."""
+        """The nested lights of `photograph` sensors, all positive, or all 0. Raises SceneError for one that is not."""
         # By way of numpy: Dr.Jit would compile a kernel for each number of photographs.
         columns = [[np.ravel(part) for part in parts_of(sensor)] for sensor in sensors]
         places, finite, strengths = (np.concatenate(column) for column in zip(*columns))
+        lit = strengths.reshape(-1, 3).any(1)
+        if lit.any() and not lit.all():
+            name = sensors[int(lit.argmin())].id()
+            raise SceneError(f'photograph "{name}": its light is 0 strong, must be positive, or 0 in all photographs')
         return cls(mi.Float(places), mi.Bool(finite), mi.Float(strengths))
 
     @classmethod
@@ -129,7 +133,7 @@ def parts_of(sensor):
     where, finite = place_of(light)
     strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
     if not dr.all(dr.isfinite(strength) & (strength >= 0)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be 0 or more')
+        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive, or 0 in all')
     if not dr.all(dr.isfinite(where)):
         raise SceneError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
     return where, finite, strength

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import math
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -19,6 +20,7 @@ from mi_ring.system import llvm
 Thing = TypeVar("Thing")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
+ENOUGH, ONE_AT_A_TIME = 2, threading.Lock()  #: threads for an EXR; who changes their number
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 
 
@@ -165,6 +167,21 @@ def threads_of(count: int = 0) -> Iterator[None]:
     finally:
         torch.set_num_threads(before[0])
         dr.set_thread_count(before[1])
+
+
+@contextlib.contextmanager
+def threads_for_exr() -> Iterator[None]:
+    """Threads enough for Mitsuba to read or write an EXR: on a single one it waits forever."""
+    if dr.thread_count() >= ENOUGH:
+        yield
+        return
+    with ONE_AT_A_TIME:
+        before = dr.thread_count()
+        dr.set_thread_count(ENOUGH)
+        try:
+            yield
+        finally:
+            dr.set_thread_count(before)
 
 
 def glibc(name: str) -> Callable[..., int]:
