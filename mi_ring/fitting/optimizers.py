@@ -27,7 +27,8 @@ def optimizers_of(networks: nn.Module, config: Config, device: torch.device) -> 
     rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
     result: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=config.learning_rate)]
     if hidden:
-        dtype = torch.bfloat16 if has_fast_bfloat16(device) else torch.float32
+        fast = config.precision != "float32" and has_fast_bfloat16(device)
+        dtype = torch.bfloat16 if fast else torch.float32
         result.append(Muon(hidden, lr=config.muon_rate, dtype=dtype))
     for optimizer in result:
         for group in optimizer.param_groups:
