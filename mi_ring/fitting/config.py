@@ -104,8 +104,8 @@ class Config:
     decay: float = 0.1
     """The learning rates fall exponentially to this share; those of cameras to a half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Precision of matrix products of networks and Muon. auto: bfloat16 where that is faster (processors with AMX, AMD's from
-    Zen 4 on, newer GPUs)."""
+    """Precision of matrix products, of networks and of Muon. auto: bfloat16 where that is faster (processors with AMX,
+    AMD's from Zen 4 on, newer GPUs)."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
     refine: tuple[Unknown, ...] = ("auto",)
