@@ -19,8 +19,6 @@ import functools
 import json
 import math
 import multiprocessing
-import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -52,12 +50,9 @@ def truth_of(scene: Path) -> Path:
 
 def processor() -> str:
     """What runs this: model of the processor and number of cores."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        model = platform.processor() or platform.machine()
-    return f"{model}, {len(os.sched_getaffinity(0))} cores"
+    from mi_ring.system import machine  # here, for the reason given in watch()
+
+    return machine.processor()
 
 
 def watch() -> dict[str, float]:
@@ -214,7 +209,7 @@ def main() -> None:
     if arguments.truth and len(arguments.scenes) > 1:
         parser.error("--truth goes with one scene")
     truths = [arguments.truth or truth_of(scene) for scene in arguments.scenes]
-    print(f"{processor()}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
+    print(f"{alone(processor)}; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
     results, parts = [], []
     for scene, truth in zip(arguments.scenes, truths):
         name, rows = scene.stem if scene.stem != "scene" else scene.parent.name, []

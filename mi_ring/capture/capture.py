@@ -26,6 +26,7 @@ from mi_ring.rendering.visibility import View
 REMEMBERED_PIXELS = 2**23
 
 SOME, COARSE = 50, 128  #: how many photographs, and pixels across them, tell how bright object and room are
+ALBEDO = 0.5  #: of an object of which nothing says how much it reflects
 LIT = 0.01  #: brightness of the background, in that of the object, from which a room is not black
 
 
@@ -182,10 +183,10 @@ class Capture:
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
         """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights.
 
-        An albedo of one half where photographs have no light of their own: what others bring nobody knows.
+        That of `ALBEDO` where photographs have no light of their own: what others bring nobody knows.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
-        return exposure / received if received > 0 else 0.5 / math.pi
+        return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:

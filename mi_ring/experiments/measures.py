@@ -59,7 +59,7 @@ def in_millimetres(run: Run, made: Made) -> list[Row]:
 def aligned(run: Run, made: Made) -> list[Row]:
     """As `evaluated` after rigid alignment, and the root mean square of what is left of cameras' turns [°]."""
     (row,) = evaluated(run, made, align="rigid")
-    exact = run.recipe.exact if isinstance(run.recipe, Perturbed) else run.recipe
+    exact = run.recipe.source if isinstance(run.recipe, Perturbed) else run.recipe
     return [row | {"turned": turns(exact.made(made.captures), made.folder / "scene.xml")}]
 
 

@@ -172,17 +172,27 @@ class Synthetic(Recipe):
 
 
 @dataclass(frozen=True)
-class Part(Recipe):
-    """So many of a capture's photographs, evenly from the first to the last."""
+class Derived(Recipe):
+    """The photographs of another capture, with its truth, by a scene file of its own."""
 
-    whole: Recipe
-    count: int
+    source: Recipe
 
     def made(self, captures: Path) -> Path:
-        return filled(captures / self.name, lambda folder: self.write(self.whole.made(captures), folder, captures))
+        return filled(captures / self.name, lambda folder: self.write(self.source.made(captures), folder, captures))
 
     def truth(self, captures: Path) -> Path:
-        return self.whole.truth(captures)
+        return self.source.truth(captures)
+
+    def write(self, scene: Path, folder: Path, captures: Path) -> None:
+        """Its scene file, by that of the source."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Part(Derived):
+    """So many of a capture's photographs, evenly from the first to the last."""
+
+    count: int
 
     def write(self, scene: Path, folder: Path, captures: Path) -> None:
         """Its scene file, of the same photographs."""
@@ -197,18 +207,11 @@ class Part(Recipe):
 
 
 @dataclass(frozen=True)
-class Perturbed(Recipe):
+class Perturbed(Derived):
     """A capture whose cameras are wrong, as `mi_ring.synthesis.degradation.miscalibrated` makes them."""
 
-    exact: Recipe
     degrees: float
     seed: int
-
-    def made(self, captures: Path) -> Path:
-        return filled(captures / self.name, lambda folder: self.write(self.exact.made(captures), folder, captures))
-
-    def truth(self, captures: Path) -> Path:
-        return self.exact.truth(captures)
 
     def write(self, scene: Path, folder: Path, captures: Path) -> None:
         """Its scene file, of the same photographs, which no longer says that it is calibrated."""

@@ -3,13 +3,11 @@
 import csv
 import datetime
 import io
-import platform
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from mi_ring.experiments.experiment import NOT_RUN, Experiment, Outcome, Row
-from mi_ring.system.machine import cores
+from mi_ring.system.machine import processor
 
 OURS = "ours"  #: who says so
 
@@ -79,13 +77,3 @@ def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Ro
     lines += [[cell(experiment, name, row.get(name, "")) for name in names] for row in rows]
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"{experiment.about}\n\n{table}\n\n{said}; {processor()}; {datetime.date.today()}\n"
-
-
-def processor() -> str:
-    """What runs this: model of the processor and number of cores."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        model = platform.processor() or platform.machine()
-    return f"{model}, {cores()} cores"

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mi_ring.capture.calibrated import with_calibration
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.curve import Curve
@@ -54,7 +54,6 @@ UNKNOWNS: dict[str, dict[str, float]] = {
 AUTO = "light", "power", "ambient"
 #: What is of the photographs' own lights, which an unknown environment takes the place of.
 OF_LIGHTS = {"light", "power", "falloff", "scale"}
-ALBEDO = 0.5  #: that `scale` begins with where the capture says more than 1
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 START = 0.2  #: progress of the fit when refinement begins
 LIT = 0.15  #: and when that of the room's light does

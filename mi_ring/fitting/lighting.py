@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from mi_ring.capture.calibrated import with_calibration
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import ALBEDO, OF_LIGHTS
+from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of

@@ -25,14 +25,8 @@ def with_surroundings(
     `index`: of all photographs of the iteration, of which these are the `share`.
     """
     calibration = fit.calibration if fit.calibration and "ambient" in fit.calibration.refined else None
-    lit = calibration is not None or photographs.room is not None
-    if not (fit.ring.indirect or lit):
-        return predicted
     looking = calibration is not None and (photographs.dark or fit.iteration / fit.iterations >= LIT)
-    if calibration and looking:
-        which = calibration.room.which
-    else:
-        which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
+    which = calibration.room.which if calibration and looking else photographs.harmonics
     if not (fit.ring.indirect or which):
         return predicted
     around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=which,

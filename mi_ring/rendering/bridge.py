@@ -230,8 +230,7 @@ def draw(
     `indirect`: with interreflection, of so many `paths` for each pixel of a picture 128 pixels wide; the light of the
     photographs' room is always part of them, without `in_the_way` as if nothing were in its way. However many pixels
     and samples, it takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and what the pictures
-    themselves take; `indirect` or a room add
-    about 100 MB for each photograph.
+    themselves take; `indirect` or a room add about 100 MB for each photograph.
     """
     parts = []
     for pixels in photographs.chunks(spp):
@@ -241,7 +240,7 @@ def draw(
         parts.append([to_torch(channel) for channel in channels])
     rgb, coverage = pictures([torch.cat(channel) for channel in zip(*parts)], photographs)
     if indirect or (in_the_way and photographs.room is not None):
-        which = [] if photographs.room is None else np.flatnonzero(photographs.room.any(1)).tolist()
+        which = photographs.harmonics
         around = surroundings(surface, photographs, coverage, seed + 1, 128, paths, indirect, which)
         rgb = rgb + (around.interreflection if indirect else 0)
         if which and in_the_way:

@@ -133,13 +133,18 @@ class Photographs:
         """May the photographs' own lights cast shadows that are seen?"""
         return not (self.colocated or self.dark)
 
+    @property
+    def harmonics(self) -> list[int]:
+        """Which of the room's are not 0; none where there is no room."""
+        return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
+
     def lighting(self, view):
         """`light` of photograph `view`, one per lane, as a function of surface interactions; None if `dark`."""
         return None if self.dark else lambda si: self.light(view, si)
 
     def around(self, scene, view):
         """What a surface reflects of the room if nothing is in the way, as such a function; None if there is none."""
-        if self.room is None or not self.room.any():
+        if not self.harmonics:
             return None
         return lambda si: shown(scene, self, si, view)
 

@@ -77,7 +77,7 @@ def reflected(bsdfs: Collection, si, to_world, which: Sequence[int], active=True
 
 def shown(scene, photographs, si, view, active=True):
     """Radiance toward the viewer by the room of `photographs`, if nothing is in its way; attached to the surface."""
-    which = [int(k) for k in np.flatnonzero(photographs.room.any(1))]
+    which = photographs.harmonics
     buffer = mi.Float(photographs.room[which].astype(np.float32).ravel())
     values = reflected(reflecting(scene), si, photographs.camera(view)[0], which, active)
     return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import math
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -152,6 +153,16 @@ def set_threads(count: int = 0) -> None:
     """Have torch and Dr.Jit use so many threads, by default all `cores`."""
     torch.set_num_threads(count or cores())
     dr.set_thread_count(count or cores())
+
+
+def processor() -> str:
+    """What runs this: model of the processor and number of cores."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        model = platform.processor() or platform.machine()
+    return f"{model}, {cores()} cores"
 
 
 @contextlib.contextmanager
