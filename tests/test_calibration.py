@@ -45,7 +45,7 @@ def edited(scene, folder, edit):
 
 def one(array):
     """What a capture has of a single photograph."""
-    return Pixels([None if array is None else lambda: array.astype(np.float32)])
+    return Pixels.of([None if array is None else array.astype(np.float32)])
 
 
 def move_light(element, offset):

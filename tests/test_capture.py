@@ -227,6 +227,14 @@ def test_pixels_are_kept_as_many_as_fit_and_shared(monkeypatch):
     assert [array[0, 0] for array in part] == [5, 3] and read[4:] == [5]
 
 
+def test_pixels_may_be_replaced_by_arrays(small_capture):
+    scene = loading.load_capture(small_capture)
+    scene.images = [image[..., ::-1].copy() for image in scene.images]
+    part = scene.part([3, 1])
+    np.testing.assert_array_equal(part.images[0][..., ::-1], loading.load_capture(small_capture).images[3])
+    torch.testing.assert_close(part.observe([0])[0], scene.observe([3])[0])
+
+
 def test_each_photograph_is_remembered_at_its_own_scale(small_capture, decodes):
     scene = loading.load_capture(small_capture)
     for _ in range(3):

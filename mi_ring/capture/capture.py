@@ -53,7 +53,7 @@ class Observation(NamedTuple):
 class Capture:
     """What a scene file gives to a fit. `images` are the files' encoded pixels, decoded on demand by `observe`.
 
-    Nothing that renders or fits a capture changes it.
+    Nothing that renders or fits a capture changes it. Lists of arrays may take the place of its pixels.
     """
 
     path: Path
@@ -73,6 +73,11 @@ class Capture:
         self._remembered = 0  # their pixels
         #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
         self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("images", "masks", "valid") and not isinstance(value, Pixels):
+            value = Pixels.of(value)
+        super().__setattr__(name, value)
 
     @property
     def known(self) -> bool:

@@ -1,6 +1,7 @@
 """Pixels of many files: read when they are asked for, and kept as long as there is room."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,11 @@ class Pixels(Sequence):
         """`kept`: what has been read of them so far."""
         self.readers = list(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
+
+    @classmethod
+    def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
+        """Arrays that are there already."""
+        return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
         return len(self.readers)
