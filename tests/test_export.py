@@ -503,3 +503,9 @@ def test_a_material_that_gltf_lacks_is_refused_before_the_work(tmp_path, monkeyp
     assert "conductor" in complaint(tmp_path / "ring.pt", tmp_path / "o.glb")
     export.main([str(tmp_path / "ring.pt"), str(tmp_path / "o.ply"), "--subdivisions", "2"])
     assert "vertex_specular_reflectance" in attributes(tmp_path / "o.ply")
+
+
+@pytest.mark.parametrize("bsdf", ["<bsdf", '<bsdf type="blendbsdf"/>', '<bsdf type="velvet"/>'])
+def test_a_material_that_is_none_is_refused(tmp_path, bsdf):
+    torch.save(ring_state(wild(bsdf=bsdf)), tmp_path / "ring.pt")
+    assert "bsdf: " in complaint(tmp_path / "ring.pt", tmp_path / "o.glb")

@@ -286,6 +286,15 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
         recipe.read()
 
 
+def test_captures_of_one_name_have_folders_of_their_own(tmp_path):
+    config = SynthesizeConfig(Path(), Path(), "plastic roughness=0.2")
+    cups = [recipes.Synthetic("cup", c, mesh) for c, mesh in [
+        (config, tmp_path / "a/cup.ply"), (config, tmp_path / "b/cup.ply"),
+        (dataclasses.replace(config, material="plastic roughness=0.3"), tmp_path / "a/cup.ply"),
+    ]]  # fmt: skip
+    assert len({cup.place(tmp_path) for cup in cups}) == 3
+
+
 def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture, tmp_path):
     egg = recipes.given(known_capture)
     whole = load_capture(egg.scene)
@@ -294,6 +303,11 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     assert [sensor.id() for sensor in some.sensors] == ["000", "003", "006", "008", "011"]
     assert part.truth(tmp_path) == known_capture / "truth"
     torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
+    scene = part.made(tmp_path)
+    before = scene.stat().st_ino
+    assert part.made(tmp_path).stat().st_ino == before  # it is there already
+    more = recipes.Part("part", egg, 6)
+    assert len(load_capture(more.made(tmp_path))) == 6  # of the same name
     wrong = recipes.Perturbed("wrong", egg, 0.5, 0)
     other = load_capture(wrong.made(tmp_path))
     torch.testing.assert_close(other.observe([3]).rgb, whole.observe([3]).rgb)

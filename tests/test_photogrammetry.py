@@ -11,7 +11,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.outlines import grown
-from mi_ring.capture.scenefile import load_element
 from mi_ring.errors import InputError
 from mi_ring.importers.cameras import Lens
 from mi_ring.importers.undistortion import Window
@@ -24,6 +23,7 @@ from mi_ring.photogrammetry.motion import Motion
 from mi_ring.photogrammetry.object import Hints, find_body
 from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
 from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid

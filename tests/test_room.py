@@ -12,9 +12,10 @@ import torch
 from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
 from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import load_element, recalibrated_xml, room_element, room_elements, scene_bytes
+from mi_ring.capture.scenefile import recalibrated_xml, room_element, room_elements, scene_bytes
 from mi_ring.fitting.room import Room
 from mi_ring.rendering import bridge, indirect
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_photographs
 from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to

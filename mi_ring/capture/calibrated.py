@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.scenefile import load_element, photograph_element
+from mi_ring.capture.scenefile import photograph_element
 from mi_ring.geometry.camera import Camera, moved_pose
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import Photographs
 

@@ -10,7 +10,8 @@ import numpy as np
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.rendering.attributes import attributes_of, constants, load_bsdf
+from mi_ring.rendering.attributes import attributes_of, constants
+from mi_ring.rendering.elements import load_bsdf
 
 
 def predicted_parameters(
@@ -62,8 +63,8 @@ def predicted_parameters(
     xml = ElementTree.tostring(element, "unicode")
     try:
         left = attributes_of(load_bsdf(xml)) - {f"vertex_{p.name}" for p in parameters}
-    except RuntimeError as error:
-        raise InputError(f"{scene}: bsdf: --parameters: {' '.join(str(error).split())}") from error
+    except InputError as error:
+        raise InputError(f"{scene}: {error}; see --parameters") from error
     if left:
         raise InputError(f"{scene}: bsdf: nothing writes {min(left)}, which {kind} reads; give that parameter a "
                          "constant, or a range with --parameters")  # fmt: skip

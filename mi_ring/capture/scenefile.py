@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -140,23 +139,6 @@ def add_film(sensor: Element, width: int, height: int) -> None:
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
-
-
-def require_parts(root: Element) -> None:
-    """Raise RuntimeError, as Mitsuba does of what is wrong, for elements that lack what it crashes without."""
-    for element in root.iter():
-        if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
-            raise RuntimeError("bitmap: filename is missing")
-        if element.get("type") == "blendbsdf" and not len(element):
-            raise RuntimeError("blendbsdf: is empty; it takes two BSDFs and a weight")
-
-
-def load_element(element: Element) -> mi.Object:
-    """The object of Mitsuba's that an element stands for. Raises RuntimeError for what is wrong with it."""
-    require_parts(element)
-    whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
-    whole.extend(element)
-    return mi.load_string(ElementTree.tostring(whole, "unicode"))
 
 
 def numbers(values: ArrayLike) -> str:

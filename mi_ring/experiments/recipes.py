@@ -1,5 +1,7 @@
 """Where the captures of experiments come from: given, path traced, converted, made from others."""
 
+import hashlib
+import json
 import os
 import shutil
 import tempfile
@@ -20,6 +22,7 @@ from mi_ring.capture.scenefile import (
     scene_bytes,
     scene_element,
 )
+from mi_ring.collection.jobs import written
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import load_npz, reading
 from mi_ring.geometry.camera import Camera
@@ -33,10 +36,11 @@ from mi_ring.synthesis.config import SynthesizeConfig, require_options
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example import VIEWS, pot, write_example
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, write_file, writing
+from mi_ring.system.files import locked, read_json, write_file, writing
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: of a checkout
 DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
+ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made of
 AXES = np.array([-1.0, 1.0, -1.0])  #: from x right, y up, z back to Mitsuba's camera
 SINGLE = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: arrays, dimensions
 
@@ -47,9 +51,13 @@ class Recipe:
 
     name: str
 
+    def folder_in(self, captures: Path) -> Path:
+        """Its own folder, if it has one."""
+        return captures / self.name
+
     def place(self, captures: Path) -> Path:
         """Where the scene file is, or will be."""
-        return captures / self.name / "scene.xml"
+        return self.folder_in(captures) / "scene.xml"
 
     def made(self, captures: Path) -> Path:
         """The scene file, which is written if it is not there. Raises InputError if there can be none."""
@@ -57,7 +65,7 @@ class Recipe:
 
     def truth(self, captures: Path) -> Path:
         """The folder of mesh.ply and, perhaps, of scene.xml with novel views."""
-        return captures / self.name / "truth"
+        return self.folder_in(captures) / "truth"
 
     @property
     def photographs(self) -> int:
@@ -109,16 +117,20 @@ def truth_of(scene: Path) -> Path:
                      "compares with it, and mi-ring synthesize writes it")  # fmt: skip
 
 
-def filled(folder: Path, write: Callable[[Path], object]) -> Path:
-    """scene.xml of a folder that is written by a function, whole or not at all, unless it is there."""
-    if not (folder / "scene.xml").is_file():
+def filled(folder: Path, write: Callable[[Path], object], of: dict) -> Path:
+    """scene.xml of a folder that is written by a function, whole or not at all, unless it is there.
+
+    `of`: what it is made of, in plain values; if that has changed, it is made again.
+    """
+    if not (folder / "scene.xml").is_file() or read_json(folder / ORIGIN) != of:
         with writing(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
             growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
             try:
                 write(growing)
+                write_file(growing / ORIGIN, json.dumps(of))
                 growing.chmod(0o755)
-                shutil.rmtree(folder, ignore_errors=True)  # of one that somebody has taken the scene file from
+                shutil.rmtree(folder, ignore_errors=True)  # of something else, or the scene file was taken from it
                 os.replace(growing, folder)
             finally:
                 shutil.rmtree(growing, ignore_errors=True)
@@ -130,7 +142,7 @@ class Example(Recipe):
     """The small capture of a pot that `mi-ring example` writes."""
 
     def made(self, captures: Path) -> Path:
-        return filled(captures / self.name, write_example)
+        return filled(self.folder_in(captures), write_example, {"views": VIEWS})
 
     @property
     def photographs(self) -> int:
@@ -153,9 +165,14 @@ class Synthetic(Recipe):
     def photographs(self) -> int:
         return self.config.views
 
+    def folder_in(self, captures: Path) -> Path:
+        """By its settings, too: two meshes may have the same name, and two materials."""
+        settings = repr((self.config, self.mesh and self.mesh.resolve()))
+        return captures / f"{self.name}-{hashlib.blake2b(settings.encode(), digest_size=3).hexdigest()}"
+
     def complete(self, captures: Path) -> SynthesizeConfig:
         """With mesh and folder."""
-        return replace(self.config, mesh=self.mesh or captures / "pot.ply", out=captures / self.name)
+        return replace(self.config, mesh=self.mesh or captures / "pot.ply", out=self.folder_in(captures))
 
     def made(self, captures: Path) -> Path:
         config = self.complete(captures)
@@ -178,7 +195,10 @@ class Derived(Recipe):
     source: Recipe
 
     def made(self, captures: Path) -> Path:
-        return filled(captures / self.name, lambda folder: self.write(self.source.made(captures), folder, captures))
+        scene = self.source.made(captures)
+        changes = {k: v for k, v in vars(self).items() if k not in ("name", "source")}
+        of = {"scene": str(scene.resolve()), "written": written(scene), **changes}
+        return filled(self.folder_in(captures), lambda folder: self.write(scene, folder, captures), of)
 
     def truth(self, captures: Path) -> Path:
         return self.source.truth(captures)
@@ -197,7 +217,7 @@ class Part(Derived):
     def write(self, scene: Path, folder: Path, captures: Path) -> None:
         """Its scene file, of the same photographs."""
         root = ElementTree.parse(scene).getroot()
-        move_names(root, scene.parent, captures / self.name)
+        move_names(root, scene.parent, self.folder_in(captures))
         sensors = root.findall("sensor")
         kept = {round(k) for k in np.linspace(0, len(sensors) - 1, min(self.count, len(sensors)))}
         for k, sensor in enumerate(sensors):
@@ -223,7 +243,7 @@ class Perturbed(Derived):
         moved = miscalibrated(cameras, lights, center, random, turned=self.degrees)
         wrong = with_calibration(capture, *moved, room=capture.photographs.room)
         root = ElementTree.parse(scene).getroot()
-        move_names(root, scene.parent, captures / self.name)
+        move_names(root, scene.parent, self.folder_in(captures))
         content = recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)
         write_file(folder / "scene.xml", content)
 
@@ -239,9 +259,8 @@ class DiligentObject(Recipe):
         source = DiligentMV(self.folder, self.place(captures), fill_holes=self.fill_holes)
         if source.truth is None:
             raise InputError(f"{self.folder}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
-        if not source.scene.is_file():
-            write_scene(source)
-        return source.scene
+        of = {"folder": str(self.folder.resolve()), "fill_holes": self.fill_holes, "written": written(source.truth)}
+        return filled(self.folder_in(captures), lambda out: write_scene(replace(source, scene=out / "scene.xml")), of)
 
 
 @dataclass(frozen=True)
@@ -264,7 +283,8 @@ class SingleView(Recipe):
         return arrays
 
     def made(self, captures: Path) -> Path:
-        return filled(captures / self.name, self.write)
+        of = {"file": str(self.file.resolve()), "written": written(self.file)}
+        return filled(self.folder_in(captures), self.write, of)
 
     def write(self, folder: Path) -> None:
         """As a scene with 16-bit photographs, the camera at the origin looking along z, 1.5 m from the object."""

@@ -16,7 +16,8 @@ from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
-from mi_ring.rendering.attributes import constants, load_bsdf
+from mi_ring.rendering.attributes import constants
+from mi_ring.rendering.elements import load_bsdf
 from mi_ring.rendering.visibility import View, seen_of
 from mi_ring.ring.ring import Ring
 
@@ -48,8 +49,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
     ``diffuse`` is itself in glTF; ``principled`` without its further lobes nearly is. Raises InputError for others.
     """
-    kind = ElementTree.fromstring(bsdf).get("type")
     loaded = load_bsdf(bsdf)
+    kind = ElementTree.fromstring(bsdf).get("type")
     fixed, params = constants(loaded), mi.traverse(loaded)
     count = len(next(iter(values.values())))
 

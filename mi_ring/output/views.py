@@ -12,12 +12,13 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import reason
-from mi_ring.capture.scenefile import load_element, photograph_element
+from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError, require_file
 from mi_ring.geometry.camera import Camera
 from mi_ring.metrics.predictions import SPP
 from mi_ring.output.atlas import flowed
 from mi_ring.rendering import bridge
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.scenes import assembled, is_table, own_emitters

@@ -1,7 +1,6 @@
 """Mesh attributes and textures: what a BSDF reads of the mesh that it is on."""
 
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 
 import drjit as dr
@@ -77,10 +76,3 @@ def constants(bsdf) -> dict[str, list]:
         if tail == "value":
             values.setdefault(head.rpartition(".")[2], []).append(value)
     return values
-
-
-def load_bsdf(xml: str) -> mi.BSDF:
-    """The BSDF of an XML element."""
-    element = ElementTree.fromstring(xml)
-    element.set("version", "3.0.0")
-    return mi.load_string(ElementTree.tostring(element, "unicode"))

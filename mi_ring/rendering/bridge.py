@@ -15,8 +15,9 @@ from torch.nn import functional as F
 
 from mi_ring.images import blur
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.rendering.attributes import load_bsdf, require_attributes
+from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.elements import load_bsdf
 from mi_ring.rendering.indirect import BOUNCES, render_indirect
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs

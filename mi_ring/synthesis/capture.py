@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from mi_ring.capture.scenefile import (
     Element,
     add_pose,
-    load_element,
     move_names,
     numbers,
     photograph_element,
@@ -28,6 +27,7 @@ from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light
 from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import poses
@@ -88,7 +88,11 @@ class Production:
         focal, size = config.size[0] / 2 / np.tan(np.radians(config.fov / 2)), config.size
         cameras = [Camera(to_world, np.full(2, focal), np.array(size) / 2, size) for to_world in place]
         lights = lamps.lights_of(
-            config.light, cameras, config.offset, config.spread, self.random(3, novel and config.light != "lamp"),
+            config.light,
+            cameras,
+            config.offset,
+            config.spread,
+            self.random(3, novel and config.light != "lamp"),
             config.away,
         )
         return [View(camera, light, f"{k:03}", config.seed * 40_009 + 2 * (k + novel * 10_007))

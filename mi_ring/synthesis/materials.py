@@ -10,10 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.capture.loading import reason
-from mi_ring.capture.scenefile import load_element, move_names
+from mi_ring.capture.scenefile import move_names
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.images import read_image
+from mi_ring.rendering.elements import load_element
 
 COLOURS = "vertex_color"  #: name of the mesh attribute that has the colours of the mesh's file
 COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: what a mesh with colours is made of

@@ -8,11 +8,12 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_ring.capture.scenefile import Element, emitter_element, load_element, table_element
+from mi_ring.capture.scenefile import Element, emitter_element, table_element
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 from mi_ring.photogrammetry.board import DOTS, page
+from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light
 from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.synthesis.materials import COLOURS, Pattern

@@ -1,0 +1,32 @@
+"""XML elements as Mitsuba's objects."""
+
+import xml.etree.ElementTree as ElementTree
+
+import mitsuba as mi
+
+from mi_ring.errors import InputError
+
+
+def require_parts(root: ElementTree.Element) -> None:
+    """Raise RuntimeError, as Mitsuba does of what is wrong, for elements that lack what it crashes without."""
+    for element in root.iter():
+        if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
+            raise RuntimeError("bitmap: filename is missing")
+        if element.get("type") == "blendbsdf" and not len(element):
+            raise RuntimeError("blendbsdf: is empty; it takes two BSDFs and a weight")
+
+
+def load_element(element: ElementTree.Element) -> mi.Object:
+    """The object of Mitsuba's that an element stands for. Raises RuntimeError for what is wrong with it."""
+    require_parts(element)
+    whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
+    whole.extend(element)
+    return mi.load_string(ElementTree.tostring(whole, "unicode"))
+
+
+def load_bsdf(xml: str) -> mi.BSDF:
+    """The BSDF of an element as text, as a fit holds it. Raises InputError for what is wrong with it."""
+    try:
+        return load_element(ElementTree.fromstring(xml))
+    except (ElementTree.ParseError, RuntimeError) as error:
+        raise InputError(f"bsdf: {' '.join(str(error).split())}") from error
