@@ -397,7 +397,7 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
 
 def panel(fit, k):
     """The row of photograph `k` in the report."""
-    return report.panel_of(fit, fit.capture, k, report.predicted(fit, fit.capture, k))[0]
+    return report.panel_of(fit, fit.capture, k, report.predicted(fit, fit.capture, np.array([k]))[0])[0]
 
 
 def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capture, broken_capture, monkeypatch):

@@ -3,7 +3,7 @@
 import functools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,6 +109,13 @@ class Capture:
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
         return evenly(len(self), most)
+
+    def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
+        """Photographs `index`, at most so many at a time and all of one size: what one launch renders."""
+        for alike in self.sizes.values():
+            chosen = np.intersect1d(alike, index)
+            for start in range(0, len(chosen), most):
+                yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
         """Photograph `k` alone, to be rendered `scale` times smaller."""

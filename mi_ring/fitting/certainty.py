@@ -21,7 +21,7 @@ from mi_ring.rendering.photographs import Photographs
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
-WIDTH, SPP, TOGETHER = 96, 16, 8  #: of the pictures that are compared, and how many at once
+WIDTH, SPP = 96, 8  #: of the pictures that are compared
 RECORDED = "curve", "contrast", "vignetting"  #: what changes nothing of the light that reaches the camera
 STEP = 0.2  #: of the unknowns, to either side, in their priors' standard deviations
 BLOCK = 8  #: pixels across which errors are taken to go together
@@ -67,11 +67,9 @@ def deviations(fit: "Fit") -> dict[str, np.ndarray]:
     if not entries.count:
         return {}
     colours, outlines = Equations(entries.count), Equations(entries.count)
-    for size, alike in fit.capture.sizes.items():
-        chosen = np.intersect1d(alike, fit.fitted)
-        for start in range(0, len(chosen), TOGETHER):
-            index = chosen[start : start + TOGETHER]
-            compare(fit, calibration, index, -(-size[0] // WIDTH), entries, colours, outlines)
+    for index in fit.capture.together(fit.fitted):
+        scale = -(-fit.capture.sensors[index[0]].size[0] // WIDTH)
+        compare(fit, calibration, index, scale, entries, colours, outlines)
     precision = np.eye(entries.count) + colours.information() + outlines.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
     return {

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
+from itertools import chain
 from typing import Any, NamedTuple
 
 import jinja2
@@ -31,6 +32,7 @@ from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
 
 REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
+TOGETHER = 4  # photographs that are drawn at once
 PICTURE = 480  # width and height of the pictures, at most [px]
 MISFIT, COVERED = 3.0, 0.9  # a PSNR this far below the others' [dB], IoU: say so
 UNTRUE, TELLING = 0.3, 60  # share of the object's light, of fits with so many iterations; good ones end at .07 to .15
@@ -59,17 +61,22 @@ def report_html(
     `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
     """
     capture, ring = fit.calibrated(), fit.ring
-    panels = list(in_turn(partial(predicted, fit, capture), partial(panel_of, fit, capture), capture.spread()))
+    some = list(capture.together(capture.spread(), TOGETHER))
+    parts = in_turn(partial(predicted, fit, capture), partial(panels_of, fit, capture), some)
+    panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # Of many photographs those that are shown may all be kept out.
     fitted, errors = zip(*([panel for panel in panels if not panel[0].kept_out] or panels))
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
+    made = f"sRGB, {pixels}, 4 samples each"
+    if any(scale_of(fit, size) > 1 for size in capture.sizes):
+        made += f", at most {fit.config.widths[-1]} px wide"
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB (sRGB, {pixels}, 4 samples each)",
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB ({made})",
         "Silhouettes": (
             f"{np.mean(masked):.4f} intersection over union with the masks"
             if masked
@@ -176,24 +183,43 @@ class Prediction(NamedTuple):
     maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
 
 
-def predicted(fit: Any, capture: Capture, k: int) -> Prediction:
-    """Photograph `k` of the calibrated capture, as the surface that is shown predicts it."""
+def scale_of(fit: Any, size: tuple[int, int]) -> int:
+    """By how much photographs of this size are compared smaller than they are: as the fit has seen them at last."""
+    return -(-size[0] // fit.config.widths[-1])
+
+
+def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]:
+    """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
+    size = capture.sensors[index[0]].size
+    scale = scale_of(fit, size)
+    photographs = capture.photographs.select(index, size, scale)
     rgb, coverage = bridge.draw(
-        fit.surface, capture.photograph(k), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=8
+        fit.surface, photographs, spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
     )
-    small = capture.photograph(k, max(1, max(capture.sensors[k].size) // PICTURE))
+    small = capture.photographs.select(index, size, max(scale, max(size) // PICTURE))
     maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
-    return Prediction(rgb[0].numpy(), coverage[0].numpy(), {name: values[0] for name, values in maps.items()})
+    return [
+        Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
+        for n in range(len(index))
+    ]
+
+
+def panels_of(
+    fit: Any, capture: Capture, index: np.ndarray, predictions: Sequence[Prediction]
+) -> list[tuple[PhotographPanel, float]]:
+    """`panel_of` of several photographs."""
+    return [panel_of(fit, capture, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
 def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
     """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
-    seen, maps = capture.observe([k]), prediction.maps
+    scale = scale_of(fit, capture.sensors[k].size)
+    seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
     sensor = capture.sensors[k]
     shown = prediction.rgb * valid[..., None]
-    photo, guess = (linear_to_srgb(recorded(linear, sensor)) for linear in (observed, shown))
+    photo, guess = (linear_to_srgb(recorded(linear, sensor, scale)) for linear in (observed, shown))
     found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
@@ -211,12 +237,13 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
     telling = comparable(capture, seen)
     error = float(np.mean((photo - guess)[telling if telling.any() else valid] ** 2))
+    by = shift(photo * inside[..., None] if masked else photo, guess, inside | found)
     row = PhotographPanel(
         name=capture.names[k],
         psnr=-10 * np.log10(max(error, 1e-10)),
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
-        shift=shift(photo * inside[..., None] if masked else photo, guess, inside | found),
+        shift=by and (scale * by[0], scale * by[1]),
         kept_out=k in fit.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )
@@ -240,7 +267,7 @@ def data_uri(picture: np.ndarray) -> str:
     image = Image.fromarray(to_bytes(picture))
     image.thumbnail((PICTURE, PICTURE))
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", quality=85, method=2)  # faster, hardly larger
+    image.save(buffer, "WEBP", quality=85, method=1)  # faster, hardly larger
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 

@@ -108,15 +108,18 @@ def write_inputs(path: Path, fit: Any) -> None:
     cell, line = 160, 16
     sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
-    for place, k in enumerate(some):
-        scale = max(1, max(fit.capture.sensors[k].size) // cell)
-        observed = fit.capture.observe([k], scale)[0]
-        _, coverage = bridge.draw(fit.surface, fit.capture.photograph(k, scale), spp=4, shadows=False)
-        tint = 0.35 * coverage[0, ..., None].numpy() * np.array([0.1, 1.0, 0.2])
-        picture = Image.fromarray(to_bytes(linear_to_srgb(observed[0].numpy()) * 0.65 + tint))
-        picture.thumbnail((cell, cell))
-        ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
-        sheet.paste(picture, (place % columns * cell, line + place // columns * cell))
+    for index in fit.capture.together(some):
+        size = fit.capture.sensors[index[0]].size
+        scale = max(1, max(size) // cell)
+        photographs = fit.capture.photographs.select(index, size, scale)
+        _, covered = bridge.draw(fit.surface, photographs, spp=4, shadows=False)
+        for k, observed, coverage in zip(index, fit.capture.observe(index, scale).rgb, covered):
+            tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
+            picture = Image.fromarray(to_bytes(linear_to_srgb(observed.numpy()) * 0.65 + tint))
+            picture.thumbnail((cell, cell))
+            ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
+            place = some.index(k)
+            sheet.paste(picture, (place % columns * cell, line + place // columns * cell))
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG")
     write_file(path, buffer.getvalue())
