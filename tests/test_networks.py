@@ -82,12 +82,14 @@ def plain(net, x):
     return net.output(h)
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=[(1, 0), (2, 0), (2, 100)], ids=["one", "two, anew", "two, kept"])
 def threads(request, monkeypatch):
+    threads, kept = request.param
     monkeypatch.setattr(chunks, "CHUNK", 16)
+    monkeypatch.setattr(chunks, "KEPT", kept)
     before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
+    torch.set_num_threads(threads)
+    yield
     torch.set_num_threads(before)
 
 

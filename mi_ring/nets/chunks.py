@@ -4,21 +4,24 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 CHUNK = 8192  #: points that a thread computes at once, at most
+KEPT = 20_000  #: points of which the activations are kept; of more they are computed again on the way back
 
 _pool: tuple[int, ThreadPoolExecutor] | None = None  # one for the whole process: (threads, executor)
 _lock = threading.Lock()
 
 
-def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor) -> Tensor:
-    """Values at points (n, 3) by `forward`, which returns those of a chunk and what the way back needs of it.
+def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Tensor:
+    """Values at points (n, 3) by `forward(chunk, keep)`: of a chunk, and what the way back needs of it, if wanted.
 
-    Chunks are computed one per thread, and are as many for each; a GPU computes all points at once.
+    Chunks are computed one per thread, and are as many for each; a GPU computes all points at once. What the way back
+    needs of very many points would be most of a fit's memory: it is computed anew, chunk by chunk.
     """
     chunks = 1
     if x.device.type == "cpu":
@@ -26,7 +29,10 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor) -> Tensor:
         chunks = threads * -(-len(x) // (threads * CHUNK))
     parts = x.detach().tensor_split(max(1, min(chunks, len(x))))
     ctx.sizes = [len(part) for part in parts]
-    values, ctx.kept = zip(*in_parallel(torch.no_grad()(forward), parts))
+    ctx.again = forward if keep and len(x) > KEPT and x.device.type == "cpu" else None
+    own = torch.no_grad()(partial(forward, keep=keep and not ctx.again))
+    values, kept = zip(*in_parallel(own, parts))
+    ctx.kept = parts if ctx.again else kept
     return torch.cat(values)
 
 
@@ -43,6 +49,8 @@ def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[
     @torch.no_grad()
     def run(gradient: Tensor, kept: Any) -> tuple[Tensor, list[Tensor]]:
         sums = ctx.layers.zeros()
+        if ctx.again:
+            _, kept = ctx.again(kept, keep=True)
         return backward(gradient, kept, sums), sums
 
     gradients, sums = zip(*in_parallel(run, gradient.split(ctx.sizes), ctx.kept))

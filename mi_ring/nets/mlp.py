@@ -107,11 +107,11 @@ class _Evaluate(torch.autograd.Function):
         ctx.layers = layers = Layers(encoding, dtype, parameters)
         ctx.save_for_backward(*parameters)
 
-        def forward(x: Tensor) -> tuple[Tensor, list[Tensor] | None]:
+        def forward(x: Tensor, keep: bool) -> tuple[Tensor, list[Tensor] | None]:
             activations, output = layers.forward(x, keep)
             return output, activations if keep else None
 
-        return forward_in_chunks(ctx, forward, x)
+        return forward_in_chunks(ctx, forward, x, keep)
 
     @staticmethod
     @once_differentiable

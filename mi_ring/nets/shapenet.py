@@ -111,7 +111,7 @@ class _Flow(torch.autograd.Function):
         ctx.scale = scale
         ctx.save_for_backward(*parameters)
 
-        def flow(x: Tensor) -> tuple[Tensor, list]:
+        def flow(x: Tensor, keep: bool) -> tuple[Tensor, list]:
             kept = []
             for _ in range(steps):
                 activations, output = layers.forward(x, keep)
@@ -121,7 +121,7 @@ class _Flow(torch.autograd.Function):
                     kept.append((activations, direction))
             return x, kept
 
-        return forward_in_chunks(ctx, flow, x)
+        return forward_in_chunks(ctx, flow, x, keep)
 
     @staticmethod
     @once_differentiable
