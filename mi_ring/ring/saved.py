@@ -2,6 +2,7 @@
 
 import io
 import math
+import sys
 import zipfile
 from pathlib import Path
 
@@ -48,7 +49,7 @@ def ring_of(state: dict) -> Ring:
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
         subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
-        material_at=state.get("material_at", "domain"),
+        material_at=sys.intern(state.get("material_at", "domain")),  # as that of a fit anew, so that files are equal
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     require_sound(ring)
