@@ -1,7 +1,9 @@
 """Pictures as arrays: sRGB, box filter, Gaussian blur, files with all their bits."""
 
 import contextlib
+import io
 import math
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import tifffile
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -22,6 +24,7 @@ from mi_ring.system.machine import threads_for_exr
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
+FORMATS = "JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP"  #: that Pillow may take an image file for
 EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader holds some, however low the picture is
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
@@ -69,15 +72,30 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
 
 
+class Bounded(io.BufferedReader):
+    """A file of which nobody reads more bytes at once than it has: else as many are allocated as are asked for."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """An image file by Pillow, which may read more than the header to answer any question.
 
     Raises ValueError if it declares to be larger than such a file can be, what its reader likes if it is none.
     """
-    with Image.open(path) as image:
-        require_room(path, 2 * len(image.getbands()) * math.prod(image.size))
-        yield image
+    Image.init()
+    formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF if its opener is there
+    with Bounded(io.FileIO(path)) as file:
+        try:
+            image = Image.open(file, formats=formats)
+        except UnidentifiedImageError as error:  # which names the object, not the file
+            raise ValueError("its content is that of no image") from error
+        with image:
+            require_room(path, 2 * len(image.getbands()) * math.prod(image.size))
+            yield image
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -130,6 +148,8 @@ def read_image(path: Path) -> np.ndarray:
             if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
             require_room(path, math.prod(page.shape) * page.dtype.itemsize)
+            if sum(page.databytecounts) > path.stat().st_size:
+                raise ValueError(f"declares {sum(page.databytecounts):,} bytes, and is shorter")
             if math.prod(page.chunked) > path.stat().st_size:  # each of which would be asked for
                 raise ValueError(f"declares {math.prod(page.chunked):,} strips or tiles, and is shorter")
         pixels = np.array(imageio.imread(path, page=0))

@@ -1,6 +1,8 @@
 """Files of others: what declares more than it can hold is refused before that is allocated, and damage is one line."""
 
+import io
 import json
+import shutil
 import struct
 import zlib
 
@@ -13,11 +15,14 @@ import trimesh
 from PIL import Image, ImageFile
 
 from mi_ring import foreign, images
+from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
 from mi_ring.foreign import EXPANSION, ROOM, load_npy, load_npz, reading, require_room, require_survival
 from mi_ring.geometry.meshes import read_mesh
+from mi_ring.images import Bounded, write_image
+from mi_ring.importers.cameras import Lens
 from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_exposure, exposure_of
 from mi_ring.importers.reading import has_alpha, image_size, load_mat, pixels_of
@@ -264,3 +269,45 @@ def test_native_readers_that_crash_are_tried_elsewhere(tmp_path):
     require_survival("open(sys.argv[1], 'rb').read()", path, 8, "a MATLAB file")
     with pytest.raises(InputError, match="a.mat: not a MATLAB file, or damaged"):
         load_mat(path)
+
+
+def test_a_name_that_no_file_can_have_is_that_of_none(small_capture, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(small_capture.parent, folder)
+    scene = folder / small_capture.name
+    scene.write_text(scene.read_text().replace("images/003.png", "c" * 300))
+    with pytest.raises(InputError, match="no such file"):
+        load_capture(scene)
+
+
+def test_a_png_whose_pixels_declare_to_be_enormous_asks_for_no_more_than_it_has(tmp_path):
+    file = tmp_path / "a.png"
+    write_image(np.zeros((5, 7, 3), np.uint8), file)
+    content = file.read_bytes()
+    place = content.index(b"IDAT")
+    file.write_bytes(content[: place - 4] + struct.pack(">I", 2**31 - 1) + content[place:])
+    with Bounded(io.FileIO(file)) as stream:
+        stream.read(5)
+        assert len(stream.read(2**62)) == len(content) - 5 and stream.read(1) == b""
+    assert image_size(file) == (7, 5)
+
+
+def test_what_is_called_png_may_be_a_jpeg_but_no_brush(tmp_path):
+    Image.new("RGB", (7, 5)).save(tmp_path / "a.png", "JPEG")
+    assert image_size(tmp_path / "a.png") == (7, 5)
+    (tmp_path / "b.png").write_bytes(struct.pack(">IIIII", 2**31, 2, 7, 5, 1) + b"GIMP" + bytes(60))
+    with pytest.raises(InputError, match="content is that of no image"):
+        image_size(tmp_path / "b.png")
+
+
+def test_a_panorama_of_colmap_is_refused():
+    with pytest.raises(InputError, match="panorama"):
+        Lens("EQUIRECTANGULAR", (70, 50), (70.0, 50.0))
+
+
+@pytest.mark.parametrize("change", [{"settings": None}, {"settings": {"weights": 3}}, {"files": []}, {"fit": "none"}])
+def test_a_checkpoint_whose_parts_are_none_is_refused(change, tmp_path):
+    state = {"format": FORMAT, "settings": Config().settings(), "files": {}, "fit": {}}
+    write_state(state | change, tmp_path / "checkpoint.pt")
+    with pytest.raises(InputError, match="not a checkpoint of this version"):
+        read_checkpoint(tmp_path, Config())

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
@@ -68,7 +68,7 @@ def require_header(path: Path, field: str, sensor: Any, scene: Path) -> None:
 def read_by(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
     """What is read of a file. Raises InputError if there is none, or if it is no image."""
     what = f'photograph "{sensor.id()}", {field}'
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{scene}: {what}: no such file: {path}")
     with reading(f"{path}: {what}", "an image"):
         return read(path)

@@ -33,7 +33,10 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
             raise error from None
         print(f"{path}: is damaged or gone; going on from the one before, {before}")
         path = before
-    if state.get("format") != FORMAT or not {"settings", "files", "fit"} <= state.keys():
+    parts = [state.get(name) for name in ("settings", "files", "fit")]
+    if isinstance(parts[0], dict):
+        parts.append(parts[0].get("weights", {}))
+    if state.get("format") != FORMAT or not all(isinstance(part, dict) for part in parts):
         raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
     known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
     known["weights"] = WEIGHTS | known["weights"]

@@ -23,6 +23,8 @@ class Lens:
     params: tuple[float, ...]  #: in COLMAP's order
 
     def __post_init__(self) -> None:
+        if self.model == "EQUIRECTANGULAR":  # pycolmap crashes when it is asked for its focal length
+            raise InputError("camera: is a panorama, EQUIRECTANGULAR; leave such photographs out")
         if not all(1 <= side <= LARGEST for side in self.size):
             raise InputError("camera: is for photographs of {:g} x {:g} pixels; must be 1 to {}".format(
                 *np.clip(self.size, -1e9, 1e9), LARGEST))  # fmt: skip

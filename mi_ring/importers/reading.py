@@ -10,7 +10,7 @@ import numpy as np
 import scipy.io
 
 from mi_ring import images
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading, require_survival
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
@@ -37,14 +37,6 @@ def has_alpha(path: Path) -> bool:
             return image.mode in ("LA", "RGBA")
 
     return read_as(path, "image", alpha)
-
-
-def is_file(path: Path) -> bool:
-    """Is there such a file? There is none of a name that cannot be."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def existing(path: Path, field: str) -> Path:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, is_file
 from mi_ring.importers.cameras import Lens, brown, inverse
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import is_file, load_json, matrix
+from mi_ring.importers.reading import load_json, matrix
 
 #: Models of distortion: coefficients, of which two after three of Brown are tangential, by either program's names.
 MODELS = {
