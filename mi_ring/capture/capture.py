@@ -119,7 +119,11 @@ class Capture:
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
         """Photograph `k` alone, to be rendered `scale` times smaller."""
-        return self.photographs.select([k], self.sensors[k].size, scale)
+        return self.selected([k], scale)
+
+    def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
+        """Photographs `index`, all of one size, to be rendered `scale` times smaller."""
+        return self.photographs.select(index, self.sensors[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""

@@ -110,7 +110,7 @@ def compare(
 ) -> None:  # fmt: skip
     """Photographs `index`, all of one size, with their predictions, at what was found and beside it."""
     seen = fit.capture.observe(index, scale)
-    photographs = fit.capture.photographs.select(index, fit.capture.sensors[index[0]].size, scale)
+    photographs = fit.capture.selected(index, scale)
     room = calibration.roomlight().cpu()
     # Where it is the only light it is part of what moves.
     photographs = replace(photographs, room=room.double().numpy() if photographs.dark else None)

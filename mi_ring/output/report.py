@@ -192,11 +192,10 @@ def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]
     """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
     size = capture.sensors[index[0]].size
     scale = scale_of(fit, size)
-    photographs = capture.photographs.select(index, size, scale)
     rgb, coverage = bridge.draw(
-        fit.surface, photographs, spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
+        fit.surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
     )
-    small = capture.photographs.select(index, size, max(scale, max(size) // PICTURE))
+    small = capture.selected(index, max(scale, max(size) // PICTURE))
     maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
     return [
         Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})

@@ -109,10 +109,8 @@ def write_inputs(path: Path, fit: Any) -> None:
     sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for index in fit.capture.together(some):
-        size = fit.capture.sensors[index[0]].size
-        scale = max(1, max(size) // cell)
-        photographs = fit.capture.photographs.select(index, size, scale)
-        _, covered = bridge.draw(fit.surface, photographs, spp=4, shadows=False)
+        scale = max(1, max(fit.capture.sensors[index[0]].size) // cell)
+        _, covered = bridge.draw(fit.surface, fit.capture.selected(index, scale), spp=4, shadows=False)
         for k, observed, coverage in zip(index, fit.capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
             picture = Image.fromarray(to_bytes(linear_to_srgb(observed.numpy()) * 0.65 + tint))
