@@ -12,7 +12,7 @@ from mi_ring import fit
 from mi_ring.capture import reflectance
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.rendering import attributes, bridge
+from mi_ring.rendering import bridge, elements
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import load_fit
 
@@ -41,7 +41,7 @@ def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
     assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
     assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
     assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
-    text = str(attributes.load_bsdf(xml))
+    text = str(elements.load_bsdf(xml))
     assert '"vertex_base_color"' in text and '"vertex_roughness"' in text and "vertex_spec_tint" not in text
 
 
@@ -121,7 +121,7 @@ def test_part_of_cooktorrance(broken_capture):
     shape = load_capture(path).shape
     parameters, xml = reflectance.predicted_parameters(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
-    assert "vertex_specular" not in str(attributes.load_bsdf(xml))
+    assert "vertex_specular" not in str(elements.load_bsdf(xml))
     # Without ranges: all but the constant.
     assert [p.name for p in reflectance.predicted_parameters(path, shape, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
