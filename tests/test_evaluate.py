@@ -259,7 +259,7 @@ def sphere_run(small_capture, tmp_path_factory):
 def test_the_command_agrees_with_the_pictures_that_render_writes(sphere_run, small_capture, tmp_path, capsys):
     out = tmp_path / "numbers" / "all.json"
     evaluate.main([str(sphere_run), "--mesh", str(sphere_run / "truth.ply"), "--novel", str(small_capture),
-                   "--out", str(out)])  # fmt: skip
+                   "--out", str(out), "--spp", "4"])  # fmt: skip
     printed = capsys.readouterr()
     totals, everything = json.loads(printed.out), json.loads(out.read_text())
     assert printed.out.count("\n") == 1 and str(out) in printed.err
@@ -270,7 +270,7 @@ def test_the_command_agrees_with_the_pictures_that_render_writes(sphere_run, sma
     assert np.mean([view["iou"] for view in views]) == pytest.approx(totals["iou"], abs=1e-4)
     assert novel == [{key: view[key] for key in ("name", "psnr", "ssim")} for view in views]  # the same photographs
 
-    render.main([str(sphere_run), str(small_capture), str(tmp_path / "pictures")])
+    render.main([str(sphere_run), str(small_capture), str(tmp_path / "pictures"), "--spp", "4"])
     squares = []
     for view in views:
         names = small_capture.parent / "images" / view["name"], tmp_path / "pictures" / view["name"]
