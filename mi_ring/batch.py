@@ -81,9 +81,13 @@ def main(arguments: Sequence[str]) -> int:
         if len(todo) < len(jobs):
             print(f"{len(jobs) - len(todo)} of {len(jobs)} are done already")
         show(jobs, config.out, True)
-        if todo:
-            follow(todo, jobs, config)
-        return finish(jobs, config.out)
+
+        def work() -> int:
+            if todo:
+                follow(todo, jobs, config)
+            return finish(jobs, config.out)
+
+        return command.going_on(work)
 
 
 def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:

@@ -1,7 +1,9 @@
 """Batches of fits: what becomes of each, whatever is killed."""
 
+import dataclasses
 import importlib.util
 import json
+import os
 import re
 import shutil
 import sys
@@ -33,7 +35,7 @@ class Script:
         self.steps, self.commands = list(steps), []
         monkeypatch.setattr(fits, "run", self)
 
-    def __call__(self, command, job):
+    def __call__(self, command, job, tell):
         self.commands.append(command)
         status, iteration, complaint = self.steps.pop(0)
         job.folder.mkdir(parents=True, exist_ok=True)
@@ -73,7 +75,7 @@ def test_a_mistake_is_not_tried_again(job, monkeypatch):
 
 
 def test_a_worker_that_is_killed_again_and_again_does_not_try_for_ever(job, monkeypatch):
-    def dies(command, job):
+    def dies(command, job, tell):
         raise KeyboardInterrupt  # as near to a death as a test can be
 
     monkeypatch.setattr(fits, "run", dies)
@@ -116,6 +118,38 @@ def test_paths_in_options_are_those_of_where_the_batch_was_begun(small_capture, 
     assert job.fingerprint() != before
     job.output.parent.mkdir(parents=True)
     assert fits.run([sys.executable, "-c", "print(open('ball.ply').read())"], job) == (0, "ply")
+
+
+def test_what_a_fit_prints_is_told_while_it_goes_on(small_capture, tmp_path):
+    (job,) = jobs_of([small_capture], tmp_path, [])
+    job.output.parent.mkdir(parents=True)
+    told = []
+
+    def tell(line):
+        told.append(line)
+        (tmp_path / "heard").touch()  # for which the first line waits
+
+    text = """import pathlib, time
+print("one", "tw", sep=chr(13), end="", flush=True)
+while not pathlib.Path("heard").exists():
+    time.sleep(.01)
+print("o")"""
+    job = dataclasses.replace(job, place=tmp_path)
+    assert fits.run([sys.executable, "-c", text], job, tell) == (0, "two") and told == ["one", "two"]
+
+
+def test_a_fit_ends_with_who_waits_for_it(small_capture, tmp_path):
+    (job,) = jobs_of([small_capture], tmp_path, [])
+    job.output.parent.mkdir(parents=True)
+
+    def tell(line):
+        raise KeyboardInterrupt(line)
+
+    text = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt) as stop:
+        fits.run([sys.executable, "-c", text], job, tell)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(str(stop.value)), 0)
 
 
 def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_path):

@@ -25,6 +25,7 @@ from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.rendering.plain_mesh import scene_of
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
+from mi_ring.system.progress import progress
 
 NUMBERS = "numbers.json"  #: of a run, in the folder of its results: what was measured of which fit
 RETRIES = 1  #: of a fit that is killed without getting any further
@@ -70,12 +71,12 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
         if not job.is_done(fingerprint):
             if not wanted:
                 return Outcome(run)
-            print(f"fitting, see {job.output}", flush=True)
+            print(f"fitting: {folder}", flush=True)
             job.output.parent.mkdir(parents=True, exist_ok=True)
             record = (
                 watched(run, job, fingerprint, made)
                 if run.watched
-                else fit_to_the_end(job, fingerprint, RETRIES, threads(asked))
+                else fit_to_the_end(job, fingerprint, RETRIES, threads(asked), tell)
             )
             if record.state != "done":
                 return Outcome(run, failed=record.message)
@@ -84,6 +85,11 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
         if not isinstance(error, InputError):
             traceback.print_exc(file=sys.stderr)
         return Outcome(run, failed=str(error) or type(error).__name__)
+
+
+def tell(line: str) -> None:
+    """What a fit says, where progress is said."""
+    print(f"  {line}", file=sys.stderr, flush=True)
 
 
 def threads(asked: Asked) -> tuple[str, ...]:
@@ -119,7 +125,7 @@ def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
 
     with threads_of(made.asked.threads):
         fit = Fit(load_capture(made.scene, masks="auto"), run.config(made.asked), callbacks=[look])
-        for _ in fit:
+        for _ in progress(fit, "iterations", total=fit.iterations):
             pass
         fit.save(job.folder)
     write_file(job.folder / COURSE, json.dumps(rows))

@@ -100,6 +100,16 @@ def one_line(message: str) -> str:
     return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]} … {words[-LONGEST // 2 :]}"
 
 
+def going_on(work: Callable[[], int]) -> int:
+    """The exit status of work that goes on where it was interrupted, and says so if it is; 130 then."""
+    try:
+        return work()
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        print("interrupted; the same command goes on", file=sys.stderr, flush=True)
+        return 130
+
+
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: status 2 and one line on standard error for anything the user can mend.
 
