@@ -152,13 +152,17 @@ def test_path_tracer_sees_the_flashs_cone_as_photometric_does():
     assert pictures[2.5, "path"].mean() < 0.95 * pictures[0.0, "path"].mean()
 
 
-def test_vignetting_and_curve_are_undone_in_a_file_that_they_made(small_capture):
-    """v = (R · cosⁿ)^γ, cosine by hand; what a fit predicts is what such a file says, decoded without."""
+def test_lens_gain_and_curve_are_undone_in_a_file_that_they_made(small_capture):
+    """v = (R · g · cosⁿ)^γ, cosine by hand, logarithms of g of mean 0. What a fit predicts is what such a
+    file says, decoded without.
+    """
     capture = mi_ring.load_capture(small_capture)
-    calibration = Calibration(capture, ("curve", "vignetting"), CENTER, 0.3)
+    calibration = Calibration(capture, ("curve", "vignetting", "gain"), CENTER, 0.3)
     with torch.no_grad():
         calibration.curve.fill_(0.8)
         calibration.vignetting.fill_(2.0)
+        calibration.gain[:, 1] = torch.linspace(-2, 3, len(capture))
+    gain = np.exp([0, 0.1 * (calibration.gain[4, 1].item() - 0.5), 0])
     sensor = calibration.applied(capture).sensors[4]
     gamma, n, (width, height) = np.exp(0.8 * 0.2), 2.0, sensor.size
     assert (sensor.gamma, sensor.vignetting) == (pytest.approx(gamma), pytest.approx(n))
@@ -166,11 +170,11 @@ def test_vignetting_and_curve_are_undone_in_a_file_that_they_made(small_capture)
     (fx, fy), (cx, cy) = sensor.camera.focal, sensor.camera.centre
     cosine = np.array([[1 / np.sqrt(1 + ((u + 0.5 - cx) / fx) ** 2 + ((v + 0.5 - cy) / fy) ** 2)
                         for u in range(width)] for v in range(height)])[..., None]  # fmt: skip
-    file = (radiance * cosine**n) ** gamma
+    file = (radiance * gain * cosine**n) ** gamma
     np.testing.assert_allclose(recorded(radiance, sensor), file, rtol=1e-4)
     changed = replace(capture, sensors=[sensor], images=one(file), masks=one(None), valid=one(None))
     np.testing.assert_allclose(changed.observe([0]).rgb[0], radiance, rtol=1e-4)
-    relative = 0.3 * (radiance * cosine**n / 0.3) ** gamma
+    relative = 0.3 * (radiance * gain * cosine**n / 0.3) ** gamma
     mean = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
     np.testing.assert_allclose(mean[0].detach(), relative, rtol=1e-4)
     np.testing.assert_allclose(calibration.linear(mean.detach(), [4], 1)[0], radiance, rtol=1e-4)
@@ -262,9 +266,10 @@ def test_what_is_refined_on_demand_goes_with_auto(small_capture):
         Config(refine=("none", "light"))
 
 
-def test_a_lens_whose_vignetting_is_known_dims_what_the_curve_records(small_capture, tmp_path):
+def test_what_is_known_of_lens_and_gain_dims_what_the_curve_records(small_capture, tmp_path):
     def dim(element):
         ElementTree.SubElement(element, "float", name="vignetting", value="3.5")
+        ElementTree.SubElement(element, "string", name="gain", value="1.2 0.8 0.9")
 
     capture = mi_ring.load_capture(edited(small_capture, tmp_path / "dim", dim))
     calibration = Calibration(capture, ("curve",), CENTER, 0.3)
@@ -509,6 +514,8 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
         for name in ("cameras", "intrinsics", "distortion", "places", "strengths"):
             if hasattr(a, name):
                 np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
+    for a, b in zip(read.sensors, applied.sensors):
+        np.testing.assert_allclose(a.gain, b.gain, rtol=1e-6)
     assert [s.gamma for s in read.sensors] == pytest.approx([s.gamma for s in applied.sensors])
     assert [s.mask for s in read.sensors] == [s.mask for s in capture.sensors]
 

@@ -1,5 +1,7 @@
 """Unknown light: what a fit takes it to be, finds, and writes."""
 
+import re
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -76,6 +78,33 @@ def test_an_environment_is_found_and_written(in_an_environment, tmp_path):
     np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
     albedo = np.pi * fit.ring.material(fit.ring.domain.sample(3)[0])["diffuse"].mean().item()
     assert 0.3 < albedo < 0.8
+
+
+def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_path):
+    """For the most part: neighbours alone tell them from light of another strength. What lights say is not lost."""
+    exposed = in_an_environment.parent.parent / "exposed"
+    shutil.copytree(in_an_environment.parent, exposed)
+    random = np.random.default_rng(2)
+    true = random.uniform(0.7, 1.4, (10, 1)) * random.uniform(0.85, 1.15, (10, 3))
+    for k, path in enumerate(sorted((exposed / "images").iterdir())):
+        write_image((read_image(path) * true[k]).astype(np.float32), path)
+    text = (exposed / "scene.xml").read_text()
+    capture = mi_ring.load_capture(exposed / "scene.xml")
+    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 50}, light="environment", refine=("gain",))
+    fit = mi_ring.Fit(capture, config)
+    for _ in fit:
+        pass
+    gains = np.log([sensor.gain for sensor in fit.calibrated().sensors]), np.log(true)
+    off = (gains[0] - gains[0].mean(0)) - (gains[1] - gains[1].mean(0))
+    assert np.abs(off).mean() < 0.5 * np.abs(gains[1] - gains[1].mean(0)).mean()
+
+    values = iter(true)
+    said = re.sub(r'(name="intensity" value=)"0 0 0"', lambda _: '{}"{} {} {}"'.format(_[1], *next(values)), text)
+    (exposed / "said.xml").write_text(said)
+    told = lit(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
+    np.testing.assert_allclose([sensor.gain for sensor in told.sensors], true / true.mean(0), rtol=1e-5)
+    with pytest.raises(InputError, match="--refine: .* must be with power or with gain"):
+        mi_ring.Config(refine=("power", "gain"))
 
 
 def test_coarse_fits_find_that_it_is_an_environment(in_an_environment):

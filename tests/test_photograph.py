@@ -206,6 +206,8 @@ def point(position, intensity=1.0):
         ({"to_world": "there"}, "to_world.* has the wrong type"),
         ({"filename": None}, "filename"),
         ({"encoding": "gamma"}, '"gamma", must be "srgb" or "linear"'),
+        ({"gain": "1 0 1"}, 'gain is "1 0 1", must be above 0'),
+        ({"gain": "1 2"}, 'gain is "1 2", must be 1 or 3 numbers'),
         ({"one": point([0, 0, 1]), "two": point([0, 1, 0])}, "2 nested emitters"),
     ],
     ids=[
@@ -219,6 +221,8 @@ def point(position, intensity=1.0):
         "to_world in words",
         "no filename",
         "encoding",
+        "no gain",
+        "two gains",
         "two lights",
     ],
 )

@@ -16,22 +16,24 @@ from mi_ring.rendering.photographs import Photographs
 def with_calibration(
     capture: Capture, cameras: Sequence[Camera], lights: Sequence[Light], gamma: float = 1.0,
     room: np.ndarray | None = None, falloff: Sequence[float] | None = None, vignetting: float = 0.0,
-    contrast: float = 1.0,
+    contrast: float = 1.0, gains: np.ndarray | float = 1.0,
 ) -> Capture:  # fmt: skip
     """The same photographs with other cameras and lights, one each; their curves' `gamma` and `contrast` times these.
 
     `room`: light of the room, as `Photographs` has it; `falloff`: exponents of the flashes' cones, one each, by default
-    as they are; `vignetting`: what is added to the exponents of the lenses'.
+    as they are; `vignetting`: what is added to the exponents of the lenses'; `gains` (P, 3):
+    factors of what the photographs record.
     """
     sensors = []
     cones = [sensor.cone for sensor in capture.sensors] if falloff is None else falloff
-    for sensor, camera, light, cone in zip(capture.sensors, cameras, lights, cones, strict=True):
+    gains = np.broadcast_to(gains, (len(cameras), 3))
+    for sensor, camera, light, cone, gain in zip(capture.sensors, cameras, lights, cones, gains, strict=True):
         element = photograph_element(
             sensor.id(), str(sensor.filename), camera, light, sensor.mask and str(sensor.mask),
             None if sensor.encoding == "auto" else sensor.encoding, sensor.saturation,
             sensor.valid and str(sensor.valid), sensor.gamma * gamma,
             falloff=cone, vignetting=sensor.vignetting + vignetting, contrast=sensor.contrast * contrast,
-            ambient=sensor.ambient and str(sensor.ambient),
+            ambient=sensor.ambient and str(sensor.ambient), gain=sensor.gain * gain,
         )  # fmt: skip
         sensors.append(load_element(element))
     return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))

@@ -34,15 +34,19 @@ def decode(
 
 
 def shade(sensor: Any, scale: int = 1) -> np.ndarray | float:
-    """What the lens of a photograph leaves of light, (H, W, 1) of a picture `scale` times smaller; 1 if all of it."""
+    """What lens and gain of a photograph make of light: factors (H, W, 3) or (3,), of a picture `scale` times smaller.
+
+    1 if they leave it as it is.
+    """
+    gain = sensor.gain.astype(np.float32) if (sensor.gain != 1).any() else np.float32(1)
     if not sensor.vignetting:
-        return 1.0
+        return gain
     cosines = sensor.camera.shrunk(scale).cosines()
-    return (cosines[..., None] ** sensor.vignetting).astype(np.float32)
+    return (cosines[..., None] ** sensor.vignetting).astype(np.float32) * gain
 
 
 def recorded(radiance: np.ndarray, sensor: Any, scale: int = 1) -> np.ndarray:
-    """Linear radiance (H, W, 3) as the lens and the curve of a photograph's camera record it, `scale` times smaller."""
+    """Linear radiance (H, W, 3) as lens, gain and curve of a photograph's camera record it, `scale` times smaller."""
     curved = (radiance * shade(sensor, scale)) ** sensor.gamma
     return curved if sensor.contrast == 1 else contrasted(curved, sensor.contrast)
 

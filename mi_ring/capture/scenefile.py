@@ -24,12 +24,14 @@ FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 #: What a photograph says of lens, curve and flash by one number each, and what it says by saying nothing.
 USUAL = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
 
+GAIN = "gain"  #: of a photograph: its only property of several numbers
+
 
 def photograph_element(
     name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
     encoding: str | None = None, saturation: float | None = None, valid: str | None = None, gamma: float = 1.0,
     calibrated: bool = False, falloff: float = 0.0, vignetting: float = 0.0, contrast: float = 1.0,
-    ambient: str | None = None,
+    ambient: str | None = None, gain: ArrayLike = 1.0,
 ) -> Element:  # fmt: skip
     """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
     element = ElementTree.Element("sensor", type="photograph", id=name)
@@ -44,6 +46,8 @@ def photograph_element(
     fields |= {field: value for field, value in given.items() if value != USUAL[field]}
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
+    if (np.asarray(gain) != 1).any():
+        ElementTree.SubElement(element, "string", name=GAIN, value=numbers(gain))
     if calibrated:
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
     add_pose(element, camera.to_world)
@@ -156,13 +160,14 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
         sensor = sensors[k]
         new = photograph_element(
             "", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma, contrast=sensor.contrast,
-            falloff=sensor.cone, vignetting=sensor.vignetting,
+            falloff=sensor.cone, vignetting=sensor.vignetting, gain=sensor.gain,
         )  # fmt: skip
-        fields = {child.get("name"): child for child in new if child.tag in ("float", "transform")}
+        fields = {child.get("name"): child for child in new
+                  if child.tag in ("float", "transform") or child.get("name") == GAIN}  # fmt: skip
         for child in list(old):
             known = f".//emitter[@id='{child.get('id')}']"
             lit = child.tag == "emitter" or (child.tag == "ref" and root.find(known) is not None)
-            if lit or child.get("name") in {*USUAL, *fields}:
+            if lit or child.get("name") in {*USUAL, GAIN, *fields}:
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
     frames = set()

@@ -1,11 +1,12 @@
 """Cameras, lights, room and camera curve as unknowns: what a fit refines besides surface and material.
 
 The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
-against albedo, but for interreflection (the logarithms of `power` have the mean zero in each colour, and `scale` takes
-the reflectance along); where the whole is, how it is turned and how large it is, which only the priors hold; focal
-length against distance, likewise; the cone of a flash against vignetting, nearly, where it is beside the lens. A room
-that is alike from all sides is in the world's axes and in the camera's: it counts as the world's. One fixed in the
-camera looks like a flash that is elsewhere, and like another reflectance: it is refined only where the scene has one.
+against albedo, but for interreflection (the logarithms of `power` and `gain` have the mean zero in each colour, and
+`scale` takes the reflectance along); where the whole is, how it is turned and how large it is, which only the priors
+hold; focal length against distance, likewise; the cone of a flash against vignetting, nearly, where it is beside the
+lens. A room that is alike from all sides is in the world's axes and in the camera's: it counts as the world's. One
+fixed in the camera looks like a flash that is elsewhere, and like another reflectance: it is refined only where the
+scene has one.
 """
 
 import math
@@ -46,12 +47,14 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
     "curve": {"curve": 0.2},  # logarithm of the exponent
     "contrast": {"contrast": 0.2},  # logarithm of how steep the curve's S is
+    "gain": {"gain": 0.1},  # logarithm, of each photograph and colour
     "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
 }
 #: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
 #: the reflectance, and takes the flash's place and the room along (docs/phone.md).
 AUTO = "light", "power", "ambient"
+OF_ONE = {"cameras", "power", "gain"}  #: what is another in each photograph; steps of their own find it
 #: What is of the photographs' own lights, which an unknown environment takes the place of.
 OF_LIGHTS = {"light", "power", "falloff", "scale"}
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
@@ -68,6 +71,8 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     names: set[str] = set(config.refine)
     unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamp": {"light", "ambient"}}.get(config.light)
     if unknown:
+        if "auto" in names and not capture.known:
+            names.add("gain")
         names = (names - {"auto"} - (OF_LIGHTS if "light" not in unknown else set())) | unknown
     if "auto" in names and not capture.known:
         untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
@@ -144,6 +149,7 @@ class Calibration(nn.Module):
         self.sizes = [sensor.size for sensor in capture.sensors]
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
+        self.gains = torch.from_numpy(np.stack([sensor.gain for sensor in capture.sensors])).float()
         kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
         lenses = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
@@ -155,8 +161,8 @@ class Calibration(nn.Module):
         shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
                   "principal": (int(lenses.max()) + 1, 2), "distortion": (int(lenses.max()) + 1,),
                   "falloff": (), "vignetting": (),
-                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "curve": (), "contrast": (),
-                  "scale": ()}  # fmt: skip
+                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "gain": (count, 3),
+                  "curve": (), "contrast": (), "scale": ()}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
@@ -195,14 +201,14 @@ class Calibration(nn.Module):
             moved = places + offset * torch.where(self.finite, self.distance, 1.0)
             places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
         scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
-        strengths = strengths * (scale + self.powers()).exp()
+        strengths = strengths * (scale + self.centred("power")).exp()
         return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"), distortion)
 
-    def powers(self) -> Tensor:
-        """(P, 3) logarithms of the factors of photographs' lights, of mean 0; 0 of those that are kept out."""
-        power = self.value("power").expand(len(self.lens), 3)
-        result = torch.zeros_like(power)
-        result[self.fitted] = power[self.fitted] - power[self.fitted].mean(0)
+    def centred(self, name: str) -> Tensor:
+        """(P, 3) `power` or `gain`, logarithms of factors, of mean 0; 0 of photographs that are kept out."""
+        found = self.value(name).expand(len(self.lens), 3)
+        result = torch.zeros_like(found)
+        result[self.fitted] = found[self.fitted] - found[self.fitted].mean(0)
         return result
 
     def scaled(self, scale: int) -> Calibrated:
@@ -247,7 +253,8 @@ class Calibration(nn.Module):
         exponent, contrast, vignetting = (
             self.value(name) if name in self.widths else None for name in ("curve", "contrast", "vignetting")
         )
-        return Curve(exponent, contrast, vignetting, self.gammas, self.dimmed, self.exposure)
+        gain = self.centred("gain").detach().exp() if "gain" in self.widths else None
+        return Curve(exponent, contrast, vignetting, self.gammas, self.dimmed, self.exposure, self.gains, gain)
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """`Curve.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
@@ -288,8 +295,8 @@ class Calibration(nn.Module):
         return total / 2 / len(self.lens)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """Adam, whose groups say when they begin, for all but cameras and powers; none if nothing is left to find."""
-        found = [UNKNOWNS[group] for group in self.refined if group not in ("cameras", "power")]
+        """Adam, whose groups say when they begin, for all but what is `OF_ONE`; none if nothing is left to find."""
+        found = [UNKNOWNS[group] for group in self.refined if group not in OF_ONE]
         groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE, "start": START}
                   for names in found if names]  # fmt: skip
         return [torch.optim.Adam(groups, lr=RATE)] if groups else []
@@ -305,7 +312,7 @@ class Calibration(nn.Module):
         with torch.no_grad():
             matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in self())
             gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
-            contrast = float(self.value("contrast").exp())
+            contrast, gains = float(self.value("contrast").exp()), self.centred("gain").double().exp().numpy()
         # The curve's fixed point is the exposure here, full scale in a scene file.
         strengths = strengths * self.exposure ** ((1 - gamma) / gamma)
         cameras, lights = [], []
@@ -317,7 +324,8 @@ class Calibration(nn.Module):
         room = None
         if "ambient" in self.refined or capture.photographs.room is not None:
             room = self.roomlight().double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
-        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast)
+        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast,
+                                gains)  # fmt: skip
 
 
 def rotations(vectors: Tensor) -> Tensor:

@@ -131,18 +131,20 @@ def compare(
         added = around.in_the_way if photographs.dark else around.room
         roomlight = added(room.to(fit.device)).cpu() if room.any() else roomlight
 
-    def picture(lit: Tensor, bounced: Tensor = bounced) -> Tensor:
-        return perceived(calibration.recorded(lit + bounced + roomlight, index, scale), fit.exposure, "log")
+    def picture(lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0) -> Tensor:
+        light = gain * (lit + bounced + roomlight)
+        return perceived(calibration.recorded(light, index, scale), fit.exposure, "log")
 
     slopes, unknowns = [], entries.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
     for name, k, places in unknowns:
         sides = []
         for step in (STEP, -STEP):
             factor = float(np.exp(step * calibration.widths[name]))
-            if name == "power":  # not by its unknowns, whose mean does not count
+            if name in ("power", "gain"):  # not by its unknowns, whose mean does not count
                 colour = torch.ones(3)
                 colour[k] = factor
-                sides.append((picture(lit * colour, bounced * colour), coverage))
+                own_light = picture(lit * colour, bounced * colour)
+                sides.append((own_light if name == "power" else picture(lit, gain=colour), coverage))
             elif name == "scale":
                 sides.append((picture(lit, bounced / factor), coverage))
             else:

@@ -18,8 +18,8 @@ WEIGHTS = {
 
 #: What `Config.refine` may have.
 Unknown = Literal[
-    "auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "falloff", "vignetting", "curve",
-    "contrast", "scale", "ambient", "masks",
+    "auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "gain", "falloff", "vignetting",
+    "curve", "contrast", "scale", "ambient", "masks",
 ]  # fmt: skip
 
 
@@ -109,16 +109,17 @@ class Config:
     subdivisions: int = 6
     """Level of the mesh that is written."""
     refine: tuple[Unknown, ...] = ("auto",)
-    """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point
-    of each lens; distortion: how much each lens bends lines, its first radial one; light: where a flash is that moves
-    with the camera, else the place or direction of each light; power: strength and colour of the light, photograph by
-    photograph; falloff: how much less a flash shines to the sides; vignetting: how much darker the lens is toward the
-    borders; curve: one exponent of the camera's, for all; contrast: how steep the S of a curve as of film is; scale:
-    the power of all lights together, by interreflection; ambient: the light of the room, which is the same for all,
-    fixed in the world, or in the camera if the scene has a `room` in its axes, as that of a turntable has; masks: the
-    object's outlines in the photographs, found anew about the surface at half and at three quarters of the fit. auto:
-    light, power and ambient, and scale where lights cannot be as strong as the scene says, but nothing if it says that
-    it is calibrated; none: nothing."""
+    """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point of
+    each lens; distortion: how much each lens bends lines, its first radial one; light: where a flash is that moves with
+    the camera, else the place or direction of each light; power: strength and colour of the light, photograph by
+    photograph; gain: how much each photograph records of it, by exposure and white balance; falloff: how much less a
+    flash shines to the sides; vignetting: how much darker the lens is toward the borders; curve: one exponent of the
+    camera's, for all; contrast: how steep the S of a curve as of film is; scale: the power of all lights together, by
+    interreflection; ambient: the light of the room, which is the same for all, fixed in the world, or in the camera if
+    the scene has a `room` in its axes, as that of a turntable has; masks: the object's outlines in the photographs,
+    found anew about the surface at half and at three quarters of the fit. auto: light, power and ambient, and scale
+    where lights cannot be as strong as the scene says, but nothing if it says that it is calibrated; where the light is
+    unknown, gain; none: nothing."""
     holdout: int = 0
     """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
     thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.
@@ -136,6 +137,9 @@ class Config:
         require(bool(self.refine) and set(self.refine) <= set(known), "refine", f"some of {', '.join(known)}")
         object.__setattr__(self, "refine", tuple(name for name in known if name in self.refine))  # in one order
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")
+
+        both = {"power", "gain"} <= set(self.refine)
+        require(not both, "refine", "with power or with gain: the one looks like the other")
 
         for f in dataclasses.fields(Config):  # from Python nobody else has checked them
             if get_origin(f.type) is Literal:

@@ -1,4 +1,4 @@
-"""What a lens and a camera's curve make of radiance, as a fit refines them: vignetting, an exponent, an S."""
+"""What lens, gain and curve of cameras make of radiance, as a fit refines them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ DARKEST = 1e-4  #: radiance, in units of the exposure, below which the curve is 
 
 
 class Curve(NamedTuple):
-    """One for all photographs. What is None is as the capture says."""
+    """One for all photographs, but for the gains. What is None is as the capture says."""
 
     exponent: Tensor | None  #: logarithm of the exponent: a file's value, decoded, goes like radiance to its power
     contrast: Tensor | None  #: logarithm of how steep the S is
@@ -22,6 +22,8 @@ class Curve(NamedTuple):
     gammas: Tensor  #: (P,) as the capture has them
     dimmed: Tensor  #: (P,) exponents of vignetting that the capture knows
     exposure: float  #: radiance that the exponent leaves as it is: the object's mean
+    gains: Tensor  #: (P, 3) as the capture has them
+    gain: Tensor | None = None  #: (P, 3) factors of them that were found
 
     @property
     def shading(self) -> bool:
@@ -29,29 +31,35 @@ class Curve(NamedTuple):
         return self.vignetting is not None or bool(self.dimmed.any())
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Radiance (N, ..., 3) as lens and curve record it, decoded by what the capture says of both.
+        """Radiance (N, ..., 3) as lens, gain and curve record it, decoded by what the capture says of them.
 
         `index` (N,): which photographs; `cosines` (N, ..., 1): of their pixels, needed for `shading`.
         """
-        if cosines is None:
-            return self.curved(radiance, self.gammas[index])
         known, unknown = self.shades(radiance, index, cosines)
         return self.curved(radiance * known * unknown, self.gammas[index]) / known
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Radiance of what lens and curve recorded, the inverse of `recorded`; without gradients."""
-        if cosines is None:
-            return self.straight(recorded, self.gammas[index])
+        """Radiance of what was recorded, the inverse of `recorded`; without gradients."""
         known, unknown = self.shades(recorded, index, cosines)
         return self.straight(recorded * known, self.gammas[index]) / known / unknown
 
-    def shades(self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor) -> tuple[Tensor, Tensor]:
-        """By how much the lens dims (N, ..., 1): what the capture knows of it, and what the fit has found."""
-        cosines = cosines.to(like)
-        dimmed = self.dimmed[index].to(like)
-        found = torch.zeros(()) if self.vignetting is None else self.vignetting
-        return cosines ** dimmed.view(-1, *[1] * (cosines.ndim - 1)), cosines ** found.to(like)
+    def shades(
+        self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
+    ) -> tuple[Tensor | float, Tensor | float]:
+        """Factors (N, ..., 3) by lens and gain: what the capture knows of them, and what the fit has found."""
+        ones = [1] * (like.ndim - 2)
+
+        def by_photograph(values: Tensor) -> Tensor:
+            return values[index].to(like).view(-1, *ones, values.shape[1])
+
+        known: Tensor | float = by_photograph(self.gains) if (self.gains != 1).any() else 1.0
+        unknown: Tensor | float = 1.0 if self.gain is None else by_photograph(self.gain)
+        if cosines is not None:
+            cosines = cosines.to(like)
+            known = known * cosines ** by_photograph(self.dimmed[:, None])
+            unknown = unknown if self.vignetting is None else unknown * cosines ** self.vignetting.to(like)
+        return known, unknown
 
     def curved(self, radiance: Tensor, gammas: Tensor) -> Tensor:
         """Radiance (N, ...) as the curve records it; `gammas` (N,): as the capture has them."""

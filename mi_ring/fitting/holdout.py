@@ -13,14 +13,14 @@ import torch
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import UNKNOWNS
+from mi_ring.fitting.calibration import OF_ONE, UNKNOWNS
 from mi_ring.rendering import bridge
 
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
 
 #: Of all photographs; what is of one is not known where it is out.
-SHARED = set(UNKNOWNS) - {"cameras", "power"}
+SHARED = set(UNKNOWNS) - OF_ONE
 WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
 
 

@@ -78,14 +78,10 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     require_unknown(capture, config)
     if config.light in ("capture", "environment", "turntable"):
         return Lighting(config.light)
-    strengths = capture.photographs.lights.rgb().mean(1)
-    if strengths.max() > ALIKE * strengths.min():
-        print(f"Light: those of the scene differ in strength, by up to {strengths.max() / strengths.min():.2g} times; "
-              "an unknown light is taken to be the same in all photographs, equally exposed")  # fmt: skip
 
     def tried(lighting: Lighting) -> tuple[float, "Fit"]:
         """The error that a coarse fit leaves, and the fit."""
-        refine = config.refine if lighting.kind == "capture" else ("none",)
+        refine = config.refine if lighting.kind == "capture" else recording(config)
         fit = trial(capture, replace(config, **COARSE, light=lighting.kind, refine=refine), lighting=lighting)
         iterations = progress(fit, f"trying --light {lighting.kind}", fit.iterations, unit="iteration")
         errors = [it.terms["rgb"] for it in iterations]
@@ -105,6 +101,27 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     left = ", ".join(f"{lighting.kind} {error:.3g}" for lighting, error in found.items())
     print(f"Light: taken to be --light {best.kind}; errors that coarse fits leave: {left}")
     return best
+
+
+def recording(config: Config) -> tuple[Any, ...]:
+    """What a coarse fit under an unknown light refines of what `Config.refine` has: exposures alone."""
+    return tuple(name for name in config.refine if name in ("auto", "gain")) or ("none",)
+
+
+def exposures(capture: Capture) -> np.ndarray:
+    """(P, 3) how strong the photographs' own lights are, by their mean: under one light that is how they were exposed.
+
+    1 where the scene does not say.
+    """
+    strengths = capture.photographs.lights.rgb()
+    kinds = capture.photographs.lights.is_finite()
+    if kinds.any() != kinds.all() or not (strengths > 0).all():
+        return np.ones_like(strengths)
+    found = strengths / strengths.mean(0)
+    if found.max() > ALIKE * found.min():
+        print(f"Light: those of the scene differ in strength, by up to {found.max() / found.min():.2g} times, which "
+              "is taken to be how the photographs were exposed")  # fmt: skip
+    return found
 
 
 def brightest(fit: "Fit") -> tuple[float, float, float]:
@@ -127,11 +144,12 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
         place, (center, _) = np.array(lighting.place), capture.sphere()
         strength = math.pi * exposure / ALBEDO * np.linalg.norm(place - center) ** 2
         return with_calibration(capture, cameras, [Light("point", place, np.full(3, strength))] * len(cameras),
-                                falloff=[0.0] * len(cameras))  # fmt: skip
+                                falloff=[0.0] * len(cameras), gains=exposures(capture))  # fmt: skip
     harmonics = np.zeros((BASIS, 3))
     harmonics[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
     dark = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
-    return with_calibration(capture, cameras, dark, room=harmonics, falloff=[0.0] * len(cameras))
+    return with_calibration(capture, cameras, dark, room=harmonics, falloff=[0.0] * len(cameras),
+                            gains=exposures(capture))  # fmt: skip
 
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:

@@ -1,4 +1,4 @@
-"""The power of each photograph's light, by what an iteration sees of it.
+"""The power of each photograph's light, or its gain, by what an iteration sees of it.
 
 It is a factor, so that one look says all of it: how much brighter the object was than predicted. Adam's steps, of a
 size that does not depend on how far off it is, came to 2.1 % of powers that were off by 15 %, these to 1.2 %.
@@ -24,8 +24,9 @@ ENOUGH = 30  #: pixels
 class Powers(torch.optim.Optimizer):
     """Steps of the photographs that an iteration has seen, and of no others: `look` at it, then `step`."""
 
-    def __init__(self, calibration: Calibration) -> None:
-        self.power, self.width = calibration.unknown("power")[0], calibration.widths["power"]
+    def __init__(self, calibration: Calibration, name: str) -> None:
+        """`name`: power or gain."""
+        self.power, self.width = calibration.unknown(name)[0], calibration.widths[name]
         super().__init__([{"params": [self.power], "initial_lr": RATE, "decay": DECAY, "start": START}], {"lr": RATE})
         self.seen: list[tuple[int, Tensor]] = []  # which photographs, and logarithms (3,) of how much brighter
 
@@ -64,5 +65,5 @@ Looker: TypeAlias = GaussNewton | Powers  #: an optimiser that goes by more of a
 
 def lookers_of(calibration: Calibration, near: bool, given: Mapping[str, Term]) -> list[Looker]:
     """Those of what is unknown of each photograph; `near` and `given` as of `GaussNewton`."""
-    found: list[Looker] = [Powers(calibration)] if "power" in calibration.refined else []
+    found: list[Looker] = [Powers(calibration, name) for name in ("power", "gain") if name in calibration.refined]
     return found + ([GaussNewton(calibration, near, given)] if "cameras" in calibration.refined else [])

@@ -15,17 +15,17 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     """What was refined: of each unknown `before`, `after` and, but for the room's light, `std`, given the surface.
 
     `photographs`: of each that was not kept out how far its picture of the object moved [px]; if cameras were refined
-    how far it was turned and moved, if powers were, the factor of each colour. `refined`: the capture with all of it;
-    `deviations`: as `mi_ring.fitting.certainty` has them.
+    how far it was turned and moved, if powers or gains were, the factor of each colour. `refined`: the capture with all
+    of it; `deviations`: as `mi_ring.fitting.certainty` has them.
     """
     calibration = fit.calibration
     assert calibration is not None
     with torch.no_grad():
         now = {name: calibration.value(name).double().numpy(force=True) for name in calibration.widths}
-        gain = calibration.strengthened
+        strengthened = calibration.strengthened
         room = calibration.room
         given, share = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics))
-        powers = calibration.powers().double().exp().numpy()
+        factors = {name: calibration.centred(name).double().exp().numpy() for name in ("power", "gain") if name in now}
     unknowns: dict[str, dict[str, Any]] = {}
 
     def add(name: str, what: str, before: Any, after: Any, std: Any) -> None:
@@ -70,7 +70,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         add("contrast", "contrast of the camera's curve", np.mean([sensor.contrast for sensor in old]), contrast,
             contrast * deviations["contrast"])  # fmt: skip
     if "scale" in now:
-        add("scale", "power of all lights together", 1, gain, gain * deviations["scale"])
+        add("scale", "power of all lights together", 1, strengthened, strengthened * deviations["scale"])
     if "ambient" in calibration.refined:
         what = "light of the room on the object, as shares of the flash's: red, green, blue"
         if fit.capture.photographs.dark:
@@ -92,7 +92,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
             if name in now:
                 entry[key] = float(unit * np.linalg.norm(now[name][k]))
                 std[key] = float(unit * np.linalg.norm(deviations[name][k]))
-        if "power" in now:
-            entry["power"], std["power"] = powers[k].tolist(), (powers[k] * deviations["power"][k]).tolist()
+        for name, factor in factors.items():
+            entry[name], std[name] = factor[k].tolist(), (factor[k] * deviations[name][k]).tolist()
         photographs[fit.capture.names[k]] = entry | {"std": std}
     return {"refined": list(calibration.refined), "unknowns": unknowns, "photographs": photographs}

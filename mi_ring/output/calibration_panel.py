@@ -57,11 +57,12 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
         if key in entries[0]:
             middle, spread = (np.median([e[key] for e in side]) for side in (entries, [e["std"] for e in entries]))
             result.append({"what": what, "before": 0, "after": middle, "std": spread})
-    if lit := [entry for entry in entries if "power" in entry]:
-        off = np.median([np.abs(np.log(e["power"])).mean() for e in lit])
-        spread = np.median([np.divide(e["std"]["power"], e["power"]).mean() for e in lit])
-        result.append({"what": "power of photographs, off the mean, median [%]", "before": 0, "after": 100 * off,
-                       "std": 100 * spread})  # fmt: skip
+    for key in ("power", "gain"):
+        if told := [entry for entry in entries if key in entry]:
+            off = np.median([np.abs(np.log(e[key])).mean() for e in told])
+            spread = np.median([np.divide(e["std"][key], e[key]).mean() for e in told])
+            result.append({"what": f"{key} of photographs, off the mean, median [%]", "before": 0, "after": 100 * off,
+                           "std": 100 * spread})  # fmt: skip
     return result
 
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera, distortion_range
-from mi_ring.plugins.properties import beside_scene, number
+from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
 from mi_ring.rendering.pinhole import camera_ray
 
 SHUTTER = -1.0  #: time of a photograph's rays, by which the flash knows them from those of other sensors (0 and later)
@@ -50,6 +50,8 @@ class Photograph(mi.Sensor):
     ``vignetting``   float        how much darker the lens is toward the borders of the picture: like
                                   the cosine of the angle from the optical axis to this power.
                                   Default: 0, none
+    ``gain``         string       how much of the radiance is recorded, by exposure and white balance: a
+                                  factor, or one each for R, G, B. Default: 1
     ``falloff``      float        how much less a point light, taken to be a flash that looks where the  P, ∂
                                   camera looks, shines to the sides: like the cosine of the angle from
                                   that direction to this power. Default: 0, alike in all directions
@@ -116,6 +118,10 @@ class Photograph(mi.Sensor):
         self.gamma = number(props, "gamma", 1.0, positive=True)
         self.contrast = number(props, "contrast", 1.0, positive=True)
         self.vignetting = number(props, "vignetting", 0.0)
+        gain = number_list(props, "gain", (1, 3)) if "gain" in props else [1.0]
+        if min(gain) < 1 / LARGEST:
+            raise ValueError(f'photograph "{props.id()}": gain is "{props["gain"]}", must be above 0')
+        self.gain = np.broadcast_to(gain, 3)
         self.falloff = mi.Float(number(props, "falloff", 0.0))
         self.calibrated = props.get("calibrated", False)
 
