@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--levels", type=int, nargs="+", default=[5])
     parser.add_argument("--widths", type=int, nargs="+", default=[256])
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--batch", type=int, default=8, help=argparse.SUPPRESS)
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:

@@ -1,5 +1,6 @@
 """Reconstruct many objects, on one machine or many: `python -m mi_ring.batch SCENES… --workers N -- FIT OPTIONS`."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -106,7 +107,8 @@ def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) ->
             now = [f"{job.name} {job.progress}" for job in todo if before[job.name] == "running"]
             bar.set_postfix_str("; ".join(now))
             if changed:
-                show(jobs, config.out, True)
+                with contextlib.suppress(InputError):  # a disk that is full for a while ends no fit
+                    show(jobs, config.out, True)
 
         fit_all(todo, config.resources, config.retries, look)
 

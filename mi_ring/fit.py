@@ -110,7 +110,7 @@ def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path)
     """The settings that --minutes has led to before, by the folder's config.json, if there is one."""
     try:
         before = read_json(folder / "config.json")
-        minutes, preset, iterations = before["minutes"], before["preset"], int(before["iterations"])
+        minutes, preset, iterations = float(before["minutes"]), before["preset"], int(before["iterations"])
     except (ValueError, LookupError, TypeError, OverflowError):
         return config  # its checkpoint tells what is wrong
     if minutes != config.minutes:

@@ -56,7 +56,7 @@ def require_survival(read: str, path: Path, size: int, what: str) -> None:
     try:
         trial = [sys.executable, "-c", BOUNDED + read, str(path), str(2**31 + 40 * size)]
         done = subprocess.run(trial, capture_output=True, text=True, timeout=PATIENCE + size / SPEED)
-        trouble = done.stderr.strip().splitlines()[-1:] or [f"its reader died of signal {-done.returncode}"]
+        trouble = done.stderr.strip().splitlines()[-1:] or [f"its reader ended with status {done.returncode}"]
     except subprocess.TimeoutExpired as late:
         raise InputError(f"{path}: not {what}, or damaged (not read in {late.timeout:.0f} s)") from late
     if done.returncode:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import math
 import os
 import struct
@@ -115,17 +116,22 @@ def exr_size(path: Path) -> tuple[int, int, int]:
 
     By "OpenEXR File Layout": attributes are their name and their type, which end in 0, their size and their value.
     """
+    found: dict[bytes, bytes] = {}
     with path.open("rb") as file:
-        header = file.read(2**16)  # of its chunks there may be many more
-    place, found = 8, {}
-    if header[:4] != b"\x76\x2f\x31\x01":
-        raise ValueError("no OpenEXR file")
-    while header[place]:
-        name, kind = header.index(b"\0", place), 0
-        kind = header.index(b"\0", name + 1)
-        (size,) = struct.unpack_from("<I", header, kind + 1)
-        found[header[place:name]] = header[kind + 5 : kind + 5 + size]
-        place = kind + 5 + size
+
+        def word() -> bytes:
+            letters = iter(lambda: file.read(1) or b"\0", b"\0")
+            return b"".join(itertools.islice(letters, 256))  # the format's longest
+
+        if file.read(8)[:4] != b"\x76\x2f\x31\x01":
+            raise ValueError("no OpenEXR file")
+        while len(found) < 2 and (name := word()):
+            word()
+            (size,) = struct.unpack("<I", file.read(4))
+            if name in (b"channels", b"dataWindow"):
+                found[name] = file.read(min(size, 2**16))
+            else:
+                file.seek(size, os.SEEK_CUR)
     left, top, right, bottom = struct.unpack("<4i", found[b"dataWindow"])
     channels, place = 0, 0
     while found[b"channels"][place]:  # a name, then 16 bytes

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -66,6 +67,26 @@ def test_a_fit_that_dies_goes_on_from_its_checkpoint_and_gives_up_where_it_gets_
     script = Script(monkeypatch, *[(-9, 60, KILLED)] * 3)
     record = fitted(job, 2)
     assert (record.state, record.message, len(script.commands)) == ("failed", KILLED, 3)
+
+
+def test_a_checkpoint_that_is_refused_is_not_gone_on_from(job, monkeypatch):
+    script = Script(monkeypatch, (-9, 5, KILLED), (2, 0, "checkpoint.pt: is of format 3"), (0, 60, ""))
+    assert fitted(job, 1).state == "done"
+    assert [("--resume" in command) for command in script.commands] == [False, True, False]
+
+
+def test_a_disk_that_is_full_for_a_while_does_not_end_a_batch(job, monkeypatch):
+    pages = Mock(side_effect=[None, InputError("index.html: cannot be written"), None, None])
+    monkeypatch.setattr(batch, "write_index", pages)
+
+    def fit_all(todo, resources, retries, look):
+        for state in ("running", "done"):
+            job.note(dataclasses.replace(job.record, state=state))
+            look()
+
+    monkeypatch.setattr(batch, "fit_all", fit_all)
+    assert batch.main([str(job.scene), "--out", str(job.folder.parent)]) == 0
+    assert pages.call_count == 4
 
 
 def test_a_mistake_is_not_tried_again(job, monkeypatch):

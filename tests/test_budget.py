@@ -76,6 +76,11 @@ def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkey
     assert read_log(tmp_path / "run")[-1]["iteration"] == options["iterations"]
     assert f"--preset {options['preset']} --iterations {options['iterations']}" in capsys.readouterr().out
     assert command.main([*call, "--resume"]) == 0
+    for strange in ("4", None, [1]):
+        (tmp_path / "run/config.json").write_text(json.dumps(options | {"minutes": strange}))
+        with pytest.raises(InputError, match="--minutes: was 4 before|--(preset|iterations): was"):
+            command.main([*call, "--resume"])
+    (tmp_path / "run/config.json").write_text(json.dumps(options))
     with pytest.raises(InputError, match="--minutes: was 1 before, is 2 now"):
         command.main([*call[:-1], "2", "--resume"])
     with pytest.raises(InputError, match="--batch: was 8 before, is 3 now"):

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import mitsuba as mi
@@ -27,6 +29,7 @@ from mi_ring.capture import capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting import checkpoint, optimizers, session, start, terms
+from mi_ring.fitting.caution import Caution
 from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
@@ -313,6 +316,32 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
     assert Fit(broken.capture, broken.config, state=broken.state()).caution.retreats == 2
 
 
+def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():
+    module = torch.nn.BatchNorm1d(3)
+    adam = torch.optim.Adam(module.parameters())
+    module(torch.ones(2, 3)).sum().backward()
+    adam.step()
+    caution = Caution([module], [adam])
+    assert caution.finite()
+    for number in (module.running_var, adam.state[module.weight]["exp_avg_sq"]):
+        before = float(number[1])
+        number[1] = np.inf
+        assert not caution.finite()
+        number[1] = before
+    assert caution.finite()
+
+
+def test_gradients_of_unknowns_that_are_none_make_no_step(small_capture, monkeypatch):
+    settings = {"levels": (1,), "widths": (28,), "shares": (1,), "domain": "sphere", "indirect": False}
+    running = Fit(load_capture(small_capture), Config(iterations=30, refine=("light",), **settings))
+    for _ in range(10):
+        running.step()
+    running.calibration.light.register_hook(lambda gradient: gradient * np.nan)
+    before = running.ring.brdf_net.output.weight.detach().clone()
+    running.step()
+    assert torch.equal(running.ring.brdf_net.output.weight, before) and running.caution.failures == 1
+
+
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
     monkeypatch.setattr(bridge.Surroundings, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
     for options, bright in (([], True), (["--no-indirect"], False)):
@@ -588,6 +617,18 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
     assert {p.name for p in elsewhere.iterdir()} == set(FILES) - {"inputs.png", "checkpoint.before.pt"}
     assert load_fit(elsewhere)
 
+    # Nor does what is left depend on the scene, which may have been on the same drive, nor on the report.
+    running = Fit(load_capture(small_capture), Config(iterations=2, levels=(1,), widths=(28,), shares=(1,)))
+    keeper = session.Keeper(running, folder, lambda: None)
+    scene = results.fitted_scene(running, folder)
+    running.capture = replace(running.capture, path=tmp_path / "gone.xml")
+    said = keeper.rescue(scene)
+    where = Path(re.fullmatch("the results are in (.*) instead", said)[1])
+    assert where != elsewhere and load_fit(where) and (where / "report.html").exists()
+    monkeypatch.setattr(results.report, "report_html", Mock(side_effect=OSError("full")))
+    where = Path(re.fullmatch("what could be written is in (.*) instead, with a checkpoint", keeper.rescue(scene))[1])
+    assert load_fit(where) and (where / "checkpoint.pt").exists() and not (where / "report.html").exists()
+
 
 def test_a_damaged_checkpoint_is_made_good_by_the_one_before(small_capture, tmp_path, monkeypatch, capsys):
     """As in a deterministic fit that nobody disturbed. What is damaged does not take the place of what is not."""
@@ -638,7 +679,7 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         )
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
     files.write_state(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
-    with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint of this version"):
+    with pytest.raises(InputError, match="checkpoint.pt: is a checkpoint of format 3, mi_ring .* goes on from 4"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):

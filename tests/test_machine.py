@@ -3,6 +3,7 @@
 import errno
 import io
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from mi_ring.errors import InputError
+from mi_ring.fitting import session
 from mi_ring.nets import chunks
 from mi_ring.system import command, files, gpus, machine, progress
 
@@ -222,6 +224,40 @@ def test_fits_that_torchrun_starts_see_one_gpu_each_and_other_programs_all_of_th
     monkeypatch.setattr(sys, "orig_argv", words)
     gpus.choose_gpu()
     assert there["CUDA_VISIBLE_DEVICES"] == seen and (gpus.OWN in there) == (seen == "7")
+
+
+def test_with_one_thread_nothing_else_runs_meanwhile(monkeypatch):
+    """Reading an EXR changes their number for a moment, which another thread that renders does not survive."""
+    where = []
+
+    def seen(*things):
+        where.append(threading.get_ident())
+        return things
+
+    for count, several in ((1, False), (2, True)):
+        monkeypatch.setattr(machine.dr, "thread_count", lambda count=count: count)
+        where.clear()
+        assert list(machine.in_turn(seen, seen, "ab")) == [("a", ("a",)), ("b", ("b",))]
+        assert (len({*where}) > 1) is several
+
+
+def test_a_signal_is_heard_without_a_word(capsys):
+    """It may come while something is being printed, which cannot be begun anew within itself."""
+    with session.heeding_signals() as heard:
+        signal.raise_signal(signal.SIGTERM)
+        assert heard() == signal.SIGTERM
+    assert "".join(capsys.readouterr()) == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")
+def test_a_command_whose_reader_has_gone_says_nothing():
+    reading, writing = os.pipe()
+    os.close(reading)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "mi_ring.doctor"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, env=environment)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_an_exr_is_written_and_read_on_a_single_thread(tmp_path):

@@ -216,6 +216,10 @@ def test_a_room_takes_no_light_away():
     assert not room.harmonics[:, 0].any()
     found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[ALL, 1]) for part in (room.harmonics, truth))
     assert float((found - missing).abs().mean()) < 0.2 * float(missing.abs().mean())
+    before = {name: value.clone() for name, value in room.state_dict().items()}
+    broken = torch.full((1, 10, 14, 3), torch.nan)
+    room.see(around, broken, broken + 1, torch.ones(1, 10, 14) > 0)  # a photograph that is no number tells nothing
+    assert all(torch.equal(value, before[name]) for name, value in room.state_dict().items())
 
 
 @pytest.mark.parametrize(("field", "value"), [("frame", "lamp"), ("harmonics", "0.1 0.1"), ("harmonics", "a " * 27)])

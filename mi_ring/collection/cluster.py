@@ -76,5 +76,6 @@ def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, look: C
                     ray.get(reference)
                 except (ray.exceptions.RayError, OSError, InputError) as error:  # of the worker, not of the fit
                     message = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-                    job.note(replace(job.record, state="failed", message=message[0]))
+                    with contextlib.suppress(InputError):
+                        job.note(replace(job.record, state="failed", message=message[0]))
             look()

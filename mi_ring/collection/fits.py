@@ -44,6 +44,9 @@ def fit_to_the_end(
         if status == 0 and (ring := written(job.folder / "ring.pt")):
             iteration = job.iteration(record.since)
             return job.note(replace(record, state="done", iteration=iteration, done=fingerprint, written=ring))
+        if status == MISTAKE and resume:  # by another version, or both checkpoints are damaged: anew, for once
+            record = replace(record, since=time.time(), iteration=-1)
+            continue
         if status in (0, MISTAKE):  # without results: it was not asked for any
             return job.note(replace(record, state="failed", message=complaint))
 

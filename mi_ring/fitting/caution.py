@@ -22,7 +22,7 @@ class Caution:
     ) -> None:  # fmt: skip
         """All is well to begin with; `state`: what `state()` was of an interrupted fit."""
         self.parts: list[Any] = [*modules, *optimizers]
-        self.parameters = [p for module in modules for p in module.parameters() if p.numel()]
+        self.modules, self.optimizers = modules, optimizers
         self.factor: float = 1.0  #: of all learning rates
         self.retreats: int = 0  #: how often it has gone back
         self.failures: int = 0  #: losses or gradients in a row that were not finite
@@ -31,8 +31,11 @@ class Caution:
 
     @torch.no_grad()
     def finite(self) -> bool:
-        """Is all that is fitted?"""
-        return all(bool(p.sum().isfinite()) for p in self.parameters)
+        """Is all that is fitted, and all that its optimisers remember?"""
+        numbers = [t for module in self.modules for t in (*module.parameters(), *module.buffers())]
+        numbers += [t for o in self.optimizers for state in o.state.values() for t in state.values()]
+        tensors = [t for t in numbers if torch.is_tensor(t) and t.is_floating_point() and t.numel()]
+        return all(bool(t.sum().isfinite()) for t in tensors)
 
     def note(self, healthy: bool) -> bool:
         """Take note of an iteration, which has made its step if it was `healthy`; go back where that is due.

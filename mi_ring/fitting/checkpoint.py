@@ -1,5 +1,6 @@
 """Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
 
+import contextlib
 import hashlib
 import math
 from pathlib import Path
@@ -10,6 +11,7 @@ from mi_ring.fitting.config import WEIGHTS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.ring.saved import read_state
 from mi_ring.system.files import is_sealed, relative_to, write_state
+from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
 BEFORE = "checkpoint.before.pt"  #: the one before it, in case that it is damaged
@@ -36,13 +38,16 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
     parts = [state.get(name) for name in ("settings", "files", "fit")]
     if isinstance(parts[0], dict):
         parts.append(parts[0].get("weights", {}))
-    if state.get("format") != FORMAT or not all(isinstance(part, dict) for part in parts):
-        raise InputError(f"{path}: not a checkpoint of this version of mi_ring; {ADVICE}")
+    if isinstance(found := state.get("format"), int) and found != FORMAT:
+        raise InputError(f"{path}: is a checkpoint of format {found}, mi_ring {__version__} goes on from {FORMAT}; go "
+                         f"on with the version that wrote it, or {ADVICE}")  # fmt: skip
+    if found != FORMAT or not all(isinstance(part, dict) for part in parts):
+        raise InputError(f"{path}: holds no checkpoint; {ADVICE}")
     known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
     known["weights"] = WEIGHTS | known["weights"]
     for name, value in config.settings().items():
-        if (before := known[name]) != value:
-            raise InputError(f"{path}: --{name.replace('_', '-')}: was {before} before, is {value} now; give the same "
+        if (was := known[name]) != value:
+            raise InputError(f"{path}: --{name.replace('_', '-')}: was {was} before, is {value} now; give the same "
                              "settings, --preset among them, or start anew without --resume")  # fmt: skip
     return state
 
@@ -79,7 +84,9 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
     """
     state = {"format": FORMAT, "settings": fit.config.settings(), "files": files, "fit": fit.state()}
     path = folder / NAME
-    whole = path.is_file() and is_sealed(path.read_bytes())  # what is damaged must not replace what is not
+    whole = False
+    with contextlib.suppress(OSError):  # there is none, or it cannot be read
+        whole = is_sealed(path.read_bytes())  # what is damaged must not replace what is not
     write_state(state, path, folder / BEFORE if whole else None)
 
 

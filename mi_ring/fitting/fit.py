@@ -274,7 +274,8 @@ class Fit:
         clip = torch.nn.utils.clip_grad_norm_
         # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
-        healthy = bool((it.loss + norm).isfinite())  # the renderer may swallow a NaN on the way back
+        others = [p.grad for p in self.calibration.parameters() if p.grad is not None] if self.calibration else []
+        healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 begun = self.caution.factor * min(1.0, max(0.0, (it.progress - group.get("start", -1.0)) / RAMP))

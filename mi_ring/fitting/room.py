@@ -81,6 +81,8 @@ class Room(nn.Module):
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
         equations = share.sum(torch.cat([matrix, vector[..., None]], -1))
+        if not bool(equations.isfinite().all()):  # the renderer may have a pixel that is none, and this is kept
+            return
         self.matrix *= MEMORY
         self.vector *= MEMORY
         self.matrix[:, torch.tensor(which)[:, None], which] += equations[..., :-1]

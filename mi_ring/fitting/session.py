@@ -39,10 +39,8 @@ def heeding_signals() -> Iterator[Callable[[], int]]:
     come: list[int] = []
 
     def hear(number: int, frame: object) -> None:
-        come.append(number)
+        come.append(number)  # and no word: it may come in the midst of one
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        if len(come) == 1:
-            tqdm.write("\nInterrupted: writing what there is (Ctrl-C again to drop it)")
 
     heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
     before = {number: signal.signal(number, hear) for number in heard}
@@ -108,16 +106,23 @@ class Keeper:
             self.folder.mkdir(parents=True, exist_ok=True)
             results.write(self.folder, self.fit, fitted_scene)
         except (InputError, OSError) as error:
-            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue()}") from error
+            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(fitted_scene)}") from error
 
-    def rescue(self) -> str:
-        """Write results and checkpoint elsewhere. Returns where they are, in words."""
+    def rescue(self, fitted_scene: bytes) -> str:
+        """Write checkpoint and results elsewhere, as far as that is possible. Returns where they are, in words."""
+        saved = ""
         try:
             elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
-            results.save_fit(elsewhere, self.fit)
+            results.prepare_folder(elsewhere, self.fit.capture.path, self.fit.config.settings(), resume=True)
+            results.write_log(elsewhere, self.fit.log)
             write_checkpoint(self.fit, self.files, elsewhere)
+            saved = f"what could be written is in {elsewhere} instead, with a checkpoint"
+            with contextlib.suppress(InputError, OSError):  # the scene may have gone with the folder
+                fitted_scene = results.fitted_scene(self.fit, elsewhere)
+            results.write(elsewhere, self.fit, fitted_scene)
         except (InputError, OSError):
-            return "what the last checkpoint there has is left, for --resume; make room or choose another place"
+            left = "what the last checkpoint there has is left, for --resume; make room or choose another place"
+            return saved or left
         return f"the results are in {elsewhere} instead"
 
 
@@ -132,8 +137,9 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     )  # fmt: skip
     if keeper.writes:
         results.write_log(keeper.folder, fit.log)
+    come = 0
     with bar:
-        while fit.iteration < fit.iterations and not interrupted():
+        while fit.iteration < fit.iterations and not (come := interrupted()):
             retreats = fit.caution.retreats
             it = fit.step()
             if fit.caution.retreats > retreats:
@@ -145,6 +151,8 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
             keeper.follow(it)
+    if come:
+        print("Interrupted: writing what there is (Ctrl-C again to drop it)", flush=True)
     keeper.checkpoint()
 
 

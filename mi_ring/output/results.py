@@ -52,6 +52,8 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        for partial in folder.glob(".*.partial"):  # of a process that was killed: nobody else writes here
+            partial.unlink(missing_ok=True)
     options = options | {"scene": relative_to(folder, scene.resolve())}
     write_file(folder / "config.json", json.dumps(options, indent=2, default=str))
 

@@ -119,7 +119,9 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
     traceback = "--traceback" in arguments
     arguments = [argument for argument in arguments if argument != "--traceback"]
     try:
-        sys.exit(main(arguments) or 0)
+        status = main(arguments) or 0
+        sys.stdout.flush()  # here, where it may fail
+        sys.exit(status)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `mi-ring … | head`: nobody reads on

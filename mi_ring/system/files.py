@@ -51,7 +51,7 @@ def partial_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
-def write_file(path: Path, content: bytes | str, durable: bool = False, keep: Path | None = None) -> None:
+def write_file(path: Path, content: bytes | memoryview | str, durable: bool = False, keep: Path | None = None) -> None:
     """Write a file so that it is there whole or not at all. Raises InputError if it cannot be written.
 
     `durable`: even after a power cut, which takes a while. `keep`: what was there before goes there.
@@ -91,24 +91,26 @@ def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
     """
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
-    write_file(path, sealed(buffer.getvalue()), durable=True, keep=keep)
+    seal(buffer)
+    write_file(path, buffer.getbuffer(), durable=True, keep=keep)
 
 
-def sealed(archive: bytes) -> bytes:
-    """A zip file with the digest of all that comes before as its comment."""
-    end = archive.rindex(END)
-    assert end + COMMENT + 2 == len(archive), "has a comment already"
-    body = archive[: end + COMMENT] + (len(SEAL) + DIGEST).to_bytes(2, "little")
-    return body + SEAL + fingerprint(body)
+def seal(archive: io.BytesIO) -> None:
+    """Give a zip file the digest of all that comes before as its comment."""
+    end = archive.seek(-COMMENT - 2, os.SEEK_END)
+    assert archive.read(len(END)) == END, "has a comment already"
+    archive.seek(end + COMMENT)
+    archive.write((len(SEAL) + DIGEST).to_bytes(2, "little"))
+    archive.write(SEAL + fingerprint(archive.getbuffer()))
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Is it a zip file as `sealed` gave it, every bit of it?"""
-    body = archive[: -len(SEAL) - DIGEST]
+    """Is it a zip file as `seal` left it, every bit of it?"""
+    body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 
 
-def fingerprint(content: bytes) -> bytes:
+def fingerprint(content: bytes | memoryview) -> bytes:
     """Of some bytes, in hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 

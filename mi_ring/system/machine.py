@@ -98,7 +98,14 @@ def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[R
 def in_turn(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """`second(thing, first(thing))` of each; in a thread of its own, while this one has the `first` of the next."""
+    """`second(thing, first(thing))` of each; in a thread of its own, while this one has the `first` of the next.
+
+    But for one thread, in turn indeed: `threads_for_exr` must not change their number while another renders.
+    """
+    if dr.thread_count() < ENOUGH:
+        for thing in things:
+            yield second(thing, first(thing))
+        return
     with ThreadPoolExecutor(1) as pool:
         before = None
         for thing in things:
@@ -183,16 +190,15 @@ def threads_of(count: int = 0) -> Iterator[None]:
 @contextlib.contextmanager
 def threads_for_exr() -> Iterator[None]:
     """Threads enough for Mitsuba to read or write an EXR: on a single one it waits forever."""
-    if dr.thread_count() >= ENOUGH:
+    with contextlib.ExitStack() as held:
+        held.enter_context(ONE_AT_A_TIME)
+        before = dr.thread_count()  # of which no other thread has made more for a moment
+        if before < ENOUGH:
+            dr.set_thread_count(ENOUGH)
+            held.callback(dr.set_thread_count, before)
+        else:
+            held.close()
         yield
-        return
-    with ONE_AT_A_TIME:
-        before = dr.thread_count()
-        dr.set_thread_count(ENOUGH)
-        try:
-            yield
-        finally:
-            dr.set_thread_count(before)
 
 
 def glibc(name: str) -> Callable[..., int]:

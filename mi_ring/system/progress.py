@@ -25,8 +25,12 @@ def outliving_readers() -> Iterator[None]:
     try:
         yield
     finally:
-        for stream in filter(None, (sys.stdout, sys.stderr)):
-            stream.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, Dispensable):
+                try:
+                    stream.stream.flush()
+                except OSError:
+                    stream.drop()
         sys.stdout, sys.stderr = before
 
 
@@ -53,9 +57,13 @@ class Dispensable:
         try:
             output()
         except OSError as error:
-            if error.errno in (errno.EPIPE, errno.EIO):  # else what is left to be written fails again at the very end
-                with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
-                    os.dup2(nowhere.fileno(), self.stream.fileno())
+            if error.errno in (errno.EPIPE, errno.EIO):
+                self.drop()
+
+    def drop(self) -> None:
+        """Drop what is left to be written, which would fail again at the very end, and all that comes."""
+        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), self.stream.fileno())
 
 
 class Lines(io.TextIOBase):

@@ -21,6 +21,8 @@ import trimesh
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
+from mi_ring.fit import planned_before
+from mi_ring.fit_config import FitConfig
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
 from mi_ring.geometry.meshes import load_closed_mesh
@@ -311,9 +313,12 @@ def results(folder: Path) -> Reader:
     for name, content in zip(names, contents):
         (folder / name).write_text(content.replace("%s", str(move).replace("'", '"')))
 
+    config = FitConfig(folder / "scene.xml", minutes=3)
+
     def read() -> None:
         read_log(folder)
         told_before(folder / "scene.xml", ["000", "001"])
+        planned_before(config, [config], folder)
 
     return Reader([folder / name for name in names], read)
 
