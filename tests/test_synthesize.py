@@ -16,6 +16,7 @@ import mi_ring
 from mi_ring import check, synthesize
 from mi_ring.capture.decoding import decode
 from mi_ring.geometry.camera import Camera
+from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.photogrammetry.board import Board
 from mi_ring.rendering.lights import Light, Lights
@@ -25,7 +26,7 @@ from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import look_at, poses
 from mi_ring.synthesis.capture import Production, write_scenes
 from mi_ring.synthesis.config import SynthesizeConfig
-from mi_ring.synthesis.degradation import encoded, miscalibrated, noisy
+from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURS, load_material, plugin
 from mi_ring.synthesis.stage import Stage, load_object
 from mi_ring.synthesis.tracing import Shot
@@ -203,6 +204,23 @@ def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     middle = truths.irradiance(np.zeros(3)).mean()
     np.testing.assert_allclose(middle, 7, rtol=1e-5)
     np.testing.assert_allclose(true.photographs.room[0].mean() / np.sqrt(4 * np.pi), 0.1 / np.pi * middle, rtol=0.13)
+
+
+def test_photographs_that_are_exposed_differently(lump, tmp_path):
+    options = ["--views", "3", "--novel", "1", "--size", "20", "16", "--spp", "4", "--exposure", "0.5"]
+    pictures = {}
+    for name, more in (("alike", []), ("apart", ["--wrong-exposure", "30"])):
+        synthesize.main([str(lump), str(tmp_path / name), *options, *more])
+        pictures[name] = [read_image(path).astype(float) for path in sorted((tmp_path / name).rglob("*.exr"))]
+    said, true = (mi_ring.load_capture(tmp_path / "apart" / name) for name in ("scene.xml", "truth/exact.xml"))
+    assert not said.sensors[0].calibrated and all((sensor.gain == 1).all() for sensor in said.sensors)
+    for k, (alike, apart) in enumerate(zip(pictures["alike"], pictures["apart"])):
+        gain = true.sensors[k].gain if k < 3 else 1.0  # the last shows a view that no fit sees
+        np.testing.assert_allclose(apart, alike * gain, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(true.observe([1]).rgb[0], pictures["alike"][1], rtol=2e-3, atol=1e-6)
+    many = exposures(20_000, 30, np.random.default_rng(1))
+    assert np.log(many).std() == pytest.approx(np.hypot(0.3, 0.1), rel=0.05)
+    assert np.log(many[:, 0] / many[:, 1]).std() == pytest.approx(0.1 * 2**0.5, rel=0.05)
 
 
 def test_stripes_are_where_they_are_said_to_be(lump, tmp_path):

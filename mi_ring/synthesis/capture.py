@@ -32,7 +32,7 @@ from mi_ring.rendering.lights import Light
 from mi_ring.synthesis import lamps
 from mi_ring.synthesis.cameras import poses
 from mi_ring.synthesis.config import SynthesizeConfig
-from mi_ring.synthesis.degradation import HIGHEST, encoded, miscalibrated, noisy
+from mi_ring.synthesis.degradation import HIGHEST, encoded, exposures, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
 from mi_ring.synthesis.tracing import Shot
@@ -157,6 +157,11 @@ class Production:
         return float(1 / bright)
 
     @cached_property
+    def gains(self) -> np.ndarray:
+        """(views, 3) how the photographs are exposed, by their mean."""
+        return exposures(self.config.views, self.config.wrong_exposure, self.random(6))
+
+    @cached_property
     def spp(self) -> int:
         """Paths per pixel: a square number."""
         return int(np.ceil(np.sqrt(self.config.spp))) ** 2
@@ -184,6 +189,7 @@ def write_capture(config: SynthesizeConfig) -> None:
     for view, folder, masked in progress(todo, "photographing", unit="photograph", leave=True):
         linear = exposure * production.radiance(stage, view, view.camera, production.spp)
         if masked:
+            linear *= production.gains[int(view.name)]
             coverage = stage.coverage(Shot(view.camera))
             write_image(to_bytes(coverage[..., None] >= 0.5), out / "masks" / f"{view.name}.png")
             if config.electrons or config.read:
@@ -206,6 +212,7 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
     metres = 0.001 if config.table == "sheet" else None
 
     def scene(folder: Path, views: list[View], images: str, masks: str, exact: bool) -> bytes:
+        gains = production.gains if exact and views is seen else np.ones((len(views), 3))
         cameras, lights = [view.camera for view in views], [view.light for view in views]
         if not exact:
             cameras, lights = miscalibrated(
@@ -218,9 +225,9 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
             photograph_element(
                 view.name, f"{images}/{photograph_name(config, view)}", camera,
                 light._replace(rgb=strength * light.rgb), masks and f"{masks}/{view.name}.png",
-                saturation=HIGHEST if config.format == "exr" else None, calibrated=exact,
+                saturation=HIGHEST if config.format == "exr" else None, calibrated=exact, gain=gain,
             )
-            for view, camera, light in zip(views, cameras, lights)
+            for view, camera, light, gain in zip(views, cameras, lights, gains)
         ]  # fmt: skip
         root = scene_element(elements, ground, up, metres)
         root.extend([] if config.wrong_room and not exact else deepcopy(extra))

@@ -98,6 +98,9 @@ class SynthesizeConfig:
     """How far beside their place all point lights are said to be, in the camera's axes, by their distance [%]."""
     wrong_power: float = 0.0
     """How wrong the power of each light is said to be, standard deviation [%]."""
+    wrong_exposure: float = 0.0
+    """How differently photographs are exposed, which the scene file does not say: standard deviation of a factor [%],
+    and by a third of that of each colour, for the white balance."""
     wrong_room: bool = False
     """Say nothing of --room or of --environment in the scene file."""
 
@@ -112,7 +115,7 @@ class SynthesizeConfig:
     def exact(self) -> bool:
         """Does the scene file say nothing wrong?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment)
-        return not (self.wrong_cameras or self.wrong_light or self.wrong_power or unknown)
+        return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def axis(self) -> np.ndarray:
@@ -130,7 +133,8 @@ class SynthesizeConfig:
 RANGES = {
     "views": (1, 10_000), "novel": (0, 10_000), "fov": (1, 150), "bands": (1, 1000), "radius": (1e-6, 1e6),
     "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5), "spp": (1, 65536),
-    "depth": (2, 100), "wrong_cameras": (0, 20), "wrong_light": (0, 50), "wrong_power": (0, 100), "seed": (0, 100_000),
+    "depth": (2, 100), "wrong_cameras": (0, 20), "wrong_light": (0, 50), "wrong_power": (0, 100),
+    "wrong_exposure": (0, 100), "seed": (0, 100_000),
 }  # fmt: skip
 
 

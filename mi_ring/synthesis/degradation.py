@@ -37,6 +37,11 @@ def encoded(linear: np.ndarray, kind: Format) -> np.ndarray:
     return to_bytes(linear_to_srgb(linear))
 
 
+def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndarray:
+    """(count, 3) factors of exposures that differ by so many per cent, and by a third of that in each colour."""
+    return np.exp(random.normal(0, spread / 100, (count, 1)) + random.normal(0, spread / 300, (count, 3)))
+
+
 def miscalibrated(
     cameras: Sequence[Camera], lights: Sequence[Light], center: np.ndarray, random: np.random.Generator,
     turned: float = 0.0, shifted: float = 0.0, scaled: float = 0.0,
