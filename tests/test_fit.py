@@ -316,6 +316,24 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
     assert Fit(broken.capture, broken.config, state=broken.state()).caution.retreats == 2
 
 
+def test_each_photograph_comes_before_one_comes_again():
+    sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
+    sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
+    capture = SimpleNamespace(sizes=sizes, sensors=sensors)
+    chooser = SimpleNamespace(capture=capture, fitted=np.arange(12), config=Config(batch=3), waiting={},
+                              random=torch.Generator().manual_seed(5))  # fmt: skip
+    drawn: dict = {size: [] for size in sizes}
+    for _ in range(60):
+        index, size = Fit.choose(chooser)
+        assert len({*index.tolist()}) == 3 and {*index.tolist()} <= {*sizes[size].tolist()}
+        drawn[size] += index.tolist()
+    for size, alike in sizes.items():
+        times = np.bincount(drawn[size])[alike]
+        assert times.sum() > 40 and times.max() - times.min() <= 1
+        rounds = [drawn[size][k : k + len(alike)] for k in range(0, len(drawn[size]) - len(alike), len(alike))]
+        assert len({tuple(one) for one in rounds}) > len(rounds) / 2  # in another order
+
+
 def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():
     module = torch.nn.BatchNorm1d(3)
     adam = torch.optim.Adam(module.parameters())

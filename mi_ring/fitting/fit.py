@@ -134,6 +134,8 @@ class Fit:
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.restraint = Restraint()
         self.averages = Averages()
+        #: Of each size of photographs, those that have not come yet.
+        self.waiting: dict[tuple[int, int], list[int]] = {}
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         if state:
             self.restore(state)
@@ -221,12 +223,19 @@ class Fit:
             net.set_parameters(net.bsdf_parameters, first * self.calibration.reflecting)
 
     def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
-        """Indices of the photographs of one iteration, all of one size (width, height)."""
+        """Indices of the photographs of one iteration, all of one size (width, height).
+
+        Of each size all come, in random order, before one comes again.
+        """
         first = self.fitted[int(torch.randint(len(self.fitted), (), generator=self.random))]
         size = self.capture.sensors[first].size
         alike = np.intersect1d(self.capture.sizes[size], self.fitted)
-        order = torch.randperm(len(alike), generator=self.random)[: self.config.batch]
-        return alike[order.numpy()], size
+        count, waiting = min(self.config.batch, len(alike)), self.waiting.get(size, [])
+        if len(waiting) < count:  # those that are left come again at the end of the next round
+            order = alike[torch.randperm(len(alike), generator=self.random).numpy()].tolist()
+            waiting = waiting + [k for k in order if k not in waiting] + waiting
+        self.waiting[size] = waiting[count:]
+        return np.array(waiting[:count]), size
 
     def new_seed(self) -> int:
         """For the renderer."""
@@ -332,6 +341,7 @@ class Fit:
             "averages": self.averages.pictures,
             "confirmed": self.confirmed,
             "outlines": self.outlines,
+            "waiting": self.waiting,
             "lighting": tuple(self.lighting),
         }
         return copy.deepcopy(state)  # which the next iteration would change
@@ -346,6 +356,9 @@ class Fit:
         vars(self.restraint).update(state["restraint"])
         self.averages.pictures = state["averages"]
         self.confirmed = state["confirmed"]
+        self.waiting = state.get("waiting", {})
+        if not {k for waiting in self.waiting.values() for k in waiting} <= {*self.fitted.tolist()}:
+            raise ValueError("photographs that there are not")
         self.take_outlines(state["outlines"])
         if self.calibration:
             self.calibration.load_state_dict(state["calibration"])
