@@ -91,7 +91,7 @@ def run(*arguments: object) -> str:
 
 def relit_psnr(fit: Path, truth: Path) -> float:
     """Of pictures of a fit under the light of a scene, after one factor for each colour."""
-    run("mi_ring.render", fit, truth / "scene.xml", fit / "relit", "--spp", SMOOTH)
+    run("mi_ring.render", fit, truth / "scene.xml", fit / "relit", "--spp", SMOOTH, "--integrator", "path")
     ours, theirs = [], []
     for path in sorted((truth / "images").glob("*.exr")):
         inside = read_image(truth / "masks" / f"{path.stem}.png").squeeze() > 127
