@@ -554,7 +554,7 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
         words = f"--holdout: is {every}, which keeps {out} of 12 photographs out; give 2 to 23"
         with pytest.raises(InputError, match=words):
             Fit(capture, Config(holdout=every))
-    drawn = {k for _ in range(20) for k in running.choose()[0]}
+    drawn = {k for _ in range(20) for k in running.rounds.draw(running.config.batch, running.random)[0]}
     assert drawn == set(range(12)) - {2, 7}
     with torch.no_grad():
         running.calibration.light.fill_(1)

@@ -36,6 +36,7 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.fitting.restraint import Restraint
+from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.output import results
@@ -319,19 +320,17 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
 def test_each_photograph_comes_before_one_comes_again():
     sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
     sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
-    capture = SimpleNamespace(sizes=sizes, sensors=sensors)
-    chooser = SimpleNamespace(capture=capture, fitted=np.arange(12), config=Config(batch=3), waiting={},
-                              random=torch.Generator().manual_seed(5))  # fmt: skip
+    rounds, random = Rounds(SimpleNamespace(sensors=sensors), np.arange(12)), torch.Generator().manual_seed(5)
     drawn: dict = {size: [] for size in sizes}
     for _ in range(60):
-        index, size = Fit.choose(chooser)
+        index, size = rounds.draw(3, random)
         assert len({*index.tolist()}) == 3 and {*index.tolist()} <= {*sizes[size].tolist()}
         drawn[size] += index.tolist()
     for size, alike in sizes.items():
         times = np.bincount(drawn[size])[alike]
         assert times.sum() > 40 and times.max() - times.min() <= 1
-        rounds = [drawn[size][k : k + len(alike)] for k in range(0, len(drawn[size]) - len(alike), len(alike))]
-        assert len({tuple(one) for one in rounds}) > len(rounds) / 2  # in another order
+        orders = [drawn[size][k : k + len(alike)] for k in range(0, len(drawn[size]) - len(alike), len(alike))]
+        assert len({tuple(one) for one in orders}) > len(orders) / 2  # in another order
 
 
 def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():

@@ -56,8 +56,8 @@ def posed(capture, **changes):
                 "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
     config = mi_ring.Config(**settings | changes)
     fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
-    fit.iteration, chosen = fit.iterations // 2, fit.choose()
-    fit.choose = lambda: chosen
+    fit.iteration, chosen = fit.iterations // 2, fit.rounds.draw(fit.config.batch, fit.random)
+    fit.rounds.draw = lambda *_: chosen
     with torch.no_grad():
         seen = fit.predict()
     index = seen.index

@@ -27,6 +27,7 @@ from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
 from mi_ring.fitting.processes import current
 from mi_ring.fitting.restraint import Restraint
+from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import starting_ring
 from mi_ring.fitting.summary import summary
@@ -134,8 +135,7 @@ class Fit:
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.restraint = Restraint()
         self.averages = Averages()
-        #: Of each size of photographs, those that have not come yet.
-        self.waiting: dict[tuple[int, int], list[int]] = {}
+        self.rounds = Rounds(capture, self.fitted)
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         if state:
             self.restore(state)
@@ -189,7 +189,7 @@ class Fit:
         vertices, *parameters = points.joined([vertices, *material.values()])
         material = dict(zip(material, parameters))
 
-        everything, size = self.choose()
+        everything, size = self.rounds.draw(config.batch, self.random)
         share = self.processes.share(len(everything))
         index, scale = everything[share.part], -(-size[0] // stage.width)
         seen = self.processes.together(lambda: self.capture.observe(index, scale)).to(self.device)
@@ -221,21 +221,6 @@ class Fit:
         if self.calibration and "scale" in self.calibration.refined:
             net, first = self.ring.brdf_net, self.albedo / self.calibration.first_power / math.pi
             net.set_parameters(net.bsdf_parameters, first * self.calibration.reflecting)
-
-    def choose(self) -> tuple[np.ndarray, tuple[int, int]]:
-        """Indices of the photographs of one iteration, all of one size (width, height).
-
-        Of each size all come, in random order, before one comes again.
-        """
-        first = self.fitted[int(torch.randint(len(self.fitted), (), generator=self.random))]
-        size = self.capture.sensors[first].size
-        alike = np.intersect1d(self.capture.sizes[size], self.fitted)
-        count, waiting = min(self.config.batch, len(alike)), self.waiting.get(size, [])
-        if len(waiting) < count:  # those that are left come again at the end of the next round
-            order = alike[torch.randperm(len(alike), generator=self.random).numpy()].tolist()
-            waiting = waiting + [k for k in order if k not in waiting] + waiting
-        self.waiting[size] = waiting[count:]
-        return np.array(waiting[:count]), size
 
     def new_seed(self) -> int:
         """For the renderer."""
@@ -341,7 +326,7 @@ class Fit:
             "averages": self.averages.pictures,
             "confirmed": self.confirmed,
             "outlines": self.outlines,
-            "waiting": self.waiting,
+            "waiting": self.rounds.waiting,
             "lighting": tuple(self.lighting),
         }
         return copy.deepcopy(state)  # which the next iteration would change
@@ -356,9 +341,7 @@ class Fit:
         vars(self.restraint).update(state["restraint"])
         self.averages.pictures = state["averages"]
         self.confirmed = state["confirmed"]
-        self.waiting = state.get("waiting", {})
-        if not {k for waiting in self.waiting.values() for k in waiting} <= {*self.fitted.tolist()}:
-            raise ValueError("photographs that there are not")
+        self.rounds.restore(state.get("waiting", {}))
         self.take_outlines(state["outlines"])
         if self.calibration:
             self.calibration.load_state_dict(state["calibration"])
