@@ -192,7 +192,7 @@ def test_a_lamp_is_one_for_all_and_as_strong_as_makes_the_albedo_a_half(small_ca
     np.testing.assert_allclose(lights.positions(), np.broadcast_to(place, (12, 3)), rtol=1e-6)
     assert np.pi * lamp.reflectance(capture.sphere()[0], capture.exposure()) == pytest.approx(0.5, rel=1e-5)
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamp"))
-    assert fit.calibration.refined == ("light", "ambient")
+    assert fit.calibration.refined == ("light", "gain", "ambient")
     assert len(fit.calibration.light) == 1  # one place for all photographs
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.io
 import torch
 
-from mi_ring.system.files import is_sealed, sealed
+from mi_ring.system.files import is_sealed, seal
 
 NUMBERS = (
     "0",
@@ -332,7 +332,9 @@ def in_pt(content: bytes, random: Random) -> bytes:
     state = in_tree(torch.load(io.BytesIO(content), weights_only=True), random, surprising_tensor)
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    return sealed(buffer.getvalue()) if is_sealed(content) else buffer.getvalue()
+    if is_sealed(content):
+        seal(buffer)
+    return buffer.getvalue()
 
 
 #: What is in files, by their suffix.
