@@ -313,7 +313,7 @@ def results(folder: Path) -> Reader:
     for name, content in zip(names, contents):
         (folder / name).write_text(content.replace("%s", str(move).replace("'", '"')))
 
-    config = FitConfig(folder / "scene.xml", minutes=3)
+    config = FitConfig(scene=folder / "scene.xml", minutes=3)
 
     def read() -> None:
         read_log(folder)
