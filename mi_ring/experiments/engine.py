@@ -72,7 +72,7 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
             if not wanted:
                 return Outcome(run)
             print(f"fitting: {folder}", flush=True)
-            job.output.parent.mkdir(parents=True, exist_ok=True)
+            job.note(replace(job.record, tries=0))  # interrupts of the user's are no deaths
             record = (
                 watched(run, job, fingerprint, made)
                 if run.watched
