@@ -82,13 +82,10 @@ def main(arguments: Sequence[str]) -> int:
         if len(todo) < len(jobs):
             print(f"{len(jobs) - len(todo)} of {len(jobs)} are done already")
         show(jobs, config.out, True)
-
-        def work() -> int:
-            if todo:
+        if todo:
+            with command.going_on():
                 follow(todo, jobs, config)
-            return finish(jobs, config.out)
-
-        return command.going_on(work)
+        return finish(jobs, config.out)
 
 
 def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:

@@ -70,15 +70,12 @@ def main(arguments: Sequence[str]) -> int:
     out = config.out / f"{config.name}{'-quick' * config.quick}"
     settings = "--quick" if config.quick else f"--preset {preset}"
     seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
-    said = f"mi-ring paper {config.name} {settings}{seeds}"
-
-    def work() -> int:
-        with locked(out):
-            failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
-        print(f"{out}/table.md and figure.png{f'; {failed} runs failed' * bool(failed)}")
-        return int(failed > 0)
-
-    return command.going_on(work)
+    with command.going_on(), locked(out):
+        failed = perform(
+            EXPERIMENTS[config.name], asked, out, config.only, f"mi-ring paper {config.name} {settings}{seeds}"
+        )
+    print(f"{out}/table.md and figure.png{f'; {failed} runs failed' * bool(failed)}")
+    return int(failed > 0)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -133,13 +132,11 @@ def main(arguments: Sequence[str]) -> None:
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with locked(config.out, "DIR"):
+        with command.going_on(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt:
-        sys.stdout.flush()
-        print("interrupted; the same command goes on", file=sys.stderr, flush=True)
         os._exit(130)  # native threads do not let themselves be ended; what they write is whole or not at all
     finally:
         signal.signal(signal.SIGTERM, before)

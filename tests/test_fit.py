@@ -320,7 +320,10 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
 def test_each_photograph_comes_before_one_comes_again():
     sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
     sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
-    rounds, random = Rounds(SimpleNamespace(sensors=sensors), np.arange(12)), torch.Generator().manual_seed(5)
+    rounds, random = (
+        Rounds(SimpleNamespace(sensors=sensors, sizes=sizes), np.arange(12)),
+        torch.Generator().manual_seed(5),
+    )
     drawn: dict = {size: [] for size in sizes}
     for _ in range(60):
         index, size = rounds.draw(3, random)

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import mitsuba as mi
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring import paper
 from mi_ring.capture.loading import load_capture
+from mi_ring.collection import fits
 from mi_ring.errors import InputError
 from mi_ring.experiments import engine, measures, published, recipes, slices, tables
 from mi_ring.experiments.catalogue import EXPERIMENTS
@@ -213,6 +215,16 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
     assert [row["vertices"] for row in levels] == [10 * 4**k + 2 for k in (1, 2, 3)]
     for row in (course[-1], levels[TINY["subdivisions"] - 1]):
         assert row["normal_mean"] == pytest.approx(float(rows[2]["normal_mean"]), abs=1e-3)
+
+
+def test_interrupts_are_no_deaths(known_capture, tmp_path, monkeypatch):
+    begun = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr(fits, "run", begun)
+    run = Run("egg", recipes.given(known_capture), {"capture": "egg"}, TINY)
+    for _ in range(engine.RETRIES + 2):
+        with pytest.raises(KeyboardInterrupt):
+            engine.attempted(run, Asked(preset="fast", threads=1, quick=True), tmp_path / "trial")
+    assert begun.call_count == engine.RETRIES + 2
 
 
 def test_numbers_that_are_none_are_shown():

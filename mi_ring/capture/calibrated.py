@@ -21,8 +21,8 @@ def with_calibration(
     """The same photographs with other cameras and lights, one each; their curves' `gamma` and `contrast` times these.
 
     `room`: light of the room, as `Photographs` has it; `falloff`: exponents of the flashes' cones, one each, by default
-    as they are; `vignetting`: what is added to the exponents of the lenses'; `gains` (P, 3):
-    factors of what the photographs record.
+    as they are; `vignetting`: what is added to the exponents of the lenses'; `gains` (P, 3): factors of what the
+    photographs record.
     """
     sensors = []
     cones = [sensor.cone for sensor in capture.sensors] if falloff is None else falloff

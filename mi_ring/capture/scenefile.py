@@ -162,8 +162,7 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
             "", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma, contrast=sensor.contrast,
             falloff=sensor.cone, vignetting=sensor.vignetting, gain=sensor.gain,
         )  # fmt: skip
-        fields = {child.get("name"): child for child in new
-                  if child.tag in ("float", "transform") or child.get("name") == GAIN}  # fmt: skip
+        fields = {child.get("name"): child for child in new if child.tag in ("float", "string", "transform")}
         for child in list(old):
             known = f".//emitter[@id='{child.get('id')}']"
             lit = child.tag == "emitter" or (child.tag == "ref" and root.find(known) is not None)

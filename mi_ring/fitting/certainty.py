@@ -143,8 +143,9 @@ def compare(
             if name in ("power", "gain"):  # not by its unknowns, whose mean does not count
                 colour = torch.ones(3)
                 colour[k] = factor
-                own_light = picture(lit * colour, bounced * colour)
-                sides.append((own_light if name == "power" else picture(lit, gain=colour), coverage))
+                by_lights = name == "power"
+                rgb = picture(lit * colour, bounced * colour) if by_lights else picture(lit, gain=colour)
+                sides.append((rgb, coverage))
             elif name == "scale":
                 sides.append((picture(lit, bounced / factor), coverage))
             else:

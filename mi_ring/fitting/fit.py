@@ -269,6 +269,7 @@ class Fit:
         # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
         norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
         others = [p.grad for p in self.calibration.parameters() if p.grad is not None] if self.calibration else []
+        # The renderer may swallow a NaN on the way back.
         healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:

@@ -76,6 +76,10 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     Raises InputError where nothing lights the object, and for what does not go together.
     """
     require_unknown(capture, config)
+    exposed = exposures(capture)
+    if config.light != "capture" and exposed.max() > ALIKE * exposed.min():
+        print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
+              "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
     if config.light in ("capture", "environment", "turntable"):
         return Lighting(config.light)
 
@@ -117,11 +121,7 @@ def exposures(capture: Capture) -> np.ndarray:
     kinds = capture.photographs.lights.is_finite()
     if kinds.any() != kinds.all() or not (strengths > 0).all():
         return np.ones_like(strengths)
-    found = strengths / strengths.mean(0)
-    if found.max() > ALIKE * found.min():
-        print(f"Light: those of the scene differ in strength, by up to {found.max() / found.min():.2g} times, which "
-              "is taken to be how the photographs were exposed")  # fmt: skip
-    return found
+    return strengths / strengths.mean(0)
 
 
 def brightest(fit: "Fit") -> tuple[float, float, float]:

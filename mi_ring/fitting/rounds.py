@@ -10,15 +10,15 @@ class Rounds:
     """Draws photographs of a capture, of those that are `fitted` (indices)."""
 
     def __init__(self, capture: Capture, fitted: np.ndarray) -> None:
-        self.sizes = [sensor.size for sensor in capture.sensors]
-        self.fitted = fitted
+        self.sensors, self.fitted = capture.sensors, fitted
+        self.alike = {size: np.intersect1d(index, fitted) for size, index in capture.sizes.items()}
         #: Of each size (width, height), those that have not come yet.
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, most: int, random: torch.Generator) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the next `most` photographs, or of as many as there are of one size, and that size."""
-        size = self.sizes[self.fitted[int(torch.randint(len(self.fitted), (), generator=random))]]
-        alike = np.array([k for k in self.fitted if self.sizes[k] == size])
+        size = self.sensors[self.fitted[int(torch.randint(len(self.fitted), (), generator=random))]].size
+        alike = self.alike[size]
         count, waiting = min(most, len(alike)), self.waiting.get(size, [])
         if len(waiting) < count:  # those that are left come again at the end of the next round
             order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()

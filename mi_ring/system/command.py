@@ -5,7 +5,7 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,14 +100,15 @@ def one_line(message: str) -> str:
     return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]} … {words[-LONGEST // 2 :]}"
 
 
-def going_on(work: Callable[[], int]) -> int:
-    """The exit status of work that goes on where it was interrupted, and says so if it is; 130 then."""
+@contextlib.contextmanager
+def going_on() -> Iterator[None]:
+    """For work that goes on where it was interrupted: says so if it is."""
     try:
-        return work()
+        yield
     except KeyboardInterrupt:
         sys.stdout.flush()
         print("interrupted; the same command goes on", file=sys.stderr, flush=True)
-        return 130
+        raise
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
