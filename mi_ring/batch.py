@@ -1,13 +1,14 @@
 """Reconstruct many objects, on one machine or many: `python -m mi_ring.batch SCENES… --workers N -- FIT OPTIONS`."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mi_ring.capture.loading import require_capture
 from mi_ring.collection.cluster import Resources, fit_all
 from mi_ring.collection.jobs import Job, jobs_of
 from mi_ring.errors import InputError
@@ -15,7 +16,7 @@ from mi_ring.fit_config import parse_options
 from mi_ring.output.index import Entry, write_index
 from mi_ring.system import command
 from mi_ring.system.files import locked
-from mi_ring.system.machine import cores
+from mi_ring.system.machine import cores, set_variant
 from mi_ring.system.progress import progress
 
 OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives them itself
@@ -72,20 +73,49 @@ def main(arguments: Sequence[str]) -> int:
     if wrong := [option for option in options if option.split("=")[0] in OWN]:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
     jobs = jobs_of(config.scenes, config.out, options)
-    parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+    fit = parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+    set_variant("llvm_ad_rgb")
     with locked(config.out / "batch"):
-        prints = {job: job.fingerprint() for job in progress(jobs, "comparing", unit="scene")}
-        todo = {job: own for job, own in prints.items() if not job.is_done(own)}
-        for job in jobs:
-            state = "waiting" if job in todo else "done"
-            job.note(replace(job.record, state=state, message="", tries=0))
-        if len(todo) < len(jobs):
-            print(f"{len(jobs) - len(todo)} of {len(jobs)} are done already")
+        todo = waiting(jobs, fit.masks)
         show(jobs, config.out, True)
         if todo:
-            with command.going_on():
+            with command.going_on(), noting_interrupts(todo, jobs, config.out):
                 follow(todo, jobs, config)
         return finish(jobs, config.out)
+
+
+def waiting(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
+    """What is to be fitted, with fingerprints: what is not done already, nor wrong. What is in the records, too."""
+    todo: dict[Job, str] = {}
+    done = 0
+    for job in progress(jobs, "comparing", unit="scene"):
+        fingerprint, state, message = job.fingerprint(), "waiting", ""
+        if job.is_done(fingerprint):
+            state, done = "done", done + 1
+        else:
+            try:
+                require_capture(job.scene, masks)
+                todo[job] = fingerprint
+            except InputError as error:  # now, rather than at night when its turn comes
+                state, message = "failed", command.one_line(str(error))
+                print(f"{job.name}: failed: {message}", flush=True)
+        job.note(replace(job.record, state=state, message=message, tries=0))
+    if done:
+        print(f"{done} of {len(jobs)} are done already")
+    return todo
+
+
+@contextlib.contextmanager
+def noting_interrupts(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
+    """Within it an interrupt is in the records and in index.html, too."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        for job in todo:
+            if job.record.state == "running":
+                job.note(replace(job.record, state="interrupted"))
+        show(jobs, out, False)
+        raise
 
 
 def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:

@@ -41,8 +41,8 @@ class PaperConfig:
     stripes."""
     out: Path = Path("out/paper")
     """Folder of the results of all experiments, each in a folder of its name, and of the captures that they make."""
-    preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Of the fits, as mi-ring fit has them."""
+    preset: Literal["fast", "default", "fine", "paper"] | None = None
+    """Of the fits, as mi-ring fit has them. Default: default, and fast with --quick, which goes with no other."""
     seeds: tuple[int, ...] = (0,)
     """Random seeds: each run once with each, and the mean."""
     only: tuple[str, ...] = ()
@@ -64,7 +64,9 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"--{name}: is {value}, must be {'0 or more' if name == 'threads' else 'different numbers'}")
     if missing := next((path for path in config.data if not path.exists()), None):
         raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
-    preset = "fast" if config.quick else config.preset
+    if config.quick and config.preset not in (None, "fast"):
+        raise InputError(f"--preset: is {config.preset}, but --quick is by fast; leave one of the two out")
+    preset = config.preset or ("fast" if config.quick else "default")
     variant = set_variant(config.variant)
     asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
     out = config.out / f"{config.name}{'-quick' * config.quick}"
@@ -74,7 +76,8 @@ def main(arguments: Sequence[str]) -> int:
         failed = perform(
             EXPERIMENTS[config.name], asked, out, config.only, f"mi-ring paper {config.name} {settings}{seeds}"
         )
-    print(f"{out}/table.md and figure.png{f'; {failed} runs failed' * bool(failed)}")
+    runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
+    print(f"{out}/table.md and figure.png{runs}")
     return int(failed > 0)
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -130,16 +129,14 @@ def main(arguments: Sequence[str]) -> None:
     if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with command.going_on(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
-    except KeyboardInterrupt:
-        os._exit(130)  # native threads do not let themselves be ended; what they write is whole or not at all
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    except KeyboardInterrupt as stop:
+        # Native threads do not let themselves be ended; what they write is whole or not at all.
+        os._exit(command.status_of(stop))
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -21,6 +22,7 @@ from mi_ring.collection.jobs import Job, Record, jobs_of
 from mi_ring.errors import InputError
 from mi_ring.output import results
 from mi_ring.output.index import Entry, write_index
+from mi_ring.system import command
 
 OPTIONS = ["--iterations", "60", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--batch",
            "2", "--domain", "sphere", "--deterministic"]  # fmt: skip
@@ -87,6 +89,29 @@ def test_a_disk_that_is_full_for_a_while_does_not_end_a_batch(job, monkeypatch):
     monkeypatch.setattr(batch, "fit_all", fit_all)
     assert batch.main([str(job.scene), "--out", str(job.folder.parent)]) == 0
     assert pages.call_count == 4
+
+
+def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
+    def fit_all(todo, resources, retries, look):
+        job.note(dataclasses.replace(job.record, state="running", tries=9))
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10)
+
+    monkeypatch.setattr(batch, "fit_all", fit_all)
+    wrong = job.folder.parent.parent / "wrong.xml"
+    wrong.write_text("<scene")
+    arguments = [str(job.scene), str(wrong), "--out", str(job.folder.parent)]
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt) as stop:
+        batch.main(arguments)
+    assert command.status_of(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
+    said = capsys.readouterr()
+    assert "wrong: failed: " in said.out and said.err.endswith("interrupted; the same command goes on\n")
+    page = (job.folder.parent / "index.html").read_text()
+    assert "1 interrupted" in page and "1 failed" in page and "running</" not in page and "refresh" not in page
+    monkeypatch.setattr(batch, "fit_all", lambda todo, *_: Script(monkeypatch, (0, 60, "")) and fitted(job, 0))
+    wrong.unlink()
+    assert batch.main([arguments[0], *arguments[2:]]) == 0
 
 
 def test_a_mistake_is_not_tried_again(job, monkeypatch):

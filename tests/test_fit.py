@@ -284,6 +284,13 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
     assert ("--resume" in capsys.readouterr().out) == (status == 130)
 
 
+def test_the_second_ctrl_c_says_how_to_go_on(small_capture, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(results, "write", lambda *_: [os.kill(os.getpid(), signal.SIGINT) for _ in range(2)])
+    with pytest.raises(KeyboardInterrupt):
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
+    assert capsys.readouterr().out.endswith("has a checkpoint: go on with the same command and --resume\n")
+
+
 def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_path, monkeypatch):
     genuine = terms.rgb_loss
     monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
@@ -693,9 +700,10 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         fit.main([str(broken_capture[0]), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="gone.xml: no such file"):
         fit.main([str(tmp_path / "gone.xml"), "--out", str(tmp_path), "--resume"])
-    with pytest.raises(InputError, match="--batch: was 4 before, is 5 now"):
+    with pytest.raises(InputError, match="--iterations: was 90 before, is 80 now; --batch: was 4 before, is 8 now, the "
+                       "default; give the same"):  # fmt: skip
         fit.main(
-            [str(small_capture), "--out", str(finished), "--resume", "--iterations", "90", *SPHERE, "--batch", "5"]
+            [str(small_capture), "--out", str(finished), "--resume", "--iterations", "80", *SPHERE, "--batch", "8"]
         )
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
     files.write_state(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
@@ -810,6 +818,11 @@ def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_p
         (["--domain", "mesh"], ["--domain: is mesh; must be"]),
         (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
         (["--learning-rate", "fast"], ["--learning-rate: is fast; must be a number"]),
+        (["--widths", "128", "wide"], ["--widths: is 128 wide, must be INT [INT ...]"]),
+        (["--widths"], ["--widths: is empty, must be as many values as --levels (3)"]),
+        (["--parameters", "principled"], ["--parameters: must be STR FLOAT FLOAT [STR FLOAT FLOAT ...]"]),
+        (["--refine", "gian"], ["--refine: is gian; must be one of auto, none", "; perhaps you meant gain"]),
+        (["--refine", "power", "gain"], ["--refine: is power gain, must be without power or without gain"]),
     ],
 )
 def test_an_unusable_option_is_one_line_that_names_it(options, words):

@@ -67,16 +67,27 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     many = sum(width * height for width, height in (s.size for s in sensors)) > MANY
     for k, sensor in enumerate(progress(sensors, "reading", unit="photograph", disable=None)):
         if many and k:  # decoded as they are needed; the first tells what all are like
-            for field in ("filename", "mask", "valid", "ambient"):
-                file = getattr(sensor, field)
-                if file and (field != "mask" or masks != "none"):
-                    require_header(file, field, sensor, path)
+            require_headers(sensor, path, masks)
         else:
             pixels[k], given[k], valid[k]
     capture = Capture(path, scene, shapes[0], sensors, photographs, shadows, pixels, given, valid)
     if masks != "given" and not any(given.given):
         find_masks(capture)
     return capture
+
+
+def require_headers(sensor: Any, scene: Path, masks: str) -> None:
+    """Raise InputError if a file that a photograph names is none that could be decoded. `masks`: as for a capture."""
+    for field in ("filename", "mask", "valid", "ambient"):
+        file = getattr(sensor, field)
+        if file and (field != "mask" or masks != "none"):
+            require_header(file, field, sensor, scene)
+
+
+def require_capture(path: Path, masks: str) -> None:
+    """Raise InputError, one line, for most of what `load_capture` would stumble over, without decoding anything."""
+    for sensor in load_capture(path, images=False).sensors:
+        require_headers(sensor, path, masks)
 
 
 def masks_of(sensors: Sequence, field: str, scene: Path) -> Pixels:

@@ -9,7 +9,7 @@ from typing import Any
 from mi_ring.collection.fits import fit_to_the_end
 from mi_ring.collection.jobs import Job
 from mi_ring.errors import InputError
-from mi_ring.system.optional import need
+from mi_ring.system.optional import keeping_handlers, need
 
 STORE = 80 * 2**20  #: bytes of Ray's object store, about the least that it takes: fits give each other nothing
 POLL = 1.0  #: seconds between looks at what goes on
@@ -38,7 +38,8 @@ def cluster(resources: Resources) -> Iterator[Any]:
             "object_store_memory": STORE,
         }  # fmt: skip
     try:
-        ray.init(**options)
+        with keeping_handlers():
+            ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         where = f"--address: {resources.address}" if resources.address else "mi-ring batch"
         raise InputError(f"{where}: Ray cannot be reached or started ({error}); see `ray status`") from error

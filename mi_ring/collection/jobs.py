@@ -21,7 +21,7 @@ CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
 class Record:
     """How far the fit of a scene is."""
 
-    state: str = "waiting"  #: waiting, running, failed or done
+    state: str = "waiting"  #: waiting, running, interrupted, failed or done
     fingerprint: str = ""  #: of what it is the fit of
     message: str = ""  #: why it failed
     tries: int = 0  #: how often it was begun since it got any further

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.config import WEIGHTS, Config
+from mi_ring.fitting.config import WEIGHTS, Config, as_typed
 from mi_ring.fitting.fit import Fit
 from mi_ring.ring.saved import read_state
 from mi_ring.system.files import is_sealed, relative_to, write_state
@@ -45,10 +45,14 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         raise InputError(f"{path}: holds no checkpoint; {ADVICE}")
     known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
     known["weights"] = WEIGHTS | known["weights"]
+    default, differing = Config().settings(), []
     for name, value in config.settings().items():
         if (was := known[name]) != value:
-            raise InputError(f"{path}: --{name.replace('_', '-')}: was {was} before, is {value} now; give the same "
-                             "settings, --preset among them, or start anew without --resume")  # fmt: skip
+            now = f"{as_typed(value)} now{', the default' * (value == default[name])}"
+            differing.append(f"--{name.replace('_', '-')}: was {as_typed(was)} before, is {now}")
+    if differing:
+        raise InputError(f"{path}: {'; '.join(differing)}; give the same settings, --preset among them, or start anew "
+                         "without --resume")  # fmt: skip
     return state
 
 

@@ -130,16 +130,15 @@ class Config:
     def __post_init__(self) -> None:
         def require(condition: bool, name: str, what: str) -> None:
             if not condition:
-                raise InputError(f"--{name.replace('_', '-')}: is {getattr(self, name)}, must be {what}")
+                raise InputError(f"--{name.replace('_', '-')}: is {as_typed(getattr(self, name))}, must be {what}")
 
         require(not isinstance(self.refine, str), "refine", "a tuple of names")
         known = get_args(Unknown)
         require(bool(self.refine) and set(self.refine) <= set(known), "refine", f"some of {', '.join(known)}")
         object.__setattr__(self, "refine", tuple(name for name in known if name in self.refine))  # in one order
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")
-
         both = {"power", "gain"} <= set(self.refine)
-        require(not both, "refine", "with power or with gain: the one looks like the other")
+        require(not both, "refine", "without power or without gain, for they look alike")
 
         for f in dataclasses.fields(Config):  # from Python nobody else has checked them
             if get_origin(f.type) is Literal:
@@ -188,6 +187,15 @@ class Config:
         """All settings as plain data."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(Config)}
         return json.loads(json.dumps(values, default=str))
+
+
+def as_typed(value: Any) -> str:
+    """A setting's value as the command line has it, more or less."""
+    if isinstance(value, dict):
+        value = [word for item in value.items() for word in item]
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(as_typed, value)) or "empty"
+    return str(value)
 
 
 #: Settings that go together, by name.

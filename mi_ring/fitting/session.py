@@ -3,6 +3,7 @@
 import contextlib
 import math
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -179,7 +180,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         def interrupted() -> int:
             return processes.most(heard())
 
-        print(f"{len(fit.capture)} photographs; results go to {folder}/; Ctrl-C ends early and keeps what there is")
+        keeps = "; Ctrl-C ends early and keeps what there is" * sys.stdin.isatty()  # else nobody is there to press it
+        print(f"{len(fit.capture)} photographs; results go to {folder}/{keeps}")
         if fit.calibration:
             print(f"Refined besides surface and material: {', '.join(fit.calibration.refined)}")
         if fit.config.indirect and not fit.ring.indirect:
@@ -196,6 +198,11 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         keeper = Keeper(fit, folder, prepare)
         try:
             train(fit, keeper, interrupted, costs)
+            keeper.finish(fitted_scene)
+        except KeyboardInterrupt:  # the second
+            if (folder / "checkpoint.pt").is_file():
+                print(f"Dropped; {folder} has a checkpoint: go on with the same command and --resume")
+            raise
         except Lost:
             raise
         except Exception as error:
@@ -203,5 +210,4 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             if isinstance(error, InputError):  # in all processes: `torchrun` would end the first with the others
                 processes.wait()
             raise
-        keeper.finish(fitted_scene)
         return interrupted() if fit.iteration < fit.iterations else processes.most(0)

@@ -35,7 +35,7 @@ def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     The reference for `mi_ring.rendering.crossings`, which is faster and needs no other package; those that overlap in
     a plane, or touch, count as well. Raises InputError if it is not installed.
     """
-    need("igl", "the exact count of crossing triangles", "mi-ring[exact]")
+    need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections
 
     # Vertices and faces, remeshed; pairs of faces that intersect; and which face and vertex came from which.

@@ -28,13 +28,14 @@ FIGURES = {
     "Fit time": ("time", "of the fit, without start and report"),
 }
 UNEXPLAINED = "unexplained", "share of the photographs' light that the fit does not predict, last; the less the better"
+STATES = "done", "running", "interrupted", "waiting", "failed"  #: of fits
 
 
 class Entry(NamedTuple):
     """A fit: how it is called, how far it is, what there is to say of it, and the folder of its results."""
 
     name: str
-    state: str  #: waiting, running, failed or done
+    state: str  #: of STATES
     text: str
     folder: Path
     log: Path  #: what the fit has printed
@@ -46,7 +47,7 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
     rows = [row_of(entry, out) for entry in entries]
     states = [entry.state for entry in entries]
     page = jinja2.Environment(autoescape=True).from_string(template)
-    counts = {state: states.count(state) for state in ("done", "running", "waiting", "failed") if state in states}
+    counts = {state: states.count(state) for state in STATES if state in states}
     out.mkdir(parents=True, exist_ok=True)
     figures = dict([*FIGURES.values(), UNEXPLAINED])
     write_file(out / "index.html", page.render(rows=rows, figures=figures, counts=counts, running=running,

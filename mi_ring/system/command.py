@@ -1,9 +1,11 @@
 """What all commands share: arguments from a dataclass, one line for a user's mistake."""
 
 import contextlib
+import difflib
 import io
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -51,42 +53,66 @@ def require_utf8(name: str) -> None:
 def complaint_in(box: str) -> str:
     """The complaint, in one line, of the box that tyro draws: a title, the complaint, rules and advice between them.
 
-    Of the advice, which options are spelled alike is kept. Where the output is not UTF-8 the box has no sides.
+    Of the advice, which options are spelled alike is kept, and what an option takes. Where the output is not UTF-8 the
+    box has no sides.
     """
-    lines = [line.strip() for line in box.splitlines() if line.strip()]
-    if any(line.startswith("│") for line in lines):
-        lines = [line.strip("│ ") for line in lines if line.startswith("│")]
+    if "│" in box:
+        lines = [line.strip("│") for line in box.splitlines() if line.startswith("│")]
     else:
-        lines = lines[2:]  # after the title and its rule
+        lines = [line for line in box.splitlines() if line.strip()][2:]  # after the title and its rule
     parts: list[list[str]] = [[]]
     for line in lines:
-        if set(line) in ({"─"}, {"-"}):
+        if set(line.strip()) in ({"─"}, {"-"}):
             parts.append([])
         else:
             parts[-1].append(line)
-    alike = [line for part in parts[1:] if part[:1] == ["Perhaps you meant:"] for line in part if line.startswith("--")]
-    complaint = " ".join(parts[0]) or " ".join(box.split())
-    if complaint.startswith("Missing from "):  # then come names and help of all that is
-        names = re.findall(r"(?:: |\(required\) )(--\S+|[A-Z]{2}\S*)(?= )", complaint)
-        if names:
-            return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
-    union = re.match(r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]", complaint)
-    if union:  # of kinds of values; why each is not meant is of no interest
-        kinds = re.sub("[{}]", "", union[2].replace("{None}|", "")).replace(",", "|")
-        complaint = "{}: is {}; must be {}".format(union[1], union[3].replace("'", ""), kinds)
-    choice = re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint)
-    if choice:
-        complaint = f"{choice[2]}: is {choice[1]}; must be one of {choice[3]}".replace("'", "")
-    count = re.match(r"Missing value for argument '(--\S+)'\. Expected (\d+) values", complaint)
-    if count:
-        complaint = f"{count[1]}: " + ("has no value" if count[2] == "1" else f"must be {count[2]} values")
+    if names := missing_in(parts[0]):
+        return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
+    parts = [[line.strip() for line in part if line.strip()] for part in parts]
+    advice = {part[0]: part[1:] for part in parts[1:] if part}
+    complaint = plain(" ".join(parts[0]) or " ".join(box.split()), " ".join(advice.get("Argument helptext:", [])[:1]))
+    alike = [line for line in advice.get("Perhaps you meant:", []) if line.startswith("--")]
+    return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
+
+
+def missing_in(lines: Sequence[str]) -> list[str]:
+    """The names of what is missing, where tyro says so: they are those lines that are indented, and their help more."""
+    if not (lines and lines[0].strip().startswith("Missing from ")):
+        return []
+    indents = [len(line) - len(line.lstrip()) for line in lines]
+    return [line.split()[0] for line, n in zip(lines[1:], indents[1:], strict=True) if n == min(indents[1:])]
+
+
+def plain(complaint: str, signature: str) -> str:
+    """A complaint of tyro's as ours are: what, what was found, what must be. `signature`: the option's, in its help."""
+    if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
+        choices = wrong[3].replace("'", "").split(", ")
+        alike = difflib.get_close_matches(wrong[1], choices)
+        meant = f"; perhaps you meant {', '.join(alike)}" if alike else ""
+        return f"{as_shown(wrong[2])}: is {wrong[1]}; must be one of {', '.join(choices)}{meant}"
+    if wrong := re.match(r"Missing value for argument '(\S+)'\. Expected (\d+) values", complaint):
+        has_none = "has no value" if wrong[1].startswith("--") else "is missing; --help tells more"
+        return f"{as_shown(wrong[1])}: {has_none if wrong[2] == '1' else f'must be {wrong[2]} values'}"
+    union = r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]"
+    if wrong := re.match(union, complaint):  # why each kind of value is not meant is of no interest
+        kinds = re.sub("[{}]", "", wrong[2].replace("{None}|", "")).replace(",", "|")
+        return "{}: is {}; must be {}".format(wrong[1], wrong[3].replace("'", ""), kinds)
+    unread = r"Error parsing (--\S+): (?:Could not find valid parse|Failed to parse)[^\[]*(\[.*\])?"
+    if wrong := re.match(unread, complaint):
+        found = " ".join(re.findall("'(.*?)'", wrong[2] or ""))
+        kinds = re.sub(r"^\[(.*)\]$", r"\1", signature.partition(" ")[2])
+        return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {kinds}"
     for kind, error in (
         ("whole number", r"invalid literal for int\(\) .*"),
         ("number", "could not convert string to float"),
     ):
         complaint = re.sub(rf"^Error parsing (\S+): {error}: '(.*)'", rf"\1: is \2; must be a {kind}", complaint)
-    complaint = re.sub(r"^Error parsing \w+: (?=--)", "", complaint)  # by the dataclass itself
-    return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
+    return re.sub(r"^Error parsing \w+Config: ", "", complaint)  # by the dataclass itself
+
+
+def as_shown(name: str) -> str:
+    """An argument's name as the help has it."""
+    return name if name.startswith("--") else name.upper()
 
 
 def scene_name(scene: Path) -> str:
@@ -100,15 +126,44 @@ def one_line(message: str) -> str:
     return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]} … {words[-LONGEST // 2 :]}"
 
 
+class Interrupted(KeyboardInterrupt):
+    """A signal has come that ends a command, as Ctrl-C does."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def status_of(stop: KeyboardInterrupt) -> int:
+    """The exit status of a command that was interrupted: 128 and the signal."""
+    return 128 + getattr(stop, "number", signal.SIGINT)
+
+
 @contextlib.contextmanager
 def going_on() -> Iterator[None]:
-    """For work that goes on where it was interrupted: says so if it is."""
+    """For work that goes on where it was interrupted: says so if it is, by Ctrl-C or another signal that ends it.
+
+    Raises KeyboardInterrupt for all of them.
+    """
+
+    def hear(number: int, frame: object) -> None:
+        for other in before:  # shells, schedulers and the kernel send them more than once
+            signal.signal(other, signal.SIG_IGN)
+        raise Interrupted(number)
+
+    others = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
+    heard = [number for number in others if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
+    before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield
     except KeyboardInterrupt:
-        sys.stdout.flush()
-        print("interrupted; the same command goes on", file=sys.stderr, flush=True)
+        with contextlib.suppress(OSError):  # a terminal that is closed
+            sys.stdout.flush()
+            print("interrupted; the same command goes on", file=sys.stderr, flush=True)
         raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
@@ -123,8 +178,8 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
         status = main(arguments) or 0
         sys.stdout.flush()  # here, where it may fail
         sys.exit(status)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        sys.exit(status_of(stop))
     except BrokenPipeError:  # `mi-ring … | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)

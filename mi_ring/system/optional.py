@@ -1,8 +1,10 @@
 """Packages that not every machine can install: asked for when they are needed."""
 
+import contextlib
 import importlib.util
 import signal
 import threading
+from collections.abc import Iterator
 from types import ModuleType
 
 from mi_ring.errors import InputError
@@ -19,14 +21,23 @@ def need(package: str, what: str, distribution: str | None = None) -> ModuleType
     `distribution`: what to install, if that has another name.
     """
     try:
-        module = importlib.import_module(package)
+        with keeping_handlers():  # pycolmap puts some of its own
+            module = importlib.import_module(package)
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
         raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install "
                          f"{distribution or package}` (for some systems, Linux on ARM for one, there is none "
                          "ready-made)") from error  # fmt: skip
-    handler = signal.getsignal(signal.SIGTERM)
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)  # pycolmap has put one of its own, which prints a stack trace
     return module
+
+
+@contextlib.contextmanager
+def keeping_handlers() -> Iterator[None]:
+    """Within it a library may put handlers of its own for SIGTERM, which print a stack trace; ours are back then."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
