@@ -17,7 +17,8 @@ from mi_ring.output.index import Entry, write_index
 from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import cores, set_variant
-from mi_ring.system.progress import progress
+from mi_ring.system.optional import need
+from mi_ring.system.progress import outliving_readers, progress
 
 OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives them itself
 
@@ -74,12 +75,13 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
     jobs = jobs_of(config.scenes, config.out, options)
     fit = parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+    need("ray", "mi-ring batch")
     set_variant("llvm_ad_rgb")
-    with locked(config.out / "batch"):
+    with locked(config.out / "batch"), outliving_readers(), command.going_on():
         todo = waiting(jobs, fit.masks)
         show(jobs, config.out, True)
-        if todo:
-            with command.going_on(), noting_interrupts(todo, jobs, config.out):
+        with noting_the_end(todo, jobs, config.out):
+            if todo:
                 follow(todo, jobs, config)
         return finish(jobs, config.out)
 
@@ -96,7 +98,7 @@ def waiting(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
             try:
                 require_capture(job.scene, masks)
                 todo[job] = fingerprint
-            except InputError as error:  # now, rather than at night when its turn comes
+            except (InputError, OSError) as error:  # now, rather than at night when its turn comes
                 state, message = "failed", command.one_line(str(error))
                 print(f"{job.name}: failed: {message}", flush=True)
         job.note(replace(job.record, state=state, message=message, tries=0))
@@ -106,15 +108,16 @@ def waiting(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
 
 
 @contextlib.contextmanager
-def noting_interrupts(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
-    """Within it an interrupt is in the records and in index.html, too."""
+def noting_the_end(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
+    """Within it whatever ends all fits early is in their records and in index.html, too, if a full disk lets it."""
     try:
         yield
-    except KeyboardInterrupt:
-        for job in todo:
-            if job.record.state == "running":
-                job.note(replace(job.record, state="interrupted"))
-        show(jobs, out, False)
+    except BaseException:
+        with contextlib.suppress(InputError):
+            for job in todo:
+                if job.record.state == "running":
+                    job.note(replace(job.record, state="interrupted"))
+            show(jobs, out, False)
         raise
 
 

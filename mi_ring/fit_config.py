@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
-from mi_ring.fitting.config import PRESETS, WEIGHTS, Config
+from mi_ring.fitting.config import PRESETS, WEIGHTS, Config, as_typed
 from mi_ring.output import results
 from mi_ring.system import command
 
@@ -53,7 +53,7 @@ class FitConfig(Config, Task):
         if self.deterministic and self.variant != "llvm_ad_rgb":
             raise InputError("--deterministic: needs --variant llvm_ad_rgb; a GPU adds numbers in an order of its own")
         if not set(self.weights) <= set(WEIGHTS):
-            raise InputError(f"--weights: is {self.weights}, must be of {', '.join(WEIGHTS)}")
+            raise InputError(f"--weights: is {as_typed(self.weights)}, must be of {', '.join(WEIGHTS)}")
 
     @property
     def thread_count(self) -> int:

@@ -11,6 +11,7 @@ from mi_ring.errors import InputError
 from mi_ring.experiments.catalogue import EXPERIMENTS
 from mi_ring.experiments.engine import perform
 from mi_ring.experiments.experiment import Asked
+from mi_ring.fitting.config import as_typed
 from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import set_variant
@@ -59,9 +60,10 @@ class PaperConfig:
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if a run has failed."""
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
-    if config.threads < 0 or not config.seeds or len({*config.seeds}) < len(config.seeds):
-        name, value = ("threads", config.threads) if config.threads < 0 else ("seeds", config.seeds)
-        raise InputError(f"--{name}: is {value}, must be {'0 or more' if name == 'threads' else 'different numbers'}")
+    if config.threads < 0:
+        raise InputError(f"--threads: is {config.threads}, must be 0 or more")
+    if not config.seeds or len({*config.seeds}) < len(config.seeds):
+        raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
     if missing := next((path for path in config.data if not path.exists()), None):
         raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
     if config.quick and config.preset not in (None, "fast"):

@@ -273,7 +273,7 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
     genuine = getattr(results, moment)
 
     def interrupted(*arguments):
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         genuine(*arguments)
 
     monkeypatch.setattr(results, moment, interrupted)
@@ -285,7 +285,7 @@ def test_ctrl_c_outside_the_loop_loses_nothing(moment, small_capture, tmp_path, 
 
 
 def test_the_second_ctrl_c_says_how_to_go_on(small_capture, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(results, "write", lambda *_: [os.kill(os.getpid(), signal.SIGINT) for _ in range(2)])
+    monkeypatch.setattr(results, "write", lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     with pytest.raises(KeyboardInterrupt):
         fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
     assert capsys.readouterr().out.endswith("has a checkpoint: go on with the same command and --resume\n")

@@ -45,8 +45,9 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         raise InputError(f"{path}: holds no checkpoint; {ADVICE}")
     known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
     known["weights"] = WEIGHTS | known["weights"]
-    default, differing = Config().settings(), []
-    for name, value in config.settings().items():
+    known, asked, default = (by_option(settings) for settings in (known, config.settings(), Config().settings()))
+    differing = []
+    for name, value in asked.items():
         if (was := known[name]) != value:
             now = f"{as_typed(value)} now{', the default' * (value == default[name])}"
             differing.append(f"--{name.replace('_', '-')}: was {as_typed(was)} before, is {now}")
@@ -54,6 +55,12 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
         raise InputError(f"{path}: {'; '.join(differing)}; give the same settings, --preset among them, or start anew "
                          "without --resume")  # fmt: skip
     return state
+
+
+def by_option(settings: dict) -> dict:
+    """Settings as there are options for them: one for each weight."""
+    weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
+    return {name: value for name, value in settings.items() if name != "weights"} | weights
 
 
 def require_same_files(state: dict, capture: Capture, config: Config, folder: Path) -> None:

@@ -157,6 +157,17 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     keeper.checkpoint()
 
 
+@contextlib.contextmanager
+def telling_how_to_go_on(folder: Path) -> Iterator[None]:
+    """Within it a second Ctrl-C, which drops what is being written, says what is left."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if any((folder / name).is_file() for name in ("checkpoint.pt", "checkpoint.before.pt")):
+            print(f"Dropped; {folder} has a checkpoint: go on with the same command and --resume")
+        raise
+
+
 def start_of(fit: Fit) -> str:
     """What a fit starts from."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
@@ -180,7 +191,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         def interrupted() -> int:
             return processes.most(heard())
 
-        keeps = "; Ctrl-C ends early and keeps what there is" * sys.stdin.isatty()  # else nobody is there to press it
+        somebody = getattr(sys.stdin, "isatty", bool)()
+        keeps = "; Ctrl-C ends early and keeps what there is" * somebody
         print(f"{len(fit.capture)} photographs; results go to {folder}/{keeps}")
         if fit.calibration:
             print(f"Refined besides surface and material: {', '.join(fit.calibration.refined)}")
@@ -196,18 +208,15 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             print(f"Start: {start_of(fit)}")
             processes.by_first(lambda: results.write_inputs(folder / "inputs.png", fit))
         keeper = Keeper(fit, folder, prepare)
-        try:
-            train(fit, keeper, interrupted, costs)
+        with telling_how_to_go_on(folder):
+            try:
+                train(fit, keeper, interrupted, costs)
+            except Lost:
+                raise
+            except Exception as error:
+                keeper.finish(fitted_scene)
+                if isinstance(error, InputError):  # in all processes: `torchrun` would end the first with the others
+                    processes.wait()
+                raise
             keeper.finish(fitted_scene)
-        except KeyboardInterrupt:  # the second
-            if (folder / "checkpoint.pt").is_file():
-                print(f"Dropped; {folder} has a checkpoint: go on with the same command and --resume")
-            raise
-        except Lost:
-            raise
-        except Exception as error:
-            keeper.finish(fitted_scene)
-            if isinstance(error, InputError):  # in all processes: `torchrun` would end the first with the others
-                processes.wait()
-            raise
         return interrupted() if fit.iteration < fit.iterations else processes.most(0)

@@ -1,12 +1,16 @@
 """What all commands share: arguments from a dataclass, one line for a user's mistake."""
 
+import ast
 import contextlib
 import difflib
 import io
+import math
 import os
 import re
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,7 @@ from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
 LONGEST = 800  #: message, in characters
+REPEATS = 5.0  #: seconds within which a signal that comes again is the same one
 
 
 def parse(
@@ -70,7 +75,7 @@ def complaint_in(box: str) -> str:
         return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     parts = [[line.strip() for line in part if line.strip()] for part in parts]
     advice = {part[0]: part[1:] for part in parts[1:] if part}
-    complaint = plain(" ".join(parts[0]) or " ".join(box.split()), " ".join(advice.get("Argument helptext:", [])[:1]))
+    complaint = plain(" ".join(parts[0]) or " ".join(box.split()), " ".join(advice.get("Argument helptext:", [])))
     alike = [line for line in advice.get("Perhaps you meant:", []) if line.startswith("--")]
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
 
@@ -83,8 +88,8 @@ def missing_in(lines: Sequence[str]) -> list[str]:
     return [line.split()[0] for line, n in zip(lines[1:], indents[1:], strict=True) if n == min(indents[1:])]
 
 
-def plain(complaint: str, signature: str) -> str:
-    """A complaint of tyro's as ours are: what, what was found, what must be. `signature`: the option's, in its help."""
+def plain(complaint: str, help_text: str) -> str:
+    """A complaint of tyro's as ours are: what, what was found, what must be. `help_text`: the option's."""
     if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
         choices = wrong[3].replace("'", "").split(", ")
         alike = difflib.get_close_matches(wrong[1], choices)
@@ -99,9 +104,9 @@ def plain(complaint: str, signature: str) -> str:
         return "{}: is {}; must be {}".format(wrong[1], wrong[3].replace("'", ""), kinds)
     unread = r"Error parsing (--\S+): (?:Could not find valid parse|Failed to parse)[^\[]*(\[.*\])?"
     if wrong := re.match(unread, complaint):
-        found = " ".join(re.findall("'(.*?)'", wrong[2] or ""))
-        kinds = re.sub(r"^\[(.*)\]$", r"\1", signature.partition(" ")[2])
-        return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {kinds}"
+        found = " ".join(ast.literal_eval(wrong[2])) if wrong[2] else ""
+        shown = re.match(r"--\S+ \[(.*?\.\.\.\])\]", help_text)
+        return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {shown[1] if shown else 'as --help says'}"
     for kind, error in (
         ("whole number", r"invalid literal for int\(\) .*"),
         ("number", "could not convert string to float"),
@@ -143,23 +148,29 @@ def status_of(stop: KeyboardInterrupt) -> int:
 def going_on() -> Iterator[None]:
     """For work that goes on where it was interrupted: says so if it is, by Ctrl-C or another signal that ends it.
 
-    Raises KeyboardInterrupt for all of them.
+    Raises KeyboardInterrupt for all of them. In another thread than the main one only Ctrl-C is heard.
     """
+    come: list[tuple[int, float]] = []
 
     def hear(number: int, frame: object) -> None:
-        for other in before:  # shells, schedulers and the kernel send them more than once
-            signal.signal(other, signal.SIG_IGN)
-        raise Interrupted(number)
+        before, now = come[-1][1] if come else -math.inf, time.monotonic()
+        come.append((number, now))
+        if now - before > REPEATS:  # shells, schedulers and the kernel send them more than once
+            raise Interrupted(number)
 
-    others = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
-    heard = [number for number in others if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
+    heard = []
+    if threading.current_thread() is threading.main_thread():
+        others = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
+        heard = [number for number in others if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
     before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         with contextlib.suppress(OSError):  # a terminal that is closed
             sys.stdout.flush()
             print("interrupted; the same command goes on", file=sys.stderr, flush=True)
+        if come and not isinstance(stop, Interrupted):  # a library has raised its own in the place of ours
+            raise Interrupted(come[0][0]) from stop
         raise
     finally:
         for number, handler in before.items():

@@ -34,7 +34,7 @@ def need(package: str, what: str, distribution: str | None = None) -> ModuleType
 
 @contextlib.contextmanager
 def keeping_handlers() -> Iterator[None]:
-    """Within it a library may put handlers of its own for SIGTERM, which print a stack trace; ours are back then."""
+    """Within it a library may put a handler of its own for SIGTERM, and does; ours is back then."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
