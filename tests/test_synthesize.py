@@ -162,6 +162,21 @@ def test_masks_and_the_surface_agree_and_nothing_is_to_be_mended(matt, tmp_path)
         assert pixels.min() > 0 and (pixels.max(0) < sensor.size).all()
 
 
+def test_a_pair_tells_the_flash_from_the_room(lump, tmp_path):
+    """Their difference is what the flash shows where there is no room; novel views have the room's light."""
+    size = ["--views", "3", "--size", "56", "40", "--spp", "9", "--novel", "1", "--exposure", "0.5"]
+    alone, paired = tmp_path / "alone", tmp_path / "paired"
+    synthesize.main([str(lump), str(alone), *size])
+    synthesize.main([str(lump), str(paired), *size, "--room", "0.4", "--room-kind", "harmonics", "--pairs"])
+    alone, both = mi_ring.load_capture(alone / "scene.xml"), mi_ring.load_capture(paired / "scene.xml")
+    assert both.photographs.room is None and mi_ring.load_capture(paired / "truth/scene.xml").photographs.room.any()
+    for k in range(3):
+        lit = read_image(paired / f"images/{k:03}.exr")
+        room = lit - alone.images[k]
+        assert room[both.masks[k] > 0].min() > 0.01  # what would be missing
+        np.testing.assert_allclose(both.images[k], alone.images[k], atol=1e-3 * lit.max())
+
+
 def test_an_interrupted_capture_goes_on(matt, lump, tmp_path):
     missing, kept = matt / "images/004.exr", matt / "images/005.exr"
     before, time = missing.read_bytes(), kept.stat().st_mtime_ns
@@ -380,6 +395,8 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--second", "diffuse", "--pattern", "dots"], "dots: --pattern: no such file; give stripes, checks or"),
     (["--environment", "none.exr"], "none.exr: --environment: no such file"),
     (["--wrong-room"], "--wrong-room: there is no room"),
+    (["--pairs"], "--pairs: need a room"),
+    (["--pairs", "--room", "0.1", "--wrong-room"], "--pairs: need a room"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

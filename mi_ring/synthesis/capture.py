@@ -124,16 +124,16 @@ class Production:
             shapes.append(load_element(own))
         return Stage(self.shape, self.mesh.vertices, shapes)
 
-    def radiance(self, stage: Stage, view: View, camera: Camera, spp: int) -> np.ndarray:
-        """Linear radiance (H, W, 3) where the photographs' light brings 1 W/m² to the object."""
+    def radiance(self, stage: Stage, view: View, camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray | float]:
+        """Linear radiance (H, W, 3) where the photographs' light brings 1 W/m² to the object, and by the room."""
         config, shot = self.config, Shot(camera)
-        if self.environment is not None:
-            return stage.radiance(shot, load_element(self.environment), spp, view.seed, config.depth, hidden=False)
-        picture = stage.radiance(shot, view.light, spp, view.seed, config.depth)
-        if config.room:  # apart: paths that choose between two lights are much noisier
-            seen = lamps.environment_of(self.room_level * lamps.seen_from_within(self.room, camera.to_world))
-            picture += stage.radiance(shot, seen, spp, view.seed + 1, config.depth)
-        return picture
+        light = view.light if self.environment is None else load_element(self.environment)
+        picture = stage.radiance(shot, light, spp, view.seed, config.depth, hidden=self.environment is None)
+        if not config.room:
+            return picture, 0.0
+        # Apart: paths that choose between two lights are much noisier.
+        seen = lamps.environment_of(self.room_level * lamps.seen_from_within(self.room, camera.to_world))
+        return picture, stage.radiance(shot, seen, spp, view.seed + 1, config.depth)
 
     @property
     def room_level(self) -> float:
@@ -150,7 +150,8 @@ class Production:
         for view in views[:: -(-len(views) // TRIALS)]:
             camera = view.camera.shrunk(scale)
             inside = stage.coverage(Shot(camera), 16) > 0.9
-            values.append(self.radiance(stage, view, camera, 36)[inside].max(-1))
+            own, ambient = self.radiance(stage, view, camera, 36)
+            values.append((own + ambient)[inside].max(-1))
         bright = np.quantile(np.concatenate(values), 1 - config.clipped)
         if not bright > 0:
             raise InputError(f"{config.mesh}: MESH: is black, whatever the light; do its faces point inward?")
@@ -174,7 +175,7 @@ def write_capture(config: SynthesizeConfig) -> None:
     """
     out, production = config.out, Production(config)
     claim(out, config)
-    for name in ("truth/images", "images", "masks"):
+    for name in ("truth/images", "images", "masks", *["ambient"] * config.pairs):
         with writing(out):
             (out / name).mkdir(parents=True, exist_ok=True)
     write_file(out / SETTINGS, json.dumps(settings_of(config), indent=1))  # by which the same command goes on
@@ -187,14 +188,21 @@ def write_capture(config: SynthesizeConfig) -> None:
     todo = [(view, out, True) for view in seen] + [(view, out / "truth", False) for view in novel]
     todo = [job for job in todo if not (job[1] / "images" / photograph_name(config, job[0])).is_file()]
     for view, folder, masked in progress(todo, "photographing", unit="photograph", leave=True):
-        linear = exposure * production.radiance(stage, view, view.camera, production.spp)
+        own, ambient = production.radiance(stage, view, view.camera, production.spp)
+        pictures = {"images": exposure * (own + ambient)}
         if masked:
-            linear *= production.gains[int(view.name)]
             coverage = stage.coverage(Shot(view.camera))
             write_image(to_bytes(coverage[..., None] >= 0.5), out / "masks" / f"{view.name}.png")
-            if config.electrons or config.read:
-                linear = noisy(linear, config.electrons, config.read, production.random(5, int(view.name)))
-        write_image(encoded(linear, config.format), folder / "images" / photograph_name(config, view))
+            if config.pairs:
+                pictures = {"ambient": exposure * ambient} | pictures  # by the last it is known what there is
+            for purpose, place in ((5, "images"), (7, "ambient")):
+                if place in pictures:
+                    pictures[place] *= production.gains[int(view.name)]
+                    if config.electrons or config.read:
+                        random = production.random(purpose, int(view.name))
+                        pictures[place] = noisy(pictures[place], config.electrons, config.read, random)
+        for place, linear in pictures.items():
+            write_image(encoded(linear, config.format), folder / place / photograph_name(config, view))
     write_scenes(production, seen, novel, exposure)
 
 
@@ -212,6 +220,7 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
     metres = 0.001 if config.table == "sheet" else None
 
     def scene(folder: Path, views: list[View], images: str, masks: str, exact: bool) -> bytes:
+        paired = config.pairs and views is seen
         gains = production.gains if exact and views is seen else np.ones((len(views), 3))
         cameras, lights = [view.camera for view in views], [view.light for view in views]
         if not exact:
@@ -226,11 +235,12 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
                 view.name, f"{images}/{photograph_name(config, view)}", camera,
                 light._replace(rgb=strength * light.rgb), masks and f"{masks}/{view.name}.png",
                 saturation=HIGHEST if config.format == "exr" else None, calibrated=exact, gain=gain,
+                ambient=f"ambient/{photograph_name(config, view)}" if paired else None,
             )
             for view, camera, light, gain in zip(views, cameras, lights, gains)
         ]  # fmt: skip
         root = scene_element(elements, ground, up, metres)
-        root.extend([] if config.wrong_room and not exact else deepcopy(extra))
+        root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(extra))
         for table in production.tables:
             root.append(deepcopy(table))
         move_names(root, out, folder)

@@ -74,6 +74,8 @@ class SynthesizeConfig:
     it."""
     room_kind: RoomKind = "constant"
     """constant: alike from all sides; harmonics: brighter from some, as spherical harmonics of order 2."""
+    pairs: bool = False
+    """Take each view without the photograph's own light, too, by the --room alone: what fits subtract, as `ambient`."""
     environment: Path | None = None
     """Environment, an EXR or HDR file of latitude and longitude, to light the object instead of --light."""
     table: Literal["none", "plain", "sheet"] = "none"
@@ -169,5 +171,8 @@ def require_options(config: SynthesizeConfig) -> None:
         if config.light != "flash" or any(config.offset) or given:
             raise InputError("--environment: is instead of the photographs' lights and the room; leave out --light, "
                              "--offset, --room, --wrong-light and --wrong-power")  # fmt: skip
-    elif config.room == 0 and config.wrong_room:
+    if config.pairs and (config.room == 0 or config.wrong_room):
+        raise InputError("--pairs: need a room whose light fits subtract; give --room, for instance 0.2, and leave out "
+                         "--wrong-room")  # fmt: skip
+    if not config.environment and config.room == 0 and config.wrong_room:
         raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, or --environment")
