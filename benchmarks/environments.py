@@ -69,7 +69,7 @@ def maps() -> dict[str, np.ndarray]:
 def as_harmonics(radiance: np.ndarray) -> np.ndarray:
     """(BASIS, 3) of a map, by a sum over its pixels."""
     away = directions(len(radiance)).reshape(-1, 3).astype(np.float32)
-    weight = np.sqrt(1 - away[:, 1] ** 2) * 2 * (math.pi / len(radiance)) ** 2 / 2
+    weight = np.sqrt(1 - away[:, 1] ** 2) * (math.pi / len(radiance)) ** 2
     values = dr.sh_eval(mi.Vector3f(*away.T), ORDER)
     basis = np.stack([np.array(value) + np.zeros(len(away)) for value in values])
     room = np.zeros((BASIS, 3))

@@ -103,7 +103,7 @@ def main(arguments: Sequence[str]) -> None:
         level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
     if kind in (".glb", ".obj"):
         gltf.require_expressible(ring)
-    photograph = first_photograph(config.run) if kind == ".xml" else None
+    photograph, room = first_photograph(config.run) if kind == ".xml" else (None, None)
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
     require_place(config.file)
     if kind == ".ply":
@@ -124,7 +124,7 @@ def main(arguments: Sequence[str]) -> None:
         if kind == ".obj":
             files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
         else:
-            files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph)
+            files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph, room)
     print("\n".join(map(str, files)))
 
 

@@ -14,11 +14,15 @@ from conftest import AXES
 
 import mi_ring
 from mi_ring import synthesize
+from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import lighting
+from mi_ring.fitting.calibration import refined_of
 from mi_ring.fitting.lighting import Lighting, brightest, lit
 from mi_ring.images import read_image, write_image
 from mi_ring.rendering import bridge
+from mi_ring.rendering.elements import load_element
+from mi_ring.rendering.lights import Lights
 from mi_ring.rendering.rooms import BASIS, frames_of, seen_from_within
 from mi_ring.rendering.shading import is_room
 
@@ -103,7 +107,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     (exposed / "said.xml").write_text(said)
     told = lit(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
     np.testing.assert_allclose([sensor.gain for sensor in told.sensors], true / true.mean(0), rtol=1e-5)
-    with pytest.raises(InputError, match="--refine: .* must be with power or with gain"):
+    with pytest.raises(InputError, match="--refine: is power gain, must be without power or without gain"):
         mi_ring.Config(refine=("power", "gain"))
 
 
@@ -120,6 +124,13 @@ def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_p
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert frames_of(again.scene) == {"camera"}
     np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
+
+    # Found anew as fixed in the world, nothing is left in the camera's axes.
+    changes = TINY | {"iterations": 3, "light": "environment"}
+    fit = mi_ring.Fit(mi_ring.load_capture(tmp_path / "scene.xml"), mi_ring.Config.preset("fast", **changes))
+    list(fit)
+    fit.save(tmp_path / "again")
+    assert frames_of(mi_ring.load_capture(tmp_path / "again/scene.xml", images=False).scene) == {"world"}
 
 
 def test_cameras_are_refined_under_unknown_light(in_an_environment, tmp_path):
@@ -144,16 +155,62 @@ def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environ
     scene.write_text(in_an_environment.read_text().replace("</scene>", lamp))
     capture = mi_ring.load_capture(scene)
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 4}))
-    assert fit.albedo == pytest.approx(0.5)
+    assert fit.albedo == pytest.approx(0.5) and fit.calibration.refined == ("gain",)
     assert all(np.isfinite(it.loss) for it in fit)
+    assert fit.calibrated().photographs.room is None
+    with pytest.raises(InputError, match="--refine power: is of the photographs' own lights, of which there are none"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, refine=("power",)))
     with pytest.raises(InputError, match="take the lamps of the scene out"):
         mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
 
 
-def test_what_does_not_go_together_is_said(in_an_environment, small_capture):
+@pytest.mark.parametrize(("light", "refine"), [("environment", "power"), ("auto", "scale"), ("lamp", "falloff")])
+def test_what_does_not_go_together_is_said(light, refine, in_an_environment):
     capture = mi_ring.load_capture(in_an_environment)
-    with pytest.raises(InputError, match="--refine power: is of the photographs' own lights"):
-        mi_ring.Fit(capture, mi_ring.Config.preset("fast", light="environment", refine=("power",)))
+    with pytest.raises(InputError, match=f"--refine {refine}: is of the photographs' own lights, in the place of"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", light=light, refine=(refine,)))
+
+
+def test_a_flash_that_pairs_tell_is_no_unknown_light(in_an_environment):
+    """And nothing of the room is left to be refined."""
+    pairs = in_an_environment.with_name("pairs.xml")
+    text = re.sub(r'(<string name="filename" value="(images/\d+.exr)"\s*/>)', r'\1<string name="ambient" value="\2"/>',
+                  in_an_environment.read_text())  # fmt: skip
+    pairs.write_text(text.replace('"0 0 0"', '"1 1 1"'))
+    capture = mi_ring.load_capture(pairs)
+    assert refined_of(capture, mi_ring.Config(), 0.5) == ("light", "power")
+    with pytest.raises(InputError, match="ambient: is subtracted"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", light="auto"))
+
+
+def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_environment):
+    flashed, dark = mi_ring.load_capture(small_capture), mi_ring.load_capture(in_an_environment)
+    assert refined_of(flashed, mi_ring.Config(refine=("auto", "gain")), 0.5) == ("light", "gain", "ambient")
+    assert refined_of(flashed, mi_ring.Config(light="lamp", refine=("auto", "power")), 0.5) == (
+        "light", "power", "ambient",
+    )  # fmt: skip
+    assert refined_of(dark, mi_ring.Config(), 0.5) == ("gain", "ambient")
+    exact = [load_element(element) for element in calibrated_elements(dark)]
+    said = lit(replace(dark, sensors=exact), Lighting("environment"))
+    assert said.known and refined_of(said, mi_ring.Config(light="environment"), 0.5) == ("ambient",)
+
+
+def calibrated_elements(capture):
+    """The photographs of a capture, which say that they are calibrated."""
+    lights = Lights.of(capture.sensors)
+    return [photograph_element(sensor.id(), str(sensor.filename), sensor.camera, lights[k], calibrated=True)
+            for k, sensor in enumerate(capture.sensors)]  # fmt: skip
+
+
+def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path):
+    """mi-ring photos writes one, of nothing, for a turntable."""
+    shutil.copytree(small_capture.parent, tmp_path / "capture")
+    scene = tmp_path / "capture/small.xml"
+    room = '<emitter type="room"><string name="frame" value="camera"/><string name="harmonics" value="{}"/></emitter>'
+    scene.write_text(scene.read_text().replace("</scene>", room.format(" ".join(["0"] * 27)) + "</scene>"))
+    changes = TINY | {"iterations": 1, "refine": ("none",)}
+    fit = mi_ring.Fit(mi_ring.load_capture(scene), mi_ring.Config.preset("fast", **changes))
+    assert fit.ring.indirect and np.isfinite(fit.step().loss)
 
 
 def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):

@@ -32,7 +32,8 @@ def with_calibration(
             sensor.id(), str(sensor.filename), camera, light, sensor.mask and str(sensor.mask),
             None if sensor.encoding == "auto" else sensor.encoding, sensor.saturation,
             sensor.valid and str(sensor.valid), sensor.gamma * gamma,
-            falloff=cone, vignetting=sensor.vignetting + vignetting, contrast=sensor.contrast * contrast,
+            calibrated=sensor.calibrated, falloff=cone, vignetting=sensor.vignetting + vignetting,
+            contrast=sensor.contrast * contrast,
             ambient=sensor.ambient and str(sensor.ambient), gain=sensor.gain * gain,
         )  # fmt: skip
         sensors.append(load_element(element))

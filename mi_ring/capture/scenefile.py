@@ -150,10 +150,13 @@ def numbers(values: ArrayLike) -> str:
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
-def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = None) -> bytes:
+def recalibrated_xml(
+    scene: bytes, sensors: Sequence, room: np.ndarray | None = None, frames: Collection[str] | None = None
+) -> bytes:
     """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order.
 
-    `room`: the light of their room, as `mi_ring.rendering.rooms` has it.
+    `room`: the light of their room, as `mi_ring.rendering.rooms` has it; `frames`: axes that it has, even without
+    light, by default those of the rooms that the scene file has.
     """
     root = ElementTree.fromstring(scene)
     for old, k in photographs_of(root, sensors):
@@ -169,13 +172,13 @@ def recalibrated_xml(scene: bytes, sensors: Sequence, room: np.ndarray | None = 
             if lit or child.get("name") in {*USUAL, GAIN, *fields}:
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
-    frames = set()
+    before = set()
     for emitter in root.findall("emitter[@type='room']"):
         frame = emitter.find("string[@name='frame']")
-        frames.add("world" if frame is None else frame.get("value", ""))
+        before.add("world" if frame is None else frame.get("value", ""))
         root.remove(emitter)
     if room is not None:
-        root.extend(room_elements(room, frames))
+        root.extend(room_elements(room, before if frames is None else frames))
     return scene_bytes(root)
 
 

@@ -31,6 +31,7 @@ from mi_ring.rendering.lights import Light
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.rooms import BASIS
 from mi_ring.rendering.scenes import has_table
+from mi_ring.rendering.shading import lamps
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
 UNKNOWNS: dict[str, dict[str, float]] = {
@@ -69,14 +70,16 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     `albedo`: the object's, by the lights' intensities.
     """
     names: set[str] = set(config.refine)
+    auto = "auto" in names and not capture.known
     unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamp": {"light", "ambient"}}.get(config.light)
-    if unknown:
-        if "auto" in names and not capture.known:
-            names.add("gain")
-        names = (names - {"auto"} - (OF_LIGHTS if "light" not in unknown else set())) | unknown
-    if "auto" in names and not capture.known:
-        untold = config.indirect and albedo >= 1 and not has_table(capture.scene)
-        names |= {*AUTO, "scale"} if untold else {*AUTO}
+    if unknown or capture.photographs.dark:
+        names |= unknown or ({"ambient"} if auto and not lamps(capture.scene) else set())
+        names |= {"gain"} if auto and "power" not in names else set()
+    elif auto:
+        subtracted = {"ambient"} if all(sensor.ambient for sensor in capture.sensors) else set()
+        names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
+        if config.indirect and albedo >= 1 and not has_table(capture.scene):
+            names.add("scale")
     return tuple(name for name in UNKNOWNS if name in names)
 
 
@@ -168,7 +171,7 @@ class Calibration(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room
         room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
-        self.room = Room(room, exposure, frames, capture.photographs.dark)
+        self.room = Room(room, exposure, frames, capture.photographs.dark and not lamps(capture.scene))
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""

@@ -117,9 +117,10 @@ class Config:
     camera's, for all; contrast: how steep the S of a curve as of film is; scale: the power of all lights together, by
     interreflection; ambient: the light of the room, which is the same for all, fixed in the world, or in the camera if
     the scene has a `room` in its axes, as that of a turntable has; masks: the object's outlines in the photographs,
-    found anew about the surface at half and at three quarters of the fit. auto: light, power and ambient, and scale
-    where lights cannot be as strong as the scene says, but nothing if it says that it is calibrated; where the light is
-    unknown, gain; none: nothing."""
+    found anew about the surface at half and at three quarters of the fit. auto: light, power (unless
+    gain is given) and ambient (unless it is subtracted), and scale where lights cannot be as strong as the scene says;
+    under an unknown light, or where photographs have none of their own, gain, and ambient unless lamps light them;
+    nothing if the scene says that it is calibrated. none: nothing."""
     holdout: int = 0
     """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
     thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.

@@ -31,6 +31,8 @@ def kept_out(capture: Capture, every: int) -> np.ndarray:
     """
     several = len(capture)
     found = np.arange(several)[every // 2 :: every] if every else np.arange(0)
+    if every and several < 2:
+        raise InputError(f"{capture.path}: --holdout: there is one photograph alone; leave it out")
     if every and not 0 < len(found) < several:
         raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(found)} of {several} photographs "
                          f"out; give 2 to {2 * several - 1}")  # fmt: skip

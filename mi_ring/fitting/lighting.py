@@ -49,8 +49,11 @@ class Lighting(NamedTuple):
 
 def require_unknown(capture: Capture, config: Config) -> None:
     """Raise InputError for what does not go with `Config.light`."""
-    others = lamps(capture.scene)
+    others, own = lamps(capture.scene), OF_LIGHTS & set(config.refine)
     if config.light == "capture":
+        if own and capture.photographs.dark:
+            raise InputError(f"{capture.path}: --refine {min(own)}: is of the photographs' own lights, of which there "
+                             "are none; leave it out")  # fmt: skip
         if unlit(capture) and not others:
             raise InputError(f"{capture.path}: emitter: nothing lights the object; give lights, or --light auto")
         return
@@ -59,10 +62,13 @@ def require_unknown(capture: Capture, config: Config) -> None:
     if others:
         raise InputError(f"{capture.path}: emitter: --light {config.light} finds all the light there is; take the "
                          "lamps of the scene out, or leave --light out")  # fmt: skip
-    wrong = OF_LIGHTS & set(config.refine)
-    if config.light in ("environment", "turntable") and wrong:
-        raise InputError(f"--refine {min(wrong)}: is of the photographs' own lights, which --light {config.light} "
-                         "leaves out; leave it out")  # fmt: skip
+    if any(sensor.ambient for sensor in capture.sensors):
+        raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
+                         f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
+    wrong = own & {"falloff"} if config.light == "lamp" else own
+    if wrong:
+        raise InputError(f"--refine {min(wrong)}: is of the photographs' own lights, in the place of which --light "
+                         f"{config.light} puts another; leave it out")  # fmt: skip
 
 
 def unlit(capture: Capture) -> bool:

@@ -37,7 +37,7 @@ def with_surroundings(
         predicted = predicted + (fit.calibration.bounced(around.interreflection) if fit.calibration
                                  else around.interreflection)  # fmt: skip
     before = predicted.detach()
-    if photographs.room is not None:
+    if photographs.harmonics:
         predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
     if calibration and looking:
         telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)

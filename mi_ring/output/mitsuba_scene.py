@@ -16,20 +16,33 @@ from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
 from mi_ring.rendering.lights import Lights
 from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.rendering.rooms import room_of, seen_from_within
 from mi_ring.system.files import write_file
 
 
-def first_photograph(run: Path) -> Any:
-    """The first photograph of a fit, as its scene.xml has it. Raises InputError if there is none."""
+def first_photograph(run: Path) -> tuple[Any, np.ndarray | None]:
+    """The first photograph of a fit, as its scene.xml has it, and the room of that.
+
+    Raises InputError if there is none, or if nothing of what lights it can be exported.
+    """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
-    return open_scene(run / "scene.xml")[1][0]
+    scene, sensors = open_scene(run / "scene.xml")
+    room = room_of(scene)
+    if room is None and not Lights.of(sensors[:1])[0].rgb.any():
+        raise InputError(f"{run}/scene.xml: a scene for Mitsuba takes the photographs' own light, of which there is "
+                         "none; give an OBJ or GLB file, and light it yourself")  # fmt: skip
+    return sensors[0], room
 
 
 def write_scene(
-    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any
-) -> list[Path]:
-    """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone."""
+    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any,
+    room: np.ndarray | None,
+) -> list[Path]:  # fmt: skip
+    """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone.
+
+    If that has none, the light of its `room` (BASIS, 3).
+    """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
     params = mi.traverse(mesh)
@@ -72,7 +85,14 @@ def write_scene(
             bitmap(parent, name, values[name])
     light = Lights.of([photograph])[0]
     scene.append(perspective_element(photograph.camera, atlas.vertices))
-    scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
+    if light.rgb.any():
+        scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
+    elif room is not None:
+        files.append(path.with_name(f"{path.stem}_environment.exr"))
+        radiance = seen_from_within(room, photograph.camera.to_world).clip(min=0) / scale
+        write_image(radiance.astype(np.float32), files[-1])
+        environment = ElementTree.SubElement(scene, "emitter", type="envmap")
+        ElementTree.SubElement(environment, "string", name="filename", value=files[-1].name)
     ElementTree.indent(scene)
     write_file(path, ElementTree.tostring(scene, "utf-8"))
     return files

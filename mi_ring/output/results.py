@@ -18,6 +18,7 @@ from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
 from mi_ring.rendering.rooms import seen_from_within
+from mi_ring.rendering.shading import lamps
 from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
@@ -135,11 +136,13 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     views = capture.views
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
-        scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room)
+        frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
+        scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room, frames)
     if fit.outlines:
         scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
-    if capture.photographs.dark and capture.photographs.room is not None:  # it is all the light there is
+    if capture.photographs.dark and capture.photographs.room is not None and not lamps(capture.scene):
+        # It is all the light there is.
         radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)

@@ -121,6 +121,9 @@ def views_of(capture: Capture, ring: Ring, config: RenderConfig) -> list[View]:
     size = (config.width, round(height * config.width / width)) if config.width else sensor.size
     camera, middle = framed(sensor.camera._replace(size=size), ring, up)
     light = Lights.of([sensor])[0]
+    if config.light_orbit and not light.rgb.any():
+        raise InputError(f"{config.scene}: --light-orbit: photographs have no light of their own that could go round; "
+                         "give --turntable")  # fmt: skip
     views, digits = [], max(3, len(str(count - 1)))
     for k in range(count):
         seen_from, lit_from, time = camera, light, config.time
