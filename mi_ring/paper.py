@@ -1,5 +1,6 @@
 """Reproduce a table or figure of the paper, ours beside it: `python -m mi_ring.paper NAME`."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,10 +74,17 @@ def main(arguments: Sequence[str]) -> int:
     asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
     out = config.out / f"{config.name}{'-quick' * config.quick}"
     settings = "--quick" if config.quick else f"--preset {preset}"
+    what = [path.name or str(path.resolve().name) for path in config.data]
+    if config.materials:
+        what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
     seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
     with command.going_on(), locked(out):
         failed = perform(
-            EXPERIMENTS[config.name], asked, out, config.only, f"mi-ring paper {config.name} {settings}{seeds}"
+            EXPERIMENTS[config.name],
+            asked,
+            out,
+            config.only,
+            " ".join(["mi-ring paper", config.name, *what, settings]) + seeds,
         )
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
     print(f"{out}/table.md and figure.png{runs}")

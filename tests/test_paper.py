@@ -2,7 +2,9 @@
 
 import csv
 import dataclasses
+import re
 import shutil
+import time
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -80,13 +82,15 @@ def data_for(name, known_capture, ball, tmp_path):
 
 def test_every_run_is_one_that_a_fit_takes(known_capture, photographed_ball, tmp_path):
     for name, experiment in EXPERIMENTS.items():
-        require_valid(experiment, data_for(name, known_capture, photographed_ball[0], tmp_path), known_capture)
+        seeds = (0,) if name == "swap" else (0, 1)
+        data = data_for(name, known_capture, photographed_ball[0], tmp_path)
+        require_valid(experiment, data, known_capture, seeds)
 
 
-def require_valid(experiment, data, known_capture):
+def require_valid(experiment, data, known_capture, seeds):
     for asked in (
         Asked(data, seeds=(3,)),
-        Asked(data, preset="paper", seeds=(0, 1)),
+        Asked(data, preset="paper", seeds=seeds),
         Asked(data, (), "fast", quick=True),
     ):
         runs = experiment.runs(asked)
@@ -113,6 +117,19 @@ def test_what_the_paper_compares_is_what_runs_differ_in(known_capture):
     assert of("genus", "domain") == {("sphere",), ("hull",)}
     assert of("table3", "refine") == {(("none",),), (("cameras",),)}
     assert [run.labels["views"] for run in EXPERIMENTS["views"].runs(asked)] == [5, 10, 12]  # it has twelve
+
+
+def test_labels_say_what_runs_are(known_capture):
+    """Whatever the preset is; and a run is called the same whatever seeds stand beside it."""
+    for preset in ("default", "paper"):
+        asked = Asked((known_capture,), preset=preset)
+        for run in EXPERIMENTS["ablation"].runs(asked):
+            if told := re.search(r"T = (\d+)", str(run.labels["network"])):
+                assert run.config(asked).steps == int(told[1])
+    one, two = (EXPERIMENTS["table1"].runs(Asked((known_capture,), seeds=seeds)) for seeds in ((0,), (0, 3)))
+    assert [run.name for run in two] == [one[0].name, f"{one[0].name}-3"]
+    gloss = Asked(materials=("roughconductor alpha=0.1", "roughconductor alpha=0.3"), seeds=(0, 1))
+    assert len({run.labels["material"] for run in EXPERIMENTS["specularity"].runs(gloss)}) == 2
 
 
 def test_published_figures():
@@ -144,6 +161,10 @@ MISTAKES = [
     (["table2", "EMPTY"], "has no mvpmsData/bearPNG/Calib_Results.mat"),
     (["single"], "DATA: single needs .npz files"),
     (["single", "EMPTY"], "is a folder"),
+    (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
+    (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
+    (["specularity", "--materials", ""], "--materials: one is empty"),
+    (["table1", "a.ply", "--materials", "diffuse", "plastic"], "a.ply: DATA: is not there"),
     (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
     (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
     (["specularity", "EMPTY"], "DATA: must be one mesh"),
@@ -209,6 +230,12 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
     assert text.startswith("A trial.") and f"| egg | 0 | ours | {float(rows[0]['normal_mean']):.2f} |" in text
     assert (out / "figure.png").stat().st_size > 1000
 
+    # What is compared with has changed.
+    time.sleep(0.01)
+    (egg.truth(out) / "mesh.ply").touch()
+    assert engine.perform(trial(runs[:1]), asked, out) == 0 and measured == ["egg-1", "egg-0"]
+    assert engine.perform(trial(runs[1:2]), asked, out) == 1 and not (out / "figure.png").exists()
+
     # The second was looked at in its course, which ends with its result.
     made = Made(out / "runs" / "egg-1", egg.scene, egg.truth(out), out, asked)
     course = measures.course(runs[2], made)
@@ -266,6 +293,8 @@ def test_errors_of_slices():
     row = measures.compare_slices(found, truth, other)
     assert row["slice_error"] == pytest.approx(20) and row["right_material"] == pytest.approx(75)
     assert "right_material" not in measures.compare_slices(found, truth, None)
+    black = np.zeros_like(truth)  # as far as can be seen
+    assert measures.compare_slices(black + 1e-4, black, None)["slice_error"] == pytest.approx(10)
 
 
 def test_places_of_the_second_material_are_where_it_is_seen():
@@ -296,6 +325,9 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     made = Made(folder, scene, tmp_path / "none", tmp_path / "captures", Asked())
     (row,) = measures.normals_from_one_side(Run("ball", recipe, {}), made)
     assert row["normal_mean"] < 0.5 and row["missed"] < 2 and row["seconds"] == 7
+    with pytest.raises(InputError, match=r"light_int: is of shape \(2, 3\), must be \(3, 3\) by mask and"):
+        np.savez(file, **{**np.load(file), "light_int": np.ones((2, 3))})
+        recipe.read()
     with pytest.raises(InputError, match="has no array light_dir of 2 dimensions"):
         np.savez(file, **{k: v for k, v in np.load(file).items() if k != "light_dir"})
         recipe.read()
@@ -328,3 +360,10 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     torch.testing.assert_close(other.observe([3]).rgb, whole.observe([3]).rgb)
     assert 0.4 < measures.turns(egg.scene, other.path) < 1.4  # √3 · 0.5° but for chance
     assert measures.turns(egg.scene, egg.scene) < 1e-3
+    said = egg.scene.with_name("calibrated.xml")
+    said.write_text(re.sub('(<sensor type="photograph"[^>]*>)', r'\1<boolean name="calibrated" value="true"/>',
+                           egg.scene.read_text()))  # fmt: skip
+    exact = recipes.Given("exact", said)
+    wrong = recipes.Perturbed("said", exact, 0.5, 0)
+    assert load_capture(exact.scene).known and not load_capture(wrong.made(tmp_path)).known
+    said.unlink()

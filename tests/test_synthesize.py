@@ -1,6 +1,7 @@
 """Synthetic captures: radiance by closed forms, what scene files say, what is wrong on purpose, what is refused."""
 
 import os
+import shutil
 import struct
 
 import drjit as dr
@@ -15,6 +16,7 @@ from test_merl import closed_form, directions, evaluate, networks, nodes, write
 import mi_ring
 from mi_ring import check, synthesize
 from mi_ring.capture.decoding import decode
+from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
@@ -160,6 +162,25 @@ def test_masks_and_the_surface_agree_and_nothing_is_to_be_mended(matt, tmp_path)
         np.testing.assert_allclose([columns.min(), rows.min()], pixels.min(0), atol=1.1)
         np.testing.assert_allclose([columns.max() + 1, rows.max() + 1], pixels.max(0), atol=1.1)
         assert pixels.min() > 0 and (pixels.max(0) < sensor.size).all()
+
+
+def test_a_mesh_is_known_by_what_it_holds(lump, matt, tmp_path, capsys):
+    """The same command goes on from another folder, or when all of it has moved."""
+    other = tmp_path / "moved.obj"
+    shutil.copy(lump, other)
+    options = [*SMALL, "--material", "diffuse reflectance=0.6,0.3,0.2", "--light", "point", "--depth", "2"]
+    before = (matt / "images/000.exr").stat().st_mtime_ns
+    synthesize.main([str(other), str(matt), *options])
+    assert (matt / "images/000.exr").stat().st_mtime_ns == before
+    other.write_text(other.read_text() + "# another\n")
+    with pytest.raises(InputError, match=r"made with other options \(digests\)"):
+        synthesize.main([str(other), str(matt), *options])
+
+
+def test_what_no_pixel_shows_alone_needs_an_exposure(lump, tmp_path):
+    options = ["--views", "2", "--size", "32", "32", "--novel", "0", "--distance", "900"]
+    with pytest.raises(InputError, match="no pixel shows it alone, .* give --exposure"):
+        synthesize.main([str(lump), str(tmp_path / "far"), *options])
 
 
 def test_a_pair_tells_the_flash_from_the_room(lump, tmp_path):

@@ -50,6 +50,9 @@ def captures(asked: Asked) -> list[Recipe]:
     meshes = [path for path in asked.data if path.suffix.lower() in MESHES]
     if asked.materials and not meshes:
         raise InputError("--materials: are what meshes are made of; give meshes as DATA")
+    if len(asked.materials) > max(1, len(meshes)):
+        raise InputError(f"--materials: are {len(asked.materials)} for {len(meshes)} meshes; give one each, or fewer, "
+                         "which are taken in turn")  # fmt: skip
     found: list[Recipe] = []
     for path in asked.data:
         if path in meshes:
@@ -69,12 +72,12 @@ def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = ""
 
 
 def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
-    """Each run once for each seed."""
+    """Each run once for each seed. Its name is the same whatever others there are."""
     many = len(asked.seeds) > 1
 
     def own_seed(run: Run, seed: int) -> Run:
         labels = {**run.labels, **({"seed": seed} if many else {})}
-        name = f"{run.name}-{seed}" if many else run.name
+        name = f"{run.name}-{seed}" if seed else run.name
         return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
 
     return [own_seed(run, seed) for run in runs for seed in asked.seeds]
@@ -97,6 +100,7 @@ def table1(asked: Asked) -> list[Run]:
 
 def table2(asked: Asked) -> list[Run]:
     """Each object of DiLiGenT-MV; those that are not there fail."""
+    require_no_materials(asked)
     if len(asked.data) != 1:
         raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
                          f"from its authors: {DILIGENT}/mv")  # fmt: skip
@@ -133,10 +137,13 @@ def specularity(asked: Asked) -> list[Run]:
     """One mesh of each material."""
     mesh = one_mesh(asked)
     materials = asked.materials or (GLOSSY[::2] if asked.quick else GLOSSY)
+    names = [short(material) for material in materials]
+    if len({*names}) < len(names):  # what differs is among the parameters that are left out
+        names = list(materials)
     return seeded([
         Run(f"{k}", traced(asked, mesh, material, f"gloss-{mesh.stem if mesh else 'pot'}-{short(material)}"),
-            {"material": short(material)}, measure=measures.with_slices)
-        for k, material in enumerate(materials)
+            {"material": called}, measure=measures.with_slices)
+        for k, (material, called) in enumerate(zip(materials, names))
     ], asked)  # fmt: skip
 
 
@@ -152,8 +159,16 @@ def stripes(asked: Asked) -> list[Run]:
     return seeded([Run("stripes", recipe, labels, measure=measures.with_slices)], asked)
 
 
+def require_no_materials(asked: Asked) -> None:
+    """Raise InputError if materials are given where nothing is made of them."""
+    if asked.materials:
+        raise InputError("--materials: are what meshes are made of, and this experiment takes none; leave them out")
+
+
 def one_mesh(asked: Asked) -> Path | None:
-    """That is given, if one is."""
+    """That is given, if one is. Raises InputError if that is not one mesh, or if a material is an empty word."""
+    if not all(material.strip() for material in asked.materials):
+        raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
     if len(asked.data) > 1 or any(path.suffix.lower() not in MESHES for path in asked.data):
         raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
     return asked.data[0] if asked.data else None
@@ -190,7 +205,7 @@ def genus(asked: Asked) -> list[Run]:
 
 def ablation(asked: Asked) -> list[Run]:
     """The ring and ResNets from a sphere, and the ring from a hull, as fits usually begin."""
-    sphere = {"domain": "sphere"}
+    sphere = {"domain": "sphere", "steps": 3}
     networks: dict[Any, dict[str, Any]] = {
         "ring, T = 3": sphere,
         "resnet, T = 3": {**sphere, "shape_net": "resnet"},
@@ -220,6 +235,10 @@ def steps(asked: Asked) -> list[Run]:
 
 def swap(asked: Asked) -> list[Run]:
     """Two captures or more from a sphere."""
+    if not asked.data:
+        require_no_materials(asked)
+    if len(asked.seeds) > 1:
+        raise InputError("--seeds: are several; swap takes one, of which it exchanges materials")
     recipes = captures(asked) if asked.data else [own(), traced(asked, None, GLOSSY[-1])]
     if len(recipes) < 2:
         raise InputError("DATA: is one capture; swap exchanges the materials of two or more")
@@ -239,6 +258,7 @@ def timing(asked: Asked) -> list[Run]:
 
 def single(asked: Asked) -> list[Run]:
     """Each object that is seen from one side."""
+    require_no_materials(asked)
     if not asked.data:
         raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/paper.md says; "
                          f"get them from its authors: {DILIGENT}/single")  # fmt: skip
@@ -301,7 +321,7 @@ EXPERIMENTS = {
     ),
     "genus": Experiment(
         "An object with a handle, from a sphere and from the masks' visual hull.", genus,
-        {**SHAPE, "genus": Column("genus", 0), "genus_true": Column("true genus", 0)}, figures.pictures,
+        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, figures.pictures,
         mean_over="seed", data=f"{CAPTURES}, or meshes",
     ),
     "swap": Experiment(

@@ -25,6 +25,7 @@ from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.rendering.plain_mesh import scene_of
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
+from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
 
 NUMBERS = "numbers.json"  #: of a run, in the folder of its results: what was measured of which fit
@@ -101,7 +102,8 @@ def measured(run: Run, made: Made) -> list[Row]:
     """The rows of a finished fit; those of before if it is the same."""
     measure: Callable[[Run, Made], list[Row]] = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": made.asked.spp, "written": written(made.folder / "ring.pt"),
-          "truth": str(made.truth.resolve()), "true": written(made.truth / "mesh.ply")}  # fmt: skip
+          "compared": [[str(file.resolve()), written(file)] for file in run.recipe.compared(made.captures)],
+          "exactly": installed("igl")}  # fmt: skip
     before = read_json(made.folder / NUMBERS)
     if not (isinstance(before, dict) and before.get("of") == of):
         before = {"of": of, "rows": rounded(measure(run, made))}
@@ -124,7 +126,8 @@ def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
             rows.append({"iteration": it.number, "seconds": fit.seconds, **numbers})
 
     with threads_of(made.asked.threads):
-        fit = Fit(load_capture(made.scene, masks="auto"), run.config(made.asked), callbacks=[look])
+        config = run.config(made.asked)
+        fit = Fit(load_capture(made.scene, masks=config.masks), config, callbacks=[look])
         for _ in progress(fit, "iterations", total=fit.iterations):
             pass
         fit.save(job.folder)
@@ -141,7 +144,9 @@ def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) 
     write_file(out / "table.csv", csv_text(names, rows))
     write_file(out / "table.md", markdown(experiment, names, rows, said))
     done = [outcome for outcome in outcomes if not outcome.failed]
-    if done:
-        buffer = io.BytesIO()
-        experiment.figure(done).savefig(buffer, format="png", dpi=120)
-        write_file(out / "figure.png", buffer.getvalue())
+    if not done:
+        (out / "figure.png").unlink(missing_ok=True)  # of other runs
+        return
+    buffer = io.BytesIO()
+    experiment.figure(done).savefig(buffer, format="png", dpi=120)
+    write_file(out / "figure.png", buffer.getvalue())

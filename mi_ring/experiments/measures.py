@@ -25,25 +25,28 @@ from mi_ring.system.optional import installed
 COURSE = "course.json"  #: of a fit that was watched
 POINTS = 8  #: of its course
 LEVELS = 3, 4, 5, 6, 7  #: that a fit is sampled at
+BLACK = 1e-3  #: BRDF [1/sr] below which errors count no more than there
 SAMPLED = 3  #: level of the points whose material is looked at
 
 
 def evaluated(run: Run, made: Made, align: str | None = None, seen: bool = False) -> list[Row]:
-    """What `mi-ring evaluate` tells, and how long the fit took; `crossing`: crossing triangles, in % of all.
-
-    They are counted exactly where libigl is installed.
-    """
+    """What `mi-ring evaluate` tells, and how long the fit took; `crossing`: crossing triangles, in % of all."""
     novel = made.truth / "scene.xml"
     numbers = evaluate_fit(
         made.folder, made.truth / "mesh.ply", novel if novel.is_file() else None, made.asked.spp, seen, align
     )
     row = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     mesh, _ = load_true_mesh(made.folder / "mesh.ply")
-    crossing = exactly_crossing if installed("igl") else crossing_triangles
-    row["crossing"] = 100 * float(np.mean(crossing(mesh.vertices, mesh.faces)))
+    row["crossing"] = crossing(mesh.vertices, mesh.faces)
     row["inside_out"] = 100 * row["inside_out"] / len(mesh.faces)
     row["seconds"] = read_log(made.folder)[-1]["seconds"]
     return [row]
+
+
+def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Triangles (F, 3) that cross others [%], counted exactly where libigl is installed."""
+    count = exactly_crossing if installed("igl") else crossing_triangles
+    return 100 * float(np.mean(count(vertices, faces)))
 
 
 def in_millimetres(run: Run, made: Made) -> list[Row]:
@@ -81,8 +84,8 @@ def by_level(run: Run, made: Made) -> list[Row]:
             vertices = ring.surface(s).numpy()
         numbers, _ = compare_surfaces(capture, scene_of(vertices, faces), truth, float(np.linalg.norm(mesh.extents)))
         turned = 100 * float(inside_out(ring, s, faces).mean())
-        crossing = 100 * float(crossing_triangles(vertices, faces).mean())
-        rows.append({"level": level, "vertices": len(vertices), **numbers, "inside_out": turned, "crossing": crossing})
+        flaws = {"inside_out": turned, "crossing": crossing(vertices, faces)}
+        rows.append({"level": level, "vertices": len(vertices), **numbers, **flaws})
     return rows
 
 
@@ -131,11 +134,12 @@ def with_slices(run: Run, made: Made) -> list[Row]:
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
     """Of slices (V, angles, 3) at as many points of the surface.
 
-    `slice_error`: absolute value of found / true − 1, mean over angles and channels, median over the points [%].
+    `slice_error`: |found − true| / true, what is darker than `BLACK` counting as that, mean over angles and channels,
+    median over the points [%].
     `right_material`: share of points [%] whose slice, as logarithms, is nearer to the true one than to that of the
     `other` material.
     """
-    error = np.abs(found / np.maximum(truth, 1e-9) - 1).mean((1, 2))
+    error = (np.abs(found - truth) / np.maximum(truth, BLACK)).mean((1, 2))
     row = {"slice_error": 100 * float(np.median(error))}
     if other is not None:
         logs = [np.log(np.maximum(f, 1e-6)) for f in (found, truth, other)]

@@ -31,12 +31,12 @@ from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.synthesis.capture import claim, write_capture
+from mi_ring.synthesis.capture import SETTINGS, claim, write_capture
 from mi_ring.synthesis.config import SynthesizeConfig, require_options
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example import VIEWS, pot, write_example
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, read_json, write_file, writing
+from mi_ring.system.files import locked, partial_path, read_json, write_file, writing
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: of a checkout
 DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
@@ -66,6 +66,11 @@ class Recipe:
     def truth(self, captures: Path) -> Path:
         """The folder of mesh.ply and, perhaps, of scene.xml with novel views."""
         return self.folder_in(captures) / "truth"
+
+    def compared(self, captures: Path) -> list[Path]:
+        """The files with what a fit of it is compared with; not all need be there."""
+        truth = self.truth(captures)
+        return [truth / "mesh.ply", truth / "scene.xml"]
 
     @property
     def photographs(self) -> int:
@@ -172,7 +177,8 @@ class Synthetic(Recipe):
 
     def complete(self, captures: Path) -> SynthesizeConfig:
         """With mesh and folder."""
-        return replace(self.config, mesh=self.mesh or captures / "pot.ply", out=self.folder_in(captures))
+        mesh = (self.mesh or captures / "pot.ply").resolve()
+        return replace(self.config, mesh=mesh, out=self.folder_in(captures))
 
     def made(self, captures: Path) -> Path:
         config = self.complete(captures)
@@ -180,8 +186,15 @@ class Synthetic(Recipe):
         if not self.mesh and not config.mesh.is_file():
             captures.mkdir(parents=True, exist_ok=True)
             vertices, faces, _ = pot()
-            mesh_of(vertices, faces, normals=False).write_ply(str(config.mesh))
-        claim(config.out, config)
+            growing = partial_path(config.mesh)
+            mesh_of(vertices, faces, normals=False).write_ply(str(growing))
+            os.replace(growing, config.mesh)
+        try:
+            claim(config.out, config)
+        except InputError:  # its name is by its settings: what a file of theirs holds has changed
+            if not (config.out / SETTINGS).is_file():
+                raise
+            shutil.rmtree(config.out)
         if not (config.out / "scene.xml").is_file():  # which is written last
             with locked(config.out, "OUT"):
                 write_capture(config)
@@ -243,6 +256,9 @@ class Perturbed(Derived):
         moved = miscalibrated(cameras, lights, center, random, turned=self.degrees)
         wrong = with_calibration(capture, *moved, room=capture.photographs.room)
         root = ElementTree.parse(scene).getroot()
+        for sensor in root.findall("sensor"):
+            for said in sensor.findall("boolean[@name='calibrated']"):
+                sensor.remove(said)
         move_names(root, scene.parent, self.folder_in(captures))
         content = recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)
         write_file(folder / "scene.xml", content)
@@ -280,7 +296,17 @@ class SingleView(Recipe):
         for name, dimensions in SINGLE.items():
             if name not in arrays or arrays[name].ndim != dimensions:
                 raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
+        mask, lights = arrays["mask"], len(arrays["pixels_uint16"])
+        shapes = {"pixels_uint16": (lights, int((mask > 0).sum()), 3), "light_dir": (lights, 3),
+                  "light_int": (lights, 3), "normal_gt": (*mask.shape, 3), "K": (3, 3)}  # fmt: skip
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise InputError(f"{self.file}: {name}: is of shape {arrays[name].shape}, must be {shape} by mask and "
+                                 "number of photographs; see docs/paper.md")  # fmt: skip
         return arrays
+
+    def compared(self, captures: Path) -> list[Path]:
+        return [self.file]
 
     def made(self, captures: Path) -> Path:
         of = {"file": str(self.file.resolve()), "written": written(self.file)}
@@ -296,7 +322,8 @@ class SingleView(Recipe):
         (folder / "images").mkdir(parents=True)
         write_image(mask[..., None].astype(np.uint8) * 255, folder / "mask.png")
         elements: list[Element] = []
-        for k, (pixels, to_light, rgb) in enumerate(zip(data["pixels_uint16"], data["light_dir"], data["light_int"])):
+        lights = zip(data["pixels_uint16"], data["light_dir"], data["light_int"], strict=True)
+        for k, (pixels, to_light, rgb) in enumerate(lights):
             image = np.zeros((height, width, 3), np.uint16)
             image[mask] = pixels
             file = f"images/{k:03}.png"

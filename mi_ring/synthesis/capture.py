@@ -152,6 +152,9 @@ class Production:
             inside = stage.coverage(Shot(camera), 16) > 0.9
             own, ambient = self.radiance(stage, view, camera, 36)
             values.append((own + ambient)[inside].max(-1))
+        if not np.concatenate(values).size:
+            raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows it alone, by which "
+                             "the exposure would be chosen; give --exposure, for instance 0.5")  # fmt: skip
         bright = np.quantile(np.concatenate(values), 1 - config.clipped)
         if not bright > 0:
             raise InputError(f"{config.mesh}: MESH: is black, whatever the light; do its faces point inward?")
@@ -278,7 +281,8 @@ def claim(out: Path, config: SynthesizeConfig) -> None:
     if not isinstance(found, dict):
         raise InputError(f"{out}: OUT: is there already, and is no capture of mi-ring synthesize; give another name")
     wanted = settings_of(config)
-    other = [name for name, value in wanted.items() if found.get(name) != value]
+    named = {"mesh", "environment"} & wanted["digests"].keys()  # by what they hold, wherever they are
+    other = [name for name, value in wanted.items() if name not in named and found.get(name) != value]
     if other:
         raise InputError(f"{out}: OUT: holds a capture that was made with other options ({', '.join(other)}); "
                          "give another name, or remove it")  # fmt: skip

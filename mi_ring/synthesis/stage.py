@@ -89,7 +89,11 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
     while smooth and len(mesh.vertices) < SMOOTH:
         if colours is not None:  # in the middle of an edge, the mean of its ends'
             colours = np.concatenate([colours, colours[mesh.edges_unique].mean(1)])
-        mesh = mesh.subdivide_loop(1)
+        try:
+            mesh = mesh.subdivide_loop(1)
+        except ValueError as error:
+            raise InputError(f"{path}: MESH: has edges of more than two triangles, which --smooth cannot subdivide; "
+                             "leave that out") from error  # fmt: skip
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
         mesh.invert()
     middle = mesh.bounds.mean(0)
