@@ -104,7 +104,9 @@ def plain(complaint: str, help_text: str) -> str:
         return "{}: is {}; must be {}".format(wrong[1], wrong[3].replace("'", ""), kinds)
     unread = r"Error parsing (--\S+): (?:Could not find valid parse|Failed to parse)[^\[]*(\[.*\])?"
     if wrong := re.match(unread, complaint):
-        found = " ".join(ast.literal_eval(wrong[2])) if wrong[2] else ""
+        found = ""
+        with contextlib.suppress(SyntaxError, ValueError):  # of words that the box has broken
+            found = " ".join(ast.literal_eval(wrong[2] or "[]"))
         shown = re.match(r"--\S+ \[(.*?\.\.\.\])\]", help_text)
         return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {shown[1] if shown else 'as --help says'}"
     for kind, error in (
