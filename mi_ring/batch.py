@@ -70,11 +70,19 @@ def main(arguments: Sequence[str]) -> int:
     own, options = list(arguments), []
     if "--" in own:
         own, options = own[: own.index("--")], own[own.index("--") + 1 :]
-    config = command.parse(BatchConfig, own, "mi_ring.batch")
+    try:
+        config = command.parse(BatchConfig, own, "mi_ring.batch")
+    except InputError as error:
+        if str(error).startswith("Unrecognized") and "--" not in arguments:
+            raise InputError(f"{error}; options of fits come after --, as in -- --preset fast") from None
+        raise
     if wrong := [option for option in options if option.split("=")[0] in OWN]:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
     jobs = jobs_of(config.scenes, config.out, options)
-    fit = parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+    try:
+        fit = parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+    except InputError as error:
+        raise InputError(f"options of fits, after --: {error}") from None
     need("ray", "mi-ring batch")
     set_variant("llvm_ad_rgb")
     with locked(config.out / "batch"), outliving_readers(), command.going_on():
@@ -124,6 +132,7 @@ def noting_the_end(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Itera
 def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
     """Fit them, and say what goes on."""
     before = {job.name: "waiting" for job in todo}
+    begun: dict[str, tuple[int, int]] = {}  #: by the iteration and the tries since
     with progress(None, "fits", total=len(todo), leave=True) as bar:
 
         def look() -> None:
@@ -134,6 +143,11 @@ def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) ->
                     changed, before[job.name] = True, record.state
                     bar.write(f"{job.name}: {record.state}{': ' * bool(record.message)}{record.message}")
                     bar.update(record.state in ("failed", "done"))
+                if record.state == "running":
+                    last = record.iteration, record.tries
+                    if begun.setdefault(job.name, last) != last:
+                        begun[job.name] = last
+                        bar.write(f"{job.name}: has died, goes on from iteration {record.iteration} or a little before")
             now = [f"{job.name} {job.progress}" for job in todo if before[job.name] == "running"]
             bar.set_postfix_str("; ".join(now))
             if changed:

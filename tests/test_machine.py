@@ -249,6 +249,22 @@ def test_a_signal_is_heard_without_a_word(capsys):
     assert "".join(capsys.readouterr()) == ""
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, capsys):
+    """Mitsuba does where it comes while one of our plugins is made."""
+    handler = signal.getsignal(number)
+    with pytest.raises(command.Interrupted) as stop, command.going_on():
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt as error:
+            raise InputError("scene.xml: failed to instantiate a plugin") from error
+    assert command.status_of(stop.value) == 128 + number and signal.getsignal(number) is handler
+    assert capsys.readouterr().err == "interrupted; the same command goes on\n"
+    with pytest.raises(InputError, match="no signal"), command.going_on():
+        raise InputError("no signal")
+    assert not command.interrupted()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")
 def test_a_command_whose_reader_has_gone_says_nothing():
     reading, writing = os.pipe()

@@ -124,6 +124,8 @@ def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[J
     for scene in scenes:
         require_file(scene, "the XML file of a scene")
         name = scene_name(scene)
+        if name in jobs and jobs[name].scene == scene.resolve():
+            raise InputError(f"{scene}: is given twice; give it once")
         if name in jobs or name == RECORDS:
             other = f"{jobs[name].scene} is" if name in jobs else "records of batches are"
             raise InputError(f"{scene}: its results would go to {out / name}, where {other} to be; rename it, or "

@@ -23,6 +23,7 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.metrics.evaluation import rounded
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.system.command import interrupted
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
 from mi_ring.system.optional import installed
@@ -83,6 +84,8 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
                 return Outcome(run, failed=record.message)
         return Outcome(run, made, measured(run, made), "")
     except Exception as error:  # of libraries, too: the other runs are worth more
+        if interrupted():
+            raise
         if not isinstance(error, InputError):
             traceback.print_exc(file=sys.stderr)
         return Outcome(run, failed=str(error) or type(error).__name__)

@@ -146,34 +146,42 @@ def status_of(stop: KeyboardInterrupt) -> int:
     return 128 + getattr(stop, "number", signal.SIGINT)
 
 
+COME: list[tuple[int, float]] = []  #: signals that have come within `going_on`, and when
+
+
+def interrupted() -> bool:
+    """Has a signal come that ends what is within `going_on`? Native code may have made an error of its own of it."""
+    return bool(COME)
+
+
 @contextlib.contextmanager
 def going_on() -> Iterator[None]:
     """For work that goes on where it was interrupted: says so if it is, by Ctrl-C or another signal that ends it.
 
-    Raises KeyboardInterrupt for all of them. In another thread than the main one only Ctrl-C is heard.
+    Raises Interrupted for all of them, whatever a library has made of it. Signals are heard in the main thread alone.
     """
-    come: list[tuple[int, float]] = []
+    COME.clear()
 
     def hear(number: int, frame: object) -> None:
-        before, now = come[-1][1] if come else -math.inf, time.monotonic()
-        come.append((number, now))
-        if now - before > REPEATS:  # shells, schedulers and the kernel send them more than once
+        before, now = COME[-1][1] if COME else -math.inf, time.monotonic()
+        COME.append((number, now))
+        if number == signal.SIGINT or now - before > REPEATS:  # shells, schedulers and the kernel send others again
             raise Interrupted(number)
 
     heard = []
     if threading.current_thread() is threading.main_thread():
-        others = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
-        heard = [number for number in others if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
+        known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        heard = [number for number in known if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
     before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, Exception) as stop:
+        if not (COME or isinstance(stop, KeyboardInterrupt)):
+            raise
         with contextlib.suppress(OSError):  # a terminal that is closed
             sys.stdout.flush()
             print("interrupted; the same command goes on", file=sys.stderr, flush=True)
-        if come and not isinstance(stop, Interrupted):  # a library has raised its own in the place of ours
-            raise Interrupted(come[0][0]) from stop
-        raise
+        raise Interrupted(COME[0][0] if COME else signal.SIGINT) from stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -169,7 +169,7 @@ def processor() -> str:
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {cores()} cores"
+    return f"{model}, {cores()} core{'s' * (cores() > 1)}"
 
 
 @contextlib.contextmanager
