@@ -396,7 +396,7 @@ assert "mi_ring" not in sys.modules
 np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
-    sensor = mitsuba_scene.first_photograph(run)
+    sensor, _ = mitsuba_scene.first_photograph(run)
     matrix, (fx, fy), (cx, cy), *_ = sensor.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
     light = Lights.of([sensor])[0]
@@ -420,7 +420,7 @@ def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
     torch.save(ring_state(bright, {"subdivisions": 4}), tmp_path / "ring.pt")
     (tmp_path / "scene.xml").write_text(small_capture.read_text())
     export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
-    intensity = Lights.of([mitsuba_scene.first_photograph(tmp_path)])[0].rgb
+    intensity = Lights.of(mitsuba_scene.first_photograph(tmp_path)[:1])[0].rgb
     stock = mi.load_file(str(tmp_path / "stock.xml"), parallel=False)
     boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
     assert boost.min() > 20

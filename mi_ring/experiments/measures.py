@@ -134,8 +134,8 @@ def with_slices(run: Run, made: Made) -> list[Row]:
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
     """Of slices (V, angles, 3) at as many points of the surface.
 
-    `slice_error`: |found − true| / true, what is darker than `BLACK` counting as that, mean over angles and channels,
-    median over the points [%].
+    `slice_error`: absolute value of found − true, by the true one or `BLACK` if that is more, mean over angles and
+    channels, median over the points [%].
     `right_material`: share of points [%] whose slice, as logarithms, is nearer to the true one than to that of the
     `other` material.
     """
