@@ -306,8 +306,11 @@ def test_checkpoints_of_before_go_with_the_settings_of_before(tmp_path):
     state["settings"]["weights"] = {"rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3}
     torch.save(state, tmp_path / "checkpoint.pt")
     assert checkpoint.read_checkpoint(tmp_path, config)["format"] == checkpoint.FORMAT
-    for change in ({"solver": "rk4"}, {"weights": {"material_rank": 0.1}}):
-        with pytest.raises(InputError, match=f"--{next(iter(change))}: was"):
+    for change, told in (
+        ({"solver": "rk4"}, "--solver: was euler before, is rk4 now"),
+        ({"weights": {"material_rank": 0.1}}, "--weights.material-rank: was 0.0 before, is 0.1 now"),
+    ):
+        with pytest.raises(InputError, match=told):
             checkpoint.read_checkpoint(tmp_path, Config(**change))
 
 
