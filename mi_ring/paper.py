@@ -79,13 +79,8 @@ def main(arguments: Sequence[str]) -> int:
         what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
     seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
     with command.going_on(), locked(out):
-        failed = perform(
-            EXPERIMENTS[config.name],
-            asked,
-            out,
-            config.only,
-            " ".join(["mi-ring paper", config.name, *what, settings]) + seeds,
-        )
+        said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
+        failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
     print(f"{out}/table.md and figure.png{runs}")
     return int(failed > 0)

@@ -14,21 +14,19 @@ from tqdm import tqdm
 
 from mi_ring.errors import InputError
 from mi_ring.fitting.budget import Costs, measure
-from mi_ring.fitting.checkpoint import digests, write_checkpoint
+from mi_ring.fitting.checkpoint import BEFORE, digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.processes import Lost
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
+from mi_ring.system.command import SIGNALS
 from mi_ring.system.optional import installed
 from mi_ring.system.progress import outliving_readers, progress
 
 CHECKPOINT_SECONDS = 30.0
 WORTH_MEASURING = 60  #: iterations: shorter fits do without knowing how long theirs take
-
-#: Signals that end a fit early: Ctrl-C, `kill` and schedulers, a terminal that is closed (not on Windows).
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @contextlib.contextmanager
@@ -163,7 +161,7 @@ def telling_how_to_go_on(folder: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if any((folder / name).is_file() for name in ("checkpoint.pt", "checkpoint.before.pt")):
+        if any((folder / name).is_file() for name in ("checkpoint.pt", BEFORE)):
             print(f"Dropped; {folder} has a checkpoint: go on with the same command and --resume")
         raise
 

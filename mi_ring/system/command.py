@@ -21,6 +21,8 @@ from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
 LONGEST = 800  #: message, in characters
+#: Signals that end a command: Ctrl-C, `kill` and schedulers, a terminal that is closed (not on Windows).
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 REPEATS = 5.0  #: seconds within which a signal that comes again is the same one
 
 
@@ -160,7 +162,6 @@ def going_on() -> Iterator[None]:
 
     Raises Interrupted for all of them, whatever a library has made of it. Signals are heard in the main thread alone.
     """
-    COME.clear()
 
     def hear(number: int, frame: object) -> None:
         before, now = COME[-1][1] if COME else -math.inf, time.monotonic()
@@ -170,8 +171,7 @@ def going_on() -> Iterator[None]:
 
     heard = []
     if threading.current_thread() is threading.main_thread():
-        known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-        heard = [number for number in known if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
+        heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
     before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield
@@ -185,6 +185,7 @@ def going_on() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        COME.clear()  # of what is over nothing is left to whoever asks
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
