@@ -43,7 +43,7 @@ class Config:
     what explains the photographs best in coarse fits."""
     seed: int = 0
     """Random seed."""
-    iterations: int = 360
+    iterations: int = 460
     """Number of iterations, shared out among the stages. From a hull or a mesh it is fewer, see --shares."""
     levels: tuple[int, ...] = (4, 5, 6)
     """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
@@ -206,7 +206,7 @@ PRESETS: dict[str, dict] = {
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
     },
     "default": {},
-    "fine": {"iterations": 1000, "shares": (0.3, 0.4, 0.3)},
+    "fine": {"iterations": 1400, "shares": (0.3, 0.4, 0.3)},
     "paper": {
         "iterations": 6000, "steps": 20, "levels": (5, 6), "widths": (512, 512), "shares": (1 / 3, 2 / 3), "spp": 4,
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
