@@ -1,14 +1,16 @@
 """Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw what is found.
 
-    python benchmarks/middlebury.py FOLDER [--light lamp] [--out out/middlebury] [-- OPTIONS OF FIT]
+    python benchmarks/middlebury.py FOLDER [--light lamp] [--halves] [--out out/middlebury] [-- OPTIONS OF FIT]
 
 FOLDER is the data set as it is unpacked, of a bright object before a dark background. Masks are what is brighter than a
 tenth of full scale, closed and filled: shadows on the object belong to it. Every eighth photograph is kept out; printed
 is the PSNR of these over the object's pixels, as sRGB. The picture shows some photographs as predicted, and normals.
+With `--halves` two fits instead, of every second photograph each: how far their surfaces are apart is their precision.
 """
 
 import argparse
 import datetime
+import json
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -76,34 +78,54 @@ def draw(run: Path, picture: Path) -> list[float]:
     return found
 
 
+def half_of(scene: Path, first: int) -> Path:
+    """A scene of every second photograph of another, from the `first` on, beside it."""
+    tree, half = ElementTree.parse(scene), scene.with_name(f"half{first}.xml")
+    for sensor in tree.getroot().findall("sensor")[1 - first :: 2]:
+        tree.getroot().remove(sensor)
+    tree.write(half)
+    return half
+
+
+def fit(scene: Path, run: Path, *options: object) -> str:
+    """Fit a scene into a folder; returns the command's arguments."""
+    arguments = [scene, "--out", run, *options]
+    subprocess.run([sys.executable, "-m", "mi_ring.fit", *map(str, arguments)], check=True)
+    return " ".join(map(str, arguments))
+
+
+def apart(runs: list[Path]) -> str:
+    """How far the surfaces of two fits are apart, both ways."""
+    found = []
+    for run, other in (runs, runs[::-1]):
+        command = ["-m", "mi_ring.evaluate", run, "--mesh", other / "mesh.ply", "--seen"]
+        found.append(json.loads(subprocess.check_output([sys.executable, *map(str, command)])))
+    names = {"normal_mean": "normals, mean °", "normal_median": "median °", "depth_mean": "depth, mean %",
+             "depth_median": "median %", "chamfer": "Chamfer distance, % of the diagonal"}  # fmt: skip
+    return ", ".join(f"{words} {found[0][name]:.2f} / {found[1][name]:.2f}" for name, words in names.items())
+
+
 def main() -> None:
     """The command."""
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--light", default="lamp")
+    parser.add_argument("--halves", action="store_true", help="two fits of every second photograph each")
     parser.add_argument("--out", type=Path, default=Path("out/middlebury"))
     args, options = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
     scene = masked_scene(args.folder, args.out)
-    run = args.out / args.light
-    command = [
-        sys.executable,
-        "-m",
-        "mi_ring.fit",
-        scene,
-        "--light",
-        args.light,
-        "--holdout",
-        8,
-        "--out",
-        run,
-        *options,
-    ]
-    subprocess.run(list(map(str, command)), check=True)
-    found = draw(run, args.out / f"{args.light}.jpg")
+    usual = ["--light", args.light, *options]
+    if args.halves:
+        runs = [args.out / f"{args.light}-half{first}" for first in (0, 1)]
+        told = " and ".join(fit(half_of(scene, first), run, *usual) for first, run in enumerate(runs))
+        found = apart(runs)
+    else:
+        run = args.out / args.light
+        told = fit(scene, run, "--holdout", 8, *usual)
+        found = "kept out " + ", ".join(f"{value:.1f} dB" for value in draw(run, args.out / f"{args.light}.jpg"))
     speed = product_speed(4096, 4096, torch.float32) / 1e9
-    print(f"{processor()}, {speed:.0f} GFLOP/s; {datetime.date.today()}; {' '.join(map(str, command[3:]))}: kept out "
-          + ", ".join(f"{value:.1f} dB" for value in found))  # fmt: skip
+    print(f"{processor()}, {speed:.0f} GFLOP/s; {datetime.date.today()}; mi_ring.fit {told}: {found}")
 
 
 if __name__ == "__main__":
