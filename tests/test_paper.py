@@ -270,6 +270,14 @@ def test_numbers_that_are_none_are_shown():
     assert "| egg | mean of 1 of 2 | ours | nan |  |" in text and "| egg |  | somebody | 5.00 |  |" in text
 
 
+def test_a_mean_is_of_numbers_that_all_have():
+    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    other = dataclasses.replace(run, name="b", labels={"capture": "egg", "seed": 1})
+    outcomes = [Outcome(run, None, [{"normal_mean": 1.0, "iou": 0.5}], ""), Outcome(other, None, [{"iou": 0.7}], "")]
+    mean = tables.means(trial([run, other]), outcomes)
+    assert mean == [{"capture": "egg", "seed": "mean of 2", "by": "ours", "state": "", "iou": pytest.approx(0.6)}]
+
+
 # What is measured, and the captures.
 
 

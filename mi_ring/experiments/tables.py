@@ -30,7 +30,10 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Of runs that differ in one label alone, a row with the mean of each number, over those that are done."""
+    """Of runs that differ in one label alone, a row with the mean of each number, over those that are done.
+
+    A number that only some of them have is left out: its mean would be of others than the row says.
+    """
     over, groups = experiment.mean_over, dict[tuple, list[Outcome]]()
     for outcome in outcomes:
         if over in outcome.run.labels:
@@ -40,9 +43,9 @@ def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
     for key, group in groups.items():
         rows = [row for outcome in group for row in outcome.rows]
         if len(group) > 1 and rows:
-            found = {name: [row[name] for row in rows if name in row] for name in experiment.columns}
             count = f"mean of {len(rows)}" + f" of {len(group)}" * (len(rows) < len(group))
-            mean = {name: sum(values) / len(values) for name, values in found.items() if values}
+            shared = [name for name in experiment.columns if all(name in row for row in rows)]
+            mean = {name: sum(row[name] for row in rows) / len(rows) for name in shared}
             result.append({**dict(key), str(over): count, "by": OURS, "state": "", **mean})
     return result
 
