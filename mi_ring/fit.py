@@ -71,7 +71,7 @@ def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | 
     require_scene(config.scene)
     variant: Any = set_variant(config.variant)
     config, *choice = (dataclasses.replace(c, variant=variant) for c in (config, *choice))
-    if config.minutes and config.resume:
+    if config.resume:
         config = planned_before(config, choice, config.folder)
     return config, choice, read_checkpoint(config.folder, config) if config.resume else None
 
@@ -114,7 +114,10 @@ def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path)
     except (ValueError, LookupError, TypeError, OverflowError):
         return config  # its checkpoint tells what is wrong
     if minutes != config.minutes:
-        raise InputError(f"{folder}: --minutes: was {minutes:g} before, is {config.minutes:g} now; give the same")
+        said = [f"{value:g}" if value else "not given" for value in (minutes, config.minutes)]
+        raise InputError(f"{folder}: --minutes: was {said[0]} before, is {said[1]} now; give the same")
+    if not minutes:
+        return config
     config = next((c for c in choice if c.preset == preset), config)
     return dataclasses.replace(config, iterations=iterations)
 

@@ -1,7 +1,6 @@
 """The options of a fit: its settings, what it is of, where its results go and what computes it."""
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,9 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Config, as_typed
 from mi_ring.output import results
 from mi_ring.system import command
+
+MOST_THREADS = 1024  #: of a fit
+MOST_MINUTES = 10_000  #: a week
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +46,10 @@ class FitConfig(Config, Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.threads < 0:
-            raise InputError(f"--threads: is {self.threads}, must be 0 or more")
-        if not 0 <= self.minutes < math.inf:
-            raise InputError(f"--minutes: is {self.minutes}, must be 0 or more")
+        if not 0 <= self.threads <= MOST_THREADS:
+            raise InputError(f"--threads: is {self.threads}, must be 0 to {MOST_THREADS}")
+        if not 0 <= self.minutes <= MOST_MINUTES:
+            raise InputError(f"--minutes: is {self.minutes:g}, must be 0 to {MOST_MINUTES}")
         if self.minutes and self.deterministic:
             raise InputError("--deterministic: does not go with --minutes, by which the machine's speed decides")
         if self.deterministic and self.variant != "llvm_ad_rgb":

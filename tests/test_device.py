@@ -9,8 +9,10 @@ import torch
 from test_fit import QUICK, distance
 from torch.nn import functional as F
 
+import mi_ring
 from mi_ring import fit
 from mi_ring.errors import InputError
+from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.terms import mask_loss, rgb_loss, velocity_loss
 from mi_ring.nets.brdfnet import BRDFNet
 from mi_ring.nets.shapenet import ShapeNet
@@ -52,6 +54,7 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
     "amx, bf16, name, told, expected",
     [
         (True, True, "Intel Xeon", None, True), (True, True, "Intel Xeon", "AVX512_CORE", False),
+        (True, True, "a system without its registers", None, False),
         (True, True, "Intel Xeon", "avx512_core_amx", True), (False, True, "Intel Xeon", None, False),
         (False, True, "AMD EPYC", None, True), (False, False, "AMD EPYC", None, False),
         (False, True, "AMD EPYC", "AVX512_CORE", False), (False, True, "AMD EPYC", "AVX512_CORE_BF16", True),
@@ -60,6 +63,7 @@ def test_networks_and_losses_stay_on_the_device_of_their_input():
 def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, bf16, name, told, expected, monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setattr(torch.cpu, "_init_amx", lambda: name != "a system without its registers")
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: bf16)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": name}, raising=False)
     if told:
@@ -69,6 +73,10 @@ def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, bf16, name, tol
     for precision, used in (("auto", expected), ("bfloat16", True), ("float32", False)):
         with machine.autocast(precision, torch.device("cpu"))():
             assert torch.is_autocast_enabled("cpu") == used
+        # Muon never where the processor is slower with it.
+        networks = mi_ring.Ring(torch.zeros(3), 1.0)
+        _, muon = optimizers_of(networks, mi_ring.Config(precision=precision), torch.device("cpu"))
+        assert muon.dtype == (torch.bfloat16 if expected and precision != "float32" else torch.float32)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")

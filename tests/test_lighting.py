@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ from mi_ring.rendering import bridge
 from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Lights
 from mi_ring.rendering.rooms import BASIS, frames_of, seen_from_within
-from mi_ring.rendering.shading import is_room
+from mi_ring.rendering.shading import is_room, lamps
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
@@ -148,16 +149,37 @@ def test_cameras_are_refined_under_unknown_light(in_an_environment, tmp_path):
     assert not rgb.any() and coverage.any()
 
 
-def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environment):
-    """Without a light of their own nothing says how much the object reflects: the fit begins with a half."""
+def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environment, tmp_path):
+    """As harmonics, which by hand are 1 + 2 · 1/4 in the mean and 2 · 2π/3 · √(3/4π) about its brightest direction.
+
+    It says how much the object reflects, which is a half; and stays in the scene file as it is.
+    """
     scene = in_an_environment.with_name("known.xml")
-    lamp = '<emitter type="envmap"><string name="filename" value="../lobe.exr"/></emitter></scene>'
+    exact = ElementTree.parse(scene.parent / "truth/exact.xml").getroot()
+    scale = exact.find("emitter[@type='envmap']/float[@name='scale']").get("value")
+    lamp = f'<string name="filename" value="../lobe.exr"/><float name="scale" value="{scale}"/>'
+    lamp = f'<emitter type="envmap">{lamp}</emitter></scene>'
     scene.write_text(in_an_environment.read_text().replace("</scene>", lamp))
     capture = mi_ring.load_capture(scene)
-    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 4}))
-    assert fit.albedo == pytest.approx(0.5) and fit.calibration.refined == ("gain",)
-    assert all(np.isfinite(it.loss) for it in fit)
-    assert fit.calibrated().photographs.room is None
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY))
+    assert fit.calibration.refined == ("gain",)
+    environment = fit.environment.mean(1) / float(scale)
+    assert environment[0] == pytest.approx(1.5 * np.sqrt(4 * np.pi), rel=1e-2)
+    y, z, x = environment[1:4] / (4 * np.pi / 3 * np.sqrt(3 / 4 / np.pi))
+    np.testing.assert_allclose([-x, -y, z], TOWARD, atol=2e-2)  # Dr.Jit's harmonics of degree 1 are as −y, z, −x
+    losses = [it.terms["rgb"] for it in fit]
+    assert np.mean(losses[-5:]) < 0.4 * losses[0]  # where the light is right from the beginning
+    material = fit.ring.material(fit.ring.domain.sample(3)[0])
+    assert (np.pi * material["diffuse"].mean() + 4 * material["specular"].mean()).item() == pytest.approx(0.5, abs=0.05)
+    fit.save(tmp_path)
+    again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
+    assert [lamp.class_name() for lamp in lamps(again.scene)] == ["EnvironmentMapEmitter"]
+    assert again.photographs.room is None and not (tmp_path / "environment.exr").exists()
+
+    # Without masks it may be what is seen beside the object.
+    bare = replace(capture, masks=[None] * len(capture))
+    fit = mi_ring.Fit(bare, mi_ring.Config.preset("fast", **TINY))
+    assert fit.environment is None and np.isfinite(fit.step().loss)
     with pytest.raises(InputError, match="--refine power: is of the photographs' own lights, of which there are none"):
         mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, refine=("power",)))
     with pytest.raises(InputError, match="take the lamps of the scene out"):

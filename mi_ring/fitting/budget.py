@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 from mi_ring.fitting.config import Config
@@ -17,10 +17,11 @@ Settings = TypeVar("Settings", bound=Config)
 Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and width of its stage
 
 
-def measure(fit: Fit, stages: Iterable[Stage]) -> Costs:
+def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
     """What an iteration of each stage takes: the second of two, for the first has to warm up.
 
-    They are those of another fit, which goes on from the state of this one and is dropped.
+    They are those of another fit, which goes on from the state of this one and is dropped. Nothing of it, once it was
+    `interrupted`.
     """
     print("Measuring what iterations take on this machine", flush=True)
     trial = Fit(fit.capture, fit.config, terms=fit.terms, state=fit.state())
@@ -29,7 +30,10 @@ def measure(fit: Fit, stages: Iterable[Stage]) -> Costs:
     for stage in stages:
         trial.stages = [stage._replace(first=0, last=trial.iterations)]
         for _ in range(2):
-            trial.random.set_state(random)  # the same photographs, which are remembered, as later in a fit
+            if interrupted():
+                return {}
+            trial.random.set_state(random)
+            trial.rounds.waiting = {}  # the same photographs, which are remembered, as later in a fit
             trial.iteration = max(0, trial.iterations - 2)  # the last one does more
             started = time.perf_counter()
             trial.step()

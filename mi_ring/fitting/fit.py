@@ -21,7 +21,7 @@ from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.lighting import Lighting, frames, lighting_of, lit
+from mi_ring.fitting.lighting import Lighting, frames, lighting_of, lit, smoothed
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
@@ -99,7 +99,9 @@ class Fit:
             recompute_normals(capture.scene)
         lighting = Lighting(*state["lighting"]) if state else lighting  # under which `capture` is
         self.lighting = lighting or lighting_of(capture.part(self.fitted), self.config, Fit)
-        capture = self.capture = lit(capture, self.lighting)
+        #: `environment`: harmonics of what the scene says of one, if it says so.
+        self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
+        capture = self.capture
         chosen = replace(self.config, light=self.lighting.kind)
         self.random = torch.Generator().manual_seed(self.config.seed)
         torch.manual_seed(self.config.seed)
@@ -114,7 +116,7 @@ class Fit:
         self.albedo = math.pi * seen.reflectance(self.ring.center.cpu().numpy(), self.exposure)
         self.device = device()
         self.ring.to(self.device)
-        self.surface = bridge.Surface(capture.scene, capture.shape, self.ring)
+        self.surface = bridge.Surface(scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
         self.calibration: Calibration | None = None

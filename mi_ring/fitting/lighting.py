@@ -17,7 +17,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS, frames_of
+from mi_ring.rendering.rooms import BASIS, frames_of, without_environment
 from mi_ring.rendering.shading import lamps
 from mi_ring.system.progress import progress
 
@@ -156,6 +156,22 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
     dark = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
     return with_calibration(capture, cameras, dark, room=harmonics, falloff=[0.0] * len(cameras),
                             gains=exposures(capture))  # fmt: skip
+
+
+def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
+    """The capture with the environment that its scene says among its room's harmonics, and the scene without it.
+
+    And these harmonics (BASIS, 3); None if there are none. What a surface reflects of them has no noise. That the
+    environment may be seen beside the object, which is not predicted then, does not matter where all photographs have
+    masks; else it stays as it is, to be sampled, and where the reflectance is another than `cooktorrance`.
+    """
+    if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
+        return capture, capture.scene, None
+    scene, known = without_environment(capture.scene)
+    if known is None:
+        return capture, scene, None
+    room = known if capture.photographs.room is None else capture.photographs.room + known
+    return replace(capture, photographs=replace(capture.photographs, room=room)), scene, known
 
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:

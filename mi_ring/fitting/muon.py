@@ -1,9 +1,12 @@
 """Muon: steps of orthogonalised momentum, for weight matrices."""
 
 from collections.abc import Iterable
+from functools import partial
 
 import torch
 from torch import Tensor
+
+from mi_ring.nets.chunks import in_parallel
 
 #: Coefficients of the quintic of Newton and Schulz, and how often it is applied (Jordan et al. 2024, "Muon: an
 #: optimizer for hidden layers in neural networks").
@@ -24,14 +27,19 @@ class Muon(torch.optim.Optimizer):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step. A tall matrix takes a longer one, by the root of how much taller it is."""
         for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is None:
-                    continue
+            params = [p for p in group["params"] if p.grad is not None]
+            updates = []
+            for p in params:
                 state = self.state[p]
                 if not state:
                     state["momentum_buffer"] = torch.zeros_like(p.grad)
                 momentum = state["momentum_buffer"].lerp_(p.grad, 1 - group["momentum"])
-                update = orthogonalised(p.grad.lerp(momentum, group["momentum"]), self.dtype)
+                updates.append(p.grad.lerp(momentum, group["momentum"]))
+            if updates and updates[0].device.type == "cpu":  # small matrices: one per thread is faster than one by all
+                updates = in_parallel(torch.no_grad()(partial(orthogonalised, dtype=self.dtype)), updates)
+            else:
+                updates = [orthogonalised(update, self.dtype) for update in updates]
+            for p, update in zip(params, updates):
                 ratio = max(1.0, p.shape[0] / p.shape[1]) ** 0.5
                 p.add_(update.to(p.dtype), alpha=-group["lr"] * ratio)
 

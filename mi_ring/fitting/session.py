@@ -128,7 +128,7 @@ class Keeper:
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
     """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
-        costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration])
+        costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration], interrupted)
     work = [(costs or {}).get((s.level, s.width), 1.0) for s in fit.stages for _ in range(s.first, s.last)]
     bar = progress(
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,

@@ -24,12 +24,13 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Ten
     needs of very many points would be most of a fit's memory: it is computed anew, chunk by chunk.
     """
     chunks = 1
+    ctx.again = forward if keep and len(x) > KEPT and x.device.type == "cpu" else None
     if x.device.type == "cpu":
         threads = torch.get_num_threads()
-        chunks = threads * -(-len(x) // (threads * CHUNK))
+        most = max(1, min(CHUNK, KEPT // threads)) if ctx.again else CHUNK  # all threads are at work at once
+        chunks = threads * -(-len(x) // (threads * most))
     parts = x.detach().tensor_split(max(1, min(chunks, len(x))))
     ctx.sizes = [len(part) for part in parts]
-    ctx.again = forward if keep and len(x) > KEPT and x.device.type == "cpu" else None
     own = torch.no_grad()(partial(forward, keep=keep and not ctx.again))
     values, kept = zip(*in_parallel(own, parts))
     ctx.kept = parts if ctx.again else kept

@@ -25,6 +25,7 @@ from mi_ring.ring.saved import ring_state
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
+ROUNDED = 1e-5  #: share of an environment by which a room may differ from it and be nothing but it
 PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
 VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
 
@@ -137,7 +138,7 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
-        scene = recalibrated_xml(scene, capture.sensors, capture.photographs.room, frames)
+        scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames)
     if fit.outlines:
         scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
@@ -158,6 +159,15 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
         print(f"Photographs kept out: {calibration_panel.held_out_text(fit.confirmed)}")
     write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
+
+
+def found_room(fit: Any, capture: Capture) -> np.ndarray | None:
+    """The room of a fit's capture without the environment that its scene file has besides."""
+    room = capture.photographs.room
+    if room is None or fit.environment is None:
+        return room
+    own = room - fit.environment
+    return own if np.abs(own).max() > ROUNDED * np.abs(fit.environment).max() else None
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:

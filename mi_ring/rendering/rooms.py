@@ -6,13 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.rendering.shading import is_room
+from mi_ring.rendering.scenes import assembled, own_emitters
+from mi_ring.rendering.shading import is_room, lamps
 
 ORDER = 4  #: of the harmonics, at most
 COUNT = (ORDER + 1) ** 2
 #: Of the world's harmonics and the camera's, without the camera's first: it is the world's.
 BASIS = 2 * COUNT - 1
 ROWS = 128  #: of a picture of a room by latitude and longitude
+FINE_ROWS = 512  #: of one that must not miss the sun
 FRAMES = {"world": [*range(COUNT)], "camera": [0, *range(COUNT, BASIS)]}  #: which of them are in these axes
 
 
@@ -34,6 +36,42 @@ def room_of(scene) -> np.ndarray | None:
         harmonics = np.array(room.harmonics).reshape(-1, 3)
         total[FRAMES[room.frame][: len(harmonics)]] += harmonics
     return total if rooms else None
+
+
+def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
+    """A scene without its `envmap` or `constant` emitters, and their harmonics (BASIS, 3), in the world's axes.
+
+    The same scene and None if it has none.
+    """
+    found = [lamp for lamp in lamps(scene) if lamp.is_environment()]
+    if not found:
+        return scene, None
+    others = [emitter for emitter in own_emitters(scene) if emitter not in found]
+    own = assembled(scene.shapes(), others, scene.sensors(), scene.integrator())
+    return own, sum(map(harmonics_of, found), np.zeros((BASIS, 3)))
+
+
+def harmonics_of(environment) -> np.ndarray:
+    """(BASIS, 3) radiance in each harmonic of an emitter that is infinitely far away."""
+    directions, angles = directions_of(FINE_ROWS)
+    toward, si = mi.Vector3f(*directions.T), dr.zeros(mi.SurfaceInteraction3f, len(angles))
+    si.wi = -toward
+    radiance, basis = (
+        np.stack([np.asarray(dr.detach(value) + dr.zeros(mi.Float, len(angles))) for value in values])
+        for values in (environment.eval(si), dr.sh_eval(toward, ORDER))
+    )
+    room = np.zeros((BASIS, 3))
+    room[:COUNT] = (basis * angles) @ radiance.T
+    return room
+
+
+def directions_of(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the pixels of a map by latitude and longitude, as Mitsuba's `envmap` has it, with y up and -z in the middle of
+    its left and right borders: directions (2 rows², 3) and the solid angles (2 rows²,) about them."""
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
+    directions = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
+    return directions, np.sin(theta) * (np.pi / rows) ** 2
 
 
 def frames_of(scene) -> set[str]:
@@ -88,11 +126,8 @@ def seen_from_within(room: np.ndarray, to_world: np.ndarray, rows: int = ROWS) -
 
     A sum of few harmonics may be less than zero, and is so here.
     """
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
-    theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
-    # Mitsuba's: y up, and -z in the middle of the picture's borders
-    direction = mi.Vector3f(*(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)))
-    which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(theta), 3))
-    for k, harmonic in zip(which, harmonics_toward(direction, mi.Matrix4f(to_world), which)):
-        values += np.asarray(dr.detach(harmonic) + dr.zeros(mi.Float, len(theta)))[:, None] * room[k]
+    directions, _ = directions_of(rows)
+    which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))
+    for k, harmonic in zip(which, harmonics_toward(mi.Vector3f(*directions.T), mi.Matrix4f(to_world), which)):
+        values += np.asarray(dr.detach(harmonic) + dr.zeros(mi.Float, len(directions)))[:, None] * room[k]
     return values.reshape(rows, 2 * rows, 3)

@@ -41,7 +41,7 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     told = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
     if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):
         return False
-    if torch.cpu._is_amx_tile_supported():
+    if torch.cpu._is_amx_tile_supported() and torch.cpu._init_amx():  # which asks the system for its registers
         return told == "DEFAULT" or "AMX" in told
     # By AVX512-BF16 alone products are twice as fast as in float32 on AMD's (Zen 4), half as fast on Intel's.
     told_of: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # from PyTorch 2.10 on
