@@ -24,7 +24,7 @@ from accuracy import alone, peak_memory, processor, table, watch
 from mi_ring.fitting.config import Config
 
 VARIED = {
-    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (3, 10, 20), "spp": (4,),
+    "level": (3, 4, 6), "width": (64, 128, 512), "batch": (2, 4, 16), "steps": (5, 10, 20), "spp": (4,),
     "photographs": (500, 2000),
 }  # fmt: skip
 WARM_UP, ITERATIONS = 3, 7

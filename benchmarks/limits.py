@@ -1,6 +1,6 @@
 """Print, as Markdown with machine and date, the two limits of a fit's speed and how near it comes to them.
 
-    python benchmarks/limits.py [SCENE.xml] [--level 5] [--steps 5]
+    python benchmarks/limits.py [SCENE.xml] [--level 5] [--steps 3]
 
 The flow: arithmetic of one forward and backward pass of Shape-Net (three products per weight, step and vertex) over its
 time, against the speed of plain products: of large square matrices, and of the hidden layers' own shape. The renderer:

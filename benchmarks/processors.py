@@ -2,14 +2,16 @@
 
     python benchmarks/processors.py [SCENE.xml]
 
-The stages are those of the default preset; the first line is the floor, 642 vertices and photographs 128 pixels wide.
-As far as PyTorch goes a server then behaves like a laptop; Dr.Jit's kernels stay as they are. Each line is a process of
-its own, the kinds in turn; speed is that of a float32 product of 4096³ in the same process.
+The stages are those of the default preset, the last of which needs a scene of photographs 512 pixels wide; the first
+line is the floor, 642 vertices and photographs 128 pixels wide. As far as PyTorch goes a server then behaves like a
+laptop; Dr.Jit's kernels stay as they are. Each line is a process of its own, the kinds in turn; speed is that of a
+float32 product of 4096³ in the same process.
 """
 
 import argparse
 import datetime
 import os
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from accuracy import alone, processor, product_speed, table
@@ -38,6 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scene", nargs="?", type=Path, default=Path("scenes/pot2.xml"))
     scene = parser.parse_args().scene
+    widest = max(int(width.get("value")) for width in ElementTree.parse(scene).findall("sensor/film/*[@name='width']"))
     rows, names = [], []
     for level, width in STAGES:
         settings = {"level": level, "width": width, "batch": Config.batch, "steps": Config.steps, "spp": Config.spp}
@@ -47,7 +50,9 @@ def main() -> None:
             names = list(parts)
             shares = [f"{1000 * s:.0f} ({s / total:.0%})" for s in (*parts.values(), total - sum(parts.values()))]
             speed = f"{measured['speed'] / 1e9:.0f}"
-            rows.append([f"{level} ({10 * 4**level + 2:,}), {width}", kind, *shares, f"{1000 * total:.0f}", speed])
+            rows.append(
+                [f"{level} ({10 * 4**level + 2:,}), {min(width, widest)}", kind, *shares, f"{1000 * total:.0f}", speed]
+            )
     print(f"{processor()}; {datetime.date.today()}; {scene}\n")
     heads = ["level (vertices), width", "processor", *(f"{part}, ms" for part in names), "rest, ms", "iteration, ms"]
     print(table([*heads, "GFLOP/s"], rows))

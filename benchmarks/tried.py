@@ -1,17 +1,19 @@
 """Print, as Markdown with machine and date, ways to compute the same thing faster: as it is, and as it was tried.
 
-    python benchmarks/tried.py [--level 5] [--steps 5]
+    python benchmarks/tried.py [--level 5] [--steps 3]
 
 Of settings that change the result, see choices.py.
 """
 
 import argparse
 import datetime
+import functools
 import time
 
 from accuracy import alone, median_seconds, peak_memory, processor, table, there_and_back
 
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.muon import orthogonalised
 from mi_ring.geometry.domain import Sphere
 from mi_ring.images import blur
 from mi_ring.nets import chunks, mlp, shapenet
@@ -125,6 +127,10 @@ def main() -> None:
             there_and_back(by_autograd(brdf_net), s, AUTOCAST))  # fmt: skip
     compare("flow: chunks of 2,048 points instead of 8,192 at most", there_and_back(net, s, AUTOCAST),
             chunked(net, s, 2048))  # fmt: skip
+    matrices = [torch.randn(256, 256) for _ in range(8)]
+    own = torch.no_grad()(functools.partial(orthogonalised, dtype=DTYPE))
+    compare("Muon: eight matrices one after the other, each by all threads", lambda: chunks.in_parallel(own, matrices),
+            lambda: [own(matrix) for matrix in matrices])  # fmt: skip
     kept = median_seconds(there_and_back(net, s, AUTOCAST))[0]
     rows.append(["flow: freed memory returned to the system", f"{1000 * kept:.3g}", f"{1000 * returned:.3g}",
                  "one after the other, not in turn"])  # fmt: skip

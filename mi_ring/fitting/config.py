@@ -105,7 +105,7 @@ class Config:
     """The learning rates fall exponentially to this share; those of cameras to a half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Precision of matrix products, of networks and of Muon. auto: bfloat16 where that is faster (processors with AMX,
-    AMD's from Zen 4 on, newer GPUs)."""
+    AMD's from Zen 4 on with PyTorch 2.10 or newer, newer GPUs). Muon's are never in one that is slower."""
     subdivisions: int = 6
     """Level of the mesh that is written."""
     refine: tuple[Unknown, ...] = ("auto",)
