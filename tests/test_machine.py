@@ -249,8 +249,18 @@ def test_a_signal_is_heard_without_a_word(capsys):
     assert "".join(capsys.readouterr()) == ""
 
 
+@pytest.fixture
+def heard_signals():
+    """None is ignored, as Ctrl-C is in what a script's shell runs in the background."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, capsys):
+def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, capsys, heard_signals):
     """Mitsuba does where it comes while one of our plugins is made."""
     handler = signal.getsignal(number)
     with pytest.raises(command.Interrupted) as stop, command.going_on():
