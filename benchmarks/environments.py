@@ -15,7 +15,6 @@ views stands beside them.
 import argparse
 import datetime
 import json
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +29,7 @@ import torch
 from accuracy import processor, product_speed, table
 
 from mi_ring.images import read_image, write_image
-from mi_ring.rendering.rooms import BASIS, COUNT, ORDER, seen_from_within
+from mi_ring.rendering.rooms import BASIS, COUNT, ORDER, directions_of, seen_from_within
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
@@ -39,9 +38,7 @@ RELIT, SMOOTH = 4, 256  #: photographs under another light, and paths per pixel,
 
 def directions(rows: int = ROWS) -> np.ndarray:
     """(rows, 2 rows, 3) of a map by latitude and longitude as Mitsuba's `envmap` has it, y up."""
-    polar, azimuth = np.meshgrid((np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows,
-                                 indexing="ij")  # fmt: skip
-    return np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)], -1)
+    return directions_of(rows)[0].reshape(rows, 2 * rows, 3)
 
 
 def window(away: np.ndarray, azimuth: float, elevation: float, size: tuple[float, float], rgb: tuple) -> np.ndarray:
@@ -68,9 +65,8 @@ def maps() -> dict[str, np.ndarray]:
 
 def as_harmonics(radiance: np.ndarray) -> np.ndarray:
     """(BASIS, 3) of a map, by a sum over its pixels."""
-    away = directions(len(radiance)).reshape(-1, 3).astype(np.float32)
-    weight = np.sqrt(1 - away[:, 1] ** 2) * (math.pi / len(radiance)) ** 2
-    values = dr.sh_eval(mi.Vector3f(*away.T), ORDER)
+    away, weight = directions_of(len(radiance))
+    values = dr.sh_eval(mi.Vector3f(*away.T.astype(np.float32)), ORDER)
     basis = np.stack([np.array(value) + np.zeros(len(away)) for value in values])
     room = np.zeros((BASIS, 3))
     room[:COUNT] = basis * weight @ radiance.reshape(-1, 3)
