@@ -1,6 +1,6 @@
 """Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw what is found.
 
-    python benchmarks/middlebury.py FOLDER [--light lamp] [--halves] [--out out/middlebury] [-- OPTIONS OF FIT]
+    python benchmarks/middlebury.py FOLDER [--light lamps] [--halves] [--out out/middlebury] [-- OPTIONS OF FIT]
 
 FOLDER is the data set as it is unpacked, of a bright object before a dark background. Masks are what is brighter than a
 tenth of full scale, closed and filled: shadows on the object belong to it. Every eighth photograph is kept out; printed
@@ -110,7 +110,7 @@ def main() -> None:
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--light", default="lamp")
+    parser.add_argument("--light", default="lamps")
     parser.add_argument("--halves", action="store_true", help="two fits of every second photograph each")
     parser.add_argument("--out", type=Path, default=Path("out/middlebury"))
     args, options = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]

@@ -16,7 +16,8 @@ def main(arguments: Sequence[str]) -> None:
         write_capture(config)
     out = config.out
     said = "" if config.exact else f"\nWhat its calibration should say is in {out}/truth/exact.xml."
-    light = " --light environment" if config.environment and config.wrong_room else ""
+    unknown = "environment" if config.environment else "lamps" if config.lamps > 1 else ""
+    light = f" --light {unknown}" if unknown and config.wrong_room else ""
     print(f"{out}/scene.xml, and the true surface in {out}/truth/mesh.ply{said}\n"
           f"Now: mi-ring check {out}/scene.xml; mi-ring fit {out}/scene.xml{light}")  # fmt: skip
 

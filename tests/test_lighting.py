@@ -25,7 +25,7 @@ from mi_ring.rendering import bridge
 from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Lights
 from mi_ring.rendering.rooms import BASIS, frames_of, seen_from_within
-from mi_ring.rendering.shading import is_room, lamps
+from mi_ring.rendering.shading import is_room, shared_emitters
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
@@ -173,7 +173,7 @@ def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environ
     assert (np.pi * material["diffuse"].mean() + 4 * material["specular"].mean()).item() == pytest.approx(0.5, abs=0.05)
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
-    assert [lamp.class_name() for lamp in lamps(again.scene)] == ["EnvironmentMapEmitter"]
+    assert [lamp.class_name() for lamp in shared_emitters(again.scene)] == ["EnvironmentMapEmitter"]
     assert again.photographs.room is None and not (tmp_path / "environment.exr").exists()
 
     # Without masks it may be what is seen beside the object.
@@ -186,7 +186,7 @@ def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environ
         mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
 
 
-@pytest.mark.parametrize(("light", "refine"), [("environment", "power"), ("auto", "scale"), ("lamp", "falloff")])
+@pytest.mark.parametrize(("light", "refine"), [("environment", "power"), ("auto", "scale"), ("lamps", "falloff")])
 def test_what_does_not_go_together_is_said(light, refine, in_an_environment):
     capture = mi_ring.load_capture(in_an_environment)
     with pytest.raises(InputError, match=f"--refine {refine}: is of the photographs' own lights, in the place of"):
@@ -208,7 +208,7 @@ def test_a_flash_that_pairs_tell_is_no_unknown_light(in_an_environment):
 def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_environment):
     flashed, dark = mi_ring.load_capture(small_capture), mi_ring.load_capture(in_an_environment)
     assert refined_of(flashed, mi_ring.Config(refine=("auto", "gain")), 0.5) == ("light", "gain", "ambient")
-    assert refined_of(flashed, mi_ring.Config(light="lamp", refine=("auto", "power")), 0.5) == (
+    assert refined_of(flashed, mi_ring.Config(light="lamps", refine=("auto", "power")), 0.5) == (
         "light", "power", "ambient",
     )  # fmt: skip
     assert refined_of(dark, mi_ring.Config(), 0.5) == ("gain", "ambient")
@@ -270,7 +270,7 @@ def test_a_lamp_is_one_for_all_and_as_strong_as_makes_the_albedo_a_half(small_ca
     lights = lamp.photographs.lights
     np.testing.assert_allclose(lights.positions(), np.broadcast_to(place, (12, 3)), rtol=1e-6)
     assert np.pi * lamp.reflectance(capture.sphere()[0], capture.exposure()) == pytest.approx(0.5, rel=1e-5)
-    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamp"))
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamps"))
     assert fit.calibration.refined == ("light", "gain", "ambient")
     assert len(fit.calibration.light) == 1  # one place for all photographs
 

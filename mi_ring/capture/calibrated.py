@@ -1,6 +1,6 @@
 """A capture whose cameras and lights are others than its scene file says."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,18 +11,19 @@ from mi_ring.geometry.camera import Camera, moved_pose
 from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Light, Lights
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.scenes import with_lamps
 
 
 def with_calibration(
     capture: Capture, cameras: Sequence[Camera], lights: Sequence[Light], gamma: float = 1.0,
     room: np.ndarray | None = None, falloff: Sequence[float] | None = None, vignetting: float = 0.0,
-    contrast: float = 1.0, gains: np.ndarray | float = 1.0,
+    contrast: float = 1.0, gains: np.ndarray | float = 1.0, lamps: Iterable[Light] | None = None,
 ) -> Capture:  # fmt: skip
     """The same photographs with other cameras and lights, one each; their curves' `gamma` and `contrast` times these.
 
     `room`: light of the room, as `Photographs` has it; `falloff`: exponents of the flashes' cones, one each, by default
     as they are; `vignetting`: what is added to the exponents of the lenses'; `gains` (P, 3): factors of what the
-    photographs record.
+    photographs record; `lamps`: point lights and distant ones of the scene, by default as they are.
     """
     sensors = []
     cones = [sensor.cone for sensor in capture.sensors] if falloff is None else falloff
@@ -37,7 +38,8 @@ def with_calibration(
             ambient=sensor.ambient and str(sensor.ambient), gain=sensor.gain * gain,
         )  # fmt: skip
         sensors.append(load_element(element))
-    return replace(capture, sensors=sensors, photographs=Photographs.of(sensors, room))
+    scene = capture.scene if lamps is None else with_lamps(capture.scene, lamps)
+    return replace(capture, scene=scene, sensors=sensors, photographs=Photographs.of(sensors, room))
 
 
 def moved(capture: Capture, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Capture:

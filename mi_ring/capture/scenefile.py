@@ -151,12 +151,14 @@ def numbers(values: ArrayLike) -> str:
 
 
 def recalibrated_xml(
-    scene: bytes, sensors: Sequence, room: np.ndarray | None = None, frames: Collection[str] | None = None
-) -> bytes:
+    scene: bytes, sensors: Sequence, room: np.ndarray | None = None, frames: Collection[str] | None = None,
+    lamps: Iterable[Light] | None = None,
+) -> bytes:  # fmt: skip
     """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order.
 
     `room`: the light of their room, as `mi_ring.rendering.rooms` has it; `frames`: axes that it has, even without
-    light, by default those of the rooms that the scene file has.
+    light, by default those of the rooms that the scene file has; `lamps`: point lights and distant ones that light all
+    photographs, by default those of the scene file.
     """
     root = ElementTree.fromstring(scene)
     for old, k in photographs_of(root, sensors):
@@ -172,6 +174,10 @@ def recalibrated_xml(
             if lit or child.get("name") in {*USUAL, GAIN, *fields}:
                 old.remove(child)
         old.extend([*fields.values(), *new.findall("emitter")])
+    if lamps is not None:
+        for emitter in [e for e in root.findall("emitter") if e.get("type") in ("point", "directional")]:
+            root.remove(emitter)
+        root.extend(map(emitter_element, lamps))
     before = set()
     for emitter in root.findall("emitter[@type='room']"):
         frame = emitter.find("string[@name='frame']")

@@ -17,21 +17,23 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.curve import Curve
+from mi_ring.fitting.lamps import Lamps
 from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
+from mi_ring.geometry.rotations import quarter_turns, rotations
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import Light
+from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.rooms import BASIS
-from mi_ring.rendering.scenes import has_table
-from mi_ring.rendering.shading import lamps
+from mi_ring.rendering.scenes import has_table, lamps_of
+from mi_ring.rendering.shading import shared_emitters
+from mi_ring.system.machine import device
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
 UNKNOWNS: dict[str, dict[str, float]] = {
@@ -51,6 +53,10 @@ UNKNOWNS: dict[str, dict[str, float]] = {
     "gain": {"gain": 0.1},  # logarithm, of each photograph and colour
     "scale": {"scale": 0.7},  # logarithm of the power of all lights together
     "ambient": {},  # `Room`
+    "lamps": {
+        "lamp": 0.1,  # of those of the scene, as `light`
+        "strength": 0.5,  # logarithm, of each lamp and colour
+    },
 }
 #: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
 #: the reflectance, and takes the flash's place and the room along (docs/phone.md).
@@ -71,9 +77,11 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
-    unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamp": {"light", "ambient"}}.get(config.light)
+    unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient"}}.get(config.light)
+    if config.light == "lamps" and lamps_of(capture.scene):
+        names.add("lamps")
     if unknown or capture.photographs.dark:
-        names |= unknown or ({"ambient"} if auto and not lamps(capture.scene) else set())
+        names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(sensor.ambient for sensor in capture.sensors) else set()
@@ -81,17 +89,6 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
     return tuple(name for name in UNKNOWNS if name in names)
-
-
-def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """(P, 3, 3) quarter turns about the optical axis that take the first of places (P, 3) next to each.
-
-    The identity where they are `near` each other already.
-    """
-    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
-    turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
-    away = (turns @ places[0] - places[:, None]).norm(dim=-1)  # (P, 4)
-    return turns[torch.where(away[:, 0] < near, 0, away.argmin(1))]
 
 
 def overall(refined: Sequence[str], albedo: float) -> float:
@@ -149,6 +146,8 @@ class Calibration(nn.Module):
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
+        #: of the scene, if they are unknown
+        self.lamps = Lamps.of([light_of(lamp) for lamp in lamps_of(capture.scene) if "lamps" in refined])
         self.sizes = [sensor.size for sensor in capture.sensors]
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
@@ -165,13 +164,14 @@ class Calibration(nn.Module):
                   "principal": (int(lenses.max()) + 1, 2), "distortion": (int(lenses.max()) + 1,),
                   "falloff": (), "vignetting": (),
                   "light": (int(places.max()) + 1, 3), "power": (count, 3), "gain": (count, 3),
-                  "curve": (), "contrast": (), "scale": ()}  # fmt: skip
+                  "curve": (), "contrast": (), "scale": (),
+                  "lamp": self.lamps.places.shape, "strength": self.lamps.places.shape}  # fmt: skip
         self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room
         room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
-        self.room = Room(room, exposure, frames, capture.photographs.dark and not lamps(capture.scene))
+        self.room = Room(room, exposure, frames, capture.photographs.dark and not shared_emitters(capture.scene))
 
     def value(self, name: str) -> Tensor:
         """An unknown in its own unit; 0 if it is none."""
@@ -201,11 +201,27 @@ class Calibration(nn.Module):
             moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
             places = cameras[:, :, 3] + (cameras[:, :, :3] @ moved)[..., 0]
         else:
-            moved = places + offset * torch.where(self.finite, self.distance, 1.0)
-            places = torch.where(self.finite, moved, F.normalize(moved, dim=-1))
+            places = Lamps(places, self.finite, strengths).moved(offset, self.distance).places
         scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
         strengths = strengths * (scale + self.centred("power")).exp()
         return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"), distortion)
+
+    def lamps_now(self) -> Lamps:
+        """The lamps of the scene as they are by now."""
+        power = self.value("strength") + self.value("scale").detach()
+        lamps = self.lamps._replace(strengths=self.first_power * self.lamps.strengths * power.exp())
+        return lamps.moved(self.value("lamp"), self.distance)
+
+    def lighting(self) -> list[Tensor]:
+        """What `bridge.render` takes as `lamps`: nothing if these stay as they are."""
+        now = self.lamps_now()
+        return [now.places.to(device()), now.strengths.to(device())] if "lamps" in self.refined else []
+
+    @torch.no_grad()
+    def relight(self, surface: bridge.Surface) -> None:
+        """Light a surface by the lamps of the scene as they are by now."""
+        if "lamps" in self.refined:
+            surface.relight(*map(bridge.to_drjit, self.lighting()))
 
     def centred(self, name: str) -> Tensor:
         """(P, 3) `power` or `gain`, logarithms of factors, of mean 0; 0 of photographs that are kept out."""
@@ -317,22 +333,14 @@ class Calibration(nn.Module):
             gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
             contrast, gains = float(self.value("contrast").exp()), self.centred("gain").double().exp().numpy()
         # The curve's fixed point is the exposure here, full scale in a scene file.
-        strengths = strengths * self.exposure ** ((1 - gamma) / gamma)
-        cameras, lights = [], []
+        level = self.exposure ** ((1 - gamma) / gamma)
+        cameras = []
         for k, sensor in enumerate(capture.sensors):
             to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
             cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size, distortion[k]))
-            point = bool(self.finite[k])
-            lights.append(Light("point" if point else "directional", places[k] if point else -places[k], strengths[k]))
-        room = None
+        lights = Lamps(torch.from_numpy(places), self.finite, torch.from_numpy(level * strengths)).lights()
+        now, room = self.lamps_now(), None
+        lamps = now._replace(strengths=level * now.strengths).lights() if "lamps" in self.refined else None
         if "ambient" in self.refined or capture.photographs.room is not None:
-            room = self.roomlight().double().numpy(force=True) * self.exposure ** ((1 - gamma) / gamma)
-        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast,
-                                gains)  # fmt: skip
-
-
-def rotations(vectors: Tensor) -> Tensor:
-    """(P, 3, 3) rotation matrices of rotation vectors (P, 3) [rad]."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3))
+            room = self.roomlight().double().numpy(force=True) * level
+        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast, gains, lamps)

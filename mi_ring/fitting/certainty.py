@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mi_ring.fitting.calibration import Calibration
+from mi_ring.fitting.calibration import UNKNOWNS, Calibration
 from mi_ring.fitting.terms import perceived
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
@@ -36,13 +36,15 @@ class Entries:
             self.first[name] = self.count
             self.count += getattr(calibration, name).numel()
 
-    def rows(self, name: str, index: np.ndarray) -> np.ndarray:
-        """Which row of an unknown is that of each photograph."""
+    def rows(self, name: str, index: np.ndarray) -> list[np.ndarray]:
+        """Which rows of an unknown are those of each photograph."""
         lens = dict.fromkeys(("focal", "principal", "distortion"), self.calibration.lens)
         shared = lens | {"light": self.calibration.place}
         if name in shared:
-            return shared[name][index].numpy()
-        return index if getattr(self.calibration, name).ndim else np.zeros_like(index)
+            return [shared[name][index].numpy()]
+        if name in UNKNOWNS["lamps"]:  # all of them light all photographs
+            return [np.full_like(index, k) for k in range(len(getattr(self.calibration, name)))]
+        return [index if getattr(self.calibration, name).ndim else np.zeros_like(index)]
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
         """Name, component and place (n,) of all that photographs depend on."""
@@ -50,8 +52,9 @@ class Entries:
         for name in self.calibration.widths:
             unknown = getattr(self.calibration, name)
             components = unknown.shape[1] if unknown.ndim == 2 else 1
-            rows = self.first[name] + components * self.rows(name, index)
-            result += [(name, k, rows + k) for k in range(components)]
+            for row in self.rows(name, index):
+                first = self.first[name] + components * row
+                result += [(name, k, first + k) for k in range(components)]
         return result
 
 
@@ -116,6 +119,7 @@ def compare(
     photographs = replace(photographs, room=room.double().numpy() if photographs.dark else None)
 
     def calibrated() -> Photographs:
+        calibration.relight(fit.surface)
         return bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
 
     def direct() -> tuple[Tensor, Tensor]:

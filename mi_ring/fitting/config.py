@@ -19,7 +19,7 @@ WEIGHTS = {
 #: What `Config.refine` may have.
 Unknown = Literal[
     "auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "gain", "falloff", "vignetting",
-    "curve", "contrast", "scale", "ambient", "masks",
+    "curve", "contrast", "scale", "ambient", "lamps", "masks",
 ]  # fmt: skip
 
 
@@ -37,10 +37,10 @@ class Config:
     """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
     if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,
     which finds them in a dark room, too; --weights.mask 0 does without any."""
-    light: Literal["capture", "environment", "turntable", "lamp", "auto"] = "capture"
+    light: Literal["capture", "environment", "turntable", "lamps", "auto"] = "capture"
     """What lights the object. capture: the lights that the scene says. Else they are unknown: environment: light from
-    everywhere, fixed in the world; turntable: the same, fixed in the camera; lamp: one lamp, fixed in the world; auto:
-    what explains the photographs best in coarse fits."""
+    everywhere, fixed in the world; turntable: the same, fixed in the camera; lamps: one to three, fixed in the world,
+    as coarse fits find them; auto: what explains the photographs best in coarse fits."""
     seed: int = 0
     """Random seed."""
     iterations: int = 460
@@ -116,7 +116,8 @@ class Config:
     flash shines to the sides; vignetting: how much darker the lens is toward the borders; curve: one exponent of the
     camera's, for all; contrast: how steep the S of a curve as of film is; scale: the power of all lights together, by
     interreflection; ambient: the light of the room, which is the same for all, fixed in the world, or in the camera if
-    the scene has a `room` in its axes, as that of a turntable has; masks: the object's outlines in the photographs,
+    the scene has a `room` in its axes, as that of a turntable has; lamps: places and strengths of the scene's point and
+    directional emitters, which light all photographs; masks: the object's outlines in the photographs,
     found anew about the surface at half and at three quarters of the fit. auto: light, power (unless
     gain is given) and ambient (unless it is subtracted), and scale where lights cannot be as strong as the scene says;
     under an unknown light, or where photographs have none of their own, gain, and ambient unless lamps light them;

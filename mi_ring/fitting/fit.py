@@ -29,7 +29,7 @@ from mi_ring.fitting.processes import current
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
-from mi_ring.fitting.start import starting_ring
+from mi_ring.fitting.start import require_settings, starting_ring
 from mi_ring.fitting.summary import summary
 from mi_ring.fitting.surroundings import with_surroundings
 from mi_ring.fitting.terms import Term, default_terms
@@ -81,18 +81,11 @@ class Fit:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
         if not any(self.config.weights.get(name, term.weight) for name, term in self.terms.items()):
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
-        if not capture.images:
-            raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
+        require_settings(capture, self.config)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
-        if {"curve", "contrast"} & set(self.config.refine) and any(sensor.ambient for sensor in capture.sensors):
-            raise InputError(f"{capture.path}: ambient: is subtracted by the curve that the scene says; leave out "
-                             "--refine curve and contrast")  # fmt: skip
-        if "masks" in self.config.refine and capture.threshold is not None:
-            raise InputError(f"{capture.path}: --refine masks: they are those of a dark room, found by brightness; "
-                             "leave it out, or give others")  # fmt: skip
         self.held_out = kept_out(capture, self.config.holdout)
         self.fitted = np.setdiff1d(np.arange(len(capture)), self.held_out)  #: all other photographs
         if self.config.deterministic:
@@ -203,6 +196,7 @@ class Fit:
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
+            lamps=self.calibration.lighting() if self.calibration else [],
         )  # fmt: skip
         predicted = with_surroundings(self, predicted, coverage, photographs, seen, everything, scale, share)
         if self.calibration:
@@ -291,8 +285,11 @@ class Fit:
         return summary(self, refined, deviations(self))
 
     def calibrated(self) -> Capture:
-        """The capture with cameras, lights and curve as refined by now."""
-        return self.calibration.applied(self.capture) if self.calibration else self.capture
+        """The capture with cameras, lights and curve as refined by now; the surface is lit so, too."""
+        if not self.calibration:
+            return self.capture
+        self.calibration.relight(self.surface)
+        return self.calibration.applied(self.capture)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.optimize import nnls
 
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
@@ -17,8 +18,8 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS, frames_of, without_environment
-from mi_ring.rendering.shading import lamps
+from mi_ring.rendering.rooms import BASIS, directions_of, frames_of, harmonics_in, without_environment
+from mi_ring.rendering.shading import shared_emitters
 from mi_ring.system.progress import progress
 
 if TYPE_CHECKING:
@@ -34,22 +35,33 @@ LAST = 12  #: iterations of a trial that tell how well it explains the photograp
 ALIKE = 1.1  #: times that lights may differ in strength without a word
 #: What the scene says is believed unless another light leaves less of its error than this. An environment that is fixed
 #: in the camera looks much like a flash.
-BETTER = {"environment": 0.9, "turntable": 0.6, "lamp": 0.9}
+BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
+MOST = 3  #: lamps
+FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
+SHOWN = 1, 2 / 3, 1 / 4  #: of the harmonics of each degree by a diffuse surface
+FAINT = 0.02  #: the least strength of a lamp to begin with, by the first
+ROWS = 16  #: of a map of the directions in which lamps are sought
 
-
-Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamp"]
+Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
 
 
 class Lighting(NamedTuple):
     """The lights of the photographs, as a fit begins."""
 
     kind: Kind  #: of `Config.light`, but for "auto"
-    place: tuple[float, float, float] | None = None  #: of a lamp [scene units]
+    #: In which directions from the object they are, unit vectors, and how strong each colour is, by the first's.
+    lamps: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+    distant: bool = False  #: Are they infinitely far away, and not as far as the cameras?
+
+    def __str__(self) -> str:
+        """For people: environment, 1 lamp, 2 distant lamps."""
+        count = len(self.lamps)
+        return f"{count} {'distant ' * self.distant}lamp{'s' * (count > 1)}" if count else self.kind
 
 
 def require_unknown(capture: Capture, config: Config) -> None:
     """Raise InputError for what does not go with `Config.light`."""
-    others, own = lamps(capture.scene), OF_LIGHTS & set(config.refine)
+    others, own = shared_emitters(capture.scene), OF_LIGHTS & set(config.refine)
     if config.light == "capture":
         if own and capture.photographs.dark:
             raise InputError(f"{capture.path}: --refine {min(own)}: is of the photographs' own lights, of which there "
@@ -65,7 +77,7 @@ def require_unknown(capture: Capture, config: Config) -> None:
     if any(sensor.ambient for sensor in capture.sensors):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
-    wrong = own & {"falloff"} if config.light == "lamp" else own
+    wrong = own & {"falloff"} if config.light == "lamps" else own
     if wrong:
         raise InputError(f"--refine {min(wrong)}: is of the photographs' own lights, in the place of which --light "
                          f"{config.light} puts another; leave it out")  # fmt: skip
@@ -89,27 +101,39 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     if config.light in ("capture", "environment", "turntable"):
         return Lighting(config.light)
 
-    def tried(lighting: Lighting) -> tuple[float, "Fit"]:
-        """The error that a coarse fit leaves, and the fit."""
+    left: dict[Lighting, float] = {}  #: errors that coarse fits leave
+
+    def tried(lighting: Lighting) -> "Fit":
         refine = config.refine if lighting.kind == "capture" else recording(config)
         fit = trial(capture, replace(config, **COARSE, light=lighting.kind, refine=refine), lighting=lighting)
-        iterations = progress(fit, f"trying --light {lighting.kind}", fit.iterations, unit="iteration")
-        errors = [it.terms["rgb"] for it in iterations]
-        return float(np.nan_to_num(np.mean(errors[-LAST:]), nan=np.inf)), fit
+        iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
+        errors = [it.terms["rgb"] for it in iterations][-LAST:]
+        left[lighting] = float(np.nan_to_num(np.mean(errors), nan=np.inf))
+        return fit
 
-    environment, fit = tried(Lighting("environment"))
-    lamp = Lighting("lamp", brightest(fit))
-    if config.light == "lamp":
-        return lamp
-    found = {lighting: tried(lighting)[0] for lighting in (Lighting("turntable"), lamp)}
-    found[Lighting("environment")] = environment
-    likely = list(found)
-    if not unlit(capture):
-        capture_error = found[Lighting("capture")] = tried(Lighting("capture"))[0]
-        likely = [one for one in likely if found[one] < BETTER[one.kind] * capture_error] or [Lighting("capture")]
-    best = min(likely, key=lambda lighting: found[lighting])
-    left = ", ".join(f"{lighting.kind} {error:.3g}" for lighting, error in found.items())
-    print(f"Light: taken to be --light {best.kind}; errors that coarse fits leave: {left}")
+    fit = tried(Lighting("environment"))
+    lamp = Lighting("lamps", brightest(fit, 1))
+    tried(lamp)
+    likely = [lamp]
+    if config.light == "auto":
+        tried(Lighting("turntable"))
+        likely = [*left]
+        if not unlit(capture):
+            tried(Lighting("capture"))
+            own = left[Lighting("capture")]
+            likely = [one for one in likely if left[one] < BETTER[one.kind] * own] or [Lighting("capture")]
+    best = min(likely, key=lambda one: left[one])
+    if best.kind in ("environment", "lamps"):  # of which more lamps are between
+        several = [lamp] + [Lighting("lamps", brightest(fit, count)) for count in range(2, MOST + 1)]
+        for more in several[1:]:
+            tried(more)
+        enough = FEWER * min(left[one] for one in several)
+        lamp = next(one for one in several if left[one] <= enough)
+        distant = lamp._replace(distant=True)
+        tried(distant)
+        best = min([best, lamp, distant] if config.light == "auto" else [lamp, distant], key=lambda one: left[one])
+    errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in left.items())
+    print(f"Light: taken to be {best} (--light {best.kind}); errors that coarse fits leave: {errors}")
     return best
 
 
@@ -130,27 +154,64 @@ def exposures(capture: Capture) -> np.ndarray:
     return strengths / strengths.mean(0)
 
 
-def brightest(fit: "Fit") -> tuple[float, float, float]:
-    """Where a lamp would be that is as far from the object as the cameras, by the environment that a fit has found."""
+def brightest(fit: "Fit", count: int) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+    """So many lamps, as `Lighting` has them, that light the object as an environment does which a fit has found.
+
+    Of its harmonics up to degree 2, which are what diffuse surfaces show ("An Efficient Representation for Irradiance
+    Environment Maps", Ramamoorthi and Hanrahan 2001), by least squares, beside light that is alike from all sides: each
+    direction in turn is put where it is best, until none moves.
+    """
     assert fit.calibration is not None
-    center = fit.ring.center.numpy(force=True)
-    first = fit.calibration.room.harmonics[1:4].mean(1).numpy(force=True)
-    toward = -first[[2, 0, 1]] * [1, 1, -1]  # harmonics of degree 1 are as −y, z, −x
-    away = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in fit.capture.sensors])
-    x, y, z = (center + away * toward / max(np.linalg.norm(toward), 1e-12)).tolist()
-    return x, y, z
+    shown = np.repeat(SHOWN, [2 * degree + 1 for degree in range(len(SHOWN))])[:, None]
+    seen = shown * fit.calibration.room.harmonics[: len(shown)].double().numpy(force=True)
+    directions, _ = directions_of(ROWS)
+    lobes = shown * harmonics_in(directions, len(SHOWN) - 1)  # (harmonics, directions)
+    grey = np.eye(len(shown))[:, :1]
+
+    def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
+        """Strengths (n + 1, C) and what is left."""
+        design = np.concatenate([lobes[:, chosen], grey], 1)
+        solved = [nnls(design, colour) for colour in colours.T]
+        return np.stack([strengths for strengths, _ in solved], 1), sum(rest**2 for _, rest in solved)
+
+    chosen: list[int] = []
+    mean = seen.mean(1, keepdims=True)
+    while len(chosen) < count:
+        chosen.append(-1)
+        before: list[int] = []
+        while chosen != before:
+            before = [*chosen]
+            for k in reversed(range(len(chosen))):
+                others = [c for n, c in enumerate(chosen) if n != k and c >= 0]
+                rest = [fitted([*others, c], mean)[1] for c in range(len(directions))]
+                chosen[k] = int(np.argmin(rest))
+    strengths, _ = fitted(chosen, seen)
+    order = np.argsort(-strengths[:-1].mean(1))
+    # The first is white: which colour it has nobody can tell from the object's.
+    relative = strengths / np.maximum(strengths[order[0]], FAINT * strengths[order[0]].mean() + 1e-12)
+    relative = relative.clip(FAINT, 1 / FAINT)
+    relative[order[0]] = 1.0
+    return tuple((tuple(directions[chosen[k]].tolist()), tuple(relative[k].tolist())) for k in order)
 
 
 def lit(capture: Capture, lighting: Lighting) -> Capture:
-    """The capture under these lights: an environment is grey and alike from all sides to begin with, a lamp white."""
+    """The capture under these lights: an environment is grey and alike from all sides to begin with, a lamp white.
+
+    More lamps than one are the scene's.
+    """
     if lighting.kind == "capture":
         return capture
     cameras, exposure = [sensor.camera for sensor in capture.sensors], capture.exposure()
-    if lighting.place:
-        place, (center, _) = np.array(lighting.place), capture.sphere()
-        strength = math.pi * exposure / ALBEDO * np.linalg.norm(place - center) ** 2
-        return with_calibration(capture, cameras, [Light("point", place, np.full(3, strength))] * len(cameras),
-                                falloff=[0.0] * len(cameras), gains=exposures(capture))  # fmt: skip
+    if lighting.lamps:
+        center, _ = capture.sphere()
+        away = 1.0 if lighting.distant else np.median([np.linalg.norm(camera.position - center) for camera in cameras])
+        lights = []
+        for direction, colour in lighting.lamps:
+            toward, rgb = away * np.array(direction), math.pi * exposure / ALBEDO * away**2 * np.array(colour)
+            lights.append(Light("directional", -toward, rgb) if lighting.distant else
+                          Light("point", center + toward, rgb))  # fmt: skip
+        return with_calibration(capture, cameras, lights[:1] * len(cameras), falloff=[0.0] * len(cameras),
+                                gains=exposures(capture), lamps=lights[1:] or None)  # fmt: skip
     harmonics = np.zeros((BASIS, 3))
     harmonics[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
     dark = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
@@ -176,5 +237,5 @@ def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:
     """In which axes the unknown light of a room is fixed."""
-    own = {"environment": ["world"], "lamp": ["world"], "turntable": ["camera"]}
+    own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

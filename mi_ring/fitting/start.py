@@ -17,9 +17,24 @@ from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdfnet import BRDFNet, ReflectanceMap
 from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shapenet import Flow
-from mi_ring.rendering.scenes import has_table
+from mi_ring.rendering.scenes import has_table, lamps_of
 from mi_ring.ring.ring import Ring
 from mi_ring.system.optional import installed
+
+
+def require_settings(capture: Capture, config: Config) -> None:
+    """Raise InputError for settings that do not go with a capture."""
+    if not capture.images:
+        raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
+    if {"curve", "contrast"} & set(config.refine) and any(sensor.ambient for sensor in capture.sensors):
+        raise InputError(f"{capture.path}: ambient: is subtracted by the curve that the scene says; leave out "
+                         "--refine curve and contrast")  # fmt: skip
+    if "masks" in config.refine and capture.threshold is not None:
+        raise InputError(f"{capture.path}: --refine masks: they are those of a dark room, found by brightness; "
+                         "leave it out, or give others")  # fmt: skip
+    if "lamps" in config.refine and config.light == "capture" and not lamps_of(capture.scene):
+        raise InputError(f"{capture.path}: emitter: --refine lamps: the scene has none, point or directional, beside "
+                         "the photographs' own lights; leave it out")  # fmt: skip
 
 
 def starting_ring(

@@ -45,6 +45,13 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         units = np.where(calibration.finite.numpy()[first], calibration.distance, 1.0)
         add("light", "places of the lights [scene units], directions to distant ones", before, after,
             units * deviations["light"])  # fmt: skip
+    if "lamp" in now:
+        with torch.no_grad():
+            lamps, found = calibration.lamps, calibration.lamps_now()
+        add("lamp", "places of the scene's lamps [scene units], directions to distant ones", lamps.places, found.places,
+            np.where(lamps.finite, calibration.distance, 1.0) * deviations["lamp"])  # fmt: skip
+        add("strength", "strengths of the scene's lamps: red, green, blue", lamps.strengths, found.strengths,
+            found.strengths.numpy() * deviations["strength"])  # fmt: skip
     if "focal" in now:
         add("focal", "focal length [px]", [old[k].camera.focal.mean() for k in lenses], focal.mean(1),
             focal.mean(1) * deviations["focal"])  # fmt: skip

@@ -9,7 +9,9 @@ from matplotlib.figure import Figure
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.figures import svg_uri
+from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.rooms import COUNT, seen_from_within
+from mi_ring.rendering.scenes import lamps_of
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 LISTED = 6  #: unknowns of one kind that are listed one by one
@@ -93,7 +95,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     draw_plan(plan, after, plane, AFTER, "after")
     plan.legend(fontsize=8)
     plan.set_aspect("equal", "datalim")
-    plan.set_title("cameras and lights (•) from above [scene units]", fontsize=9)
+    plan.set_title("cameras, lights (•) and lamps (★) from above [scene units]", fontsize=9)
     for bars in others:
         if light is not None:
             frame = "camera" if light[COUNT:].any() else "world"
@@ -123,3 +125,6 @@ def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, labe
     lights = capture.photographs.lights
     x, y = (lights.positions()[lights.is_finite()] @ plane.T).T
     axes.scatter(x, y, s=8, c=colour)
+    lamps = [lamp.vector for lamp in map(light_of, lamps_of(capture.scene)) if lamp.kind == "point"]
+    x, y = plane @ np.reshape(lamps, (-1, 3)).T
+    axes.scatter(x, y, s=60, c=colour, marker="*")

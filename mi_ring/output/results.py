@@ -17,8 +17,10 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
+from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.rooms import seen_from_within
-from mi_ring.rendering.shading import lamps
+from mi_ring.rendering.scenes import lamps_of
+from mi_ring.rendering.shading import shared_emitters
 from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
 from mi_ring.ring.saved import ring_state
@@ -138,11 +140,12 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
-        scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames)
+        lamps = map(light_of, lamps_of(capture.scene)) if "lamps" in fit.calibration.refined else None
+        scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames, lamps)
     if fit.outlines:
         scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
-    if capture.photographs.dark and capture.photographs.room is not None and not lamps(capture.scene):
+    if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
         # It is all the light there is.
         radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")

@@ -15,15 +15,14 @@ from torch.nn import functional as F
 
 from mi_ring.images import blur
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.edges import Edges
-from mi_ring.rendering.elements import load_bsdf
 from mi_ring.rendering.indirect import BOUNCES, render_indirect
+from mi_ring.rendering.lights import light_of, put
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
-from mi_ring.rendering.scenes import assembled, own_emitters, parted
-from mi_ring.rendering.shading import lamps
+from mi_ring.rendering.scenes import dressed, lamps_of, parted, with_lamps
+from mi_ring.rendering.shading import shared_emitters
 
 WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
 USUAL = 1e-3, 1e4  #: radii [scene units] that are drawn as they are
@@ -59,10 +58,11 @@ class Surface:
         if ring is not None:
             scene, shape = dressed(scene, shape, ring)
             alone = self.table is None and len(scene.shapes()) == 1
-            if alone and not as_it_is and all(lamp.is_environment() for lamp in lamps(scene)):
+            if alone and not as_it_is and all(lamp.is_environment() for lamp in shared_emitters(scene)):
                 self.unit = unit_for(float(ring.radius))
         self.scene, self.shape = scene, shape
         self.params = mi.traverse(scene)
+        self.own_lamps = False  #: or the given scene's, which are not to be changed?
         self.prefix = f"{shape.id()}."
         self.faces = np.array(shape.faces_buffer()).reshape(-1, 3)  # as they are, or will be with the next vertices
         self.faces_changed, self.edges = False, None
@@ -104,6 +104,17 @@ class Surface:
         self.written += 1
         return list(arrays.values())
 
+    def relight(self, places, strengths) -> None:
+        """Change the L `lamps_of` the scene, in this one alone: Dr.Jit Floats, three for each, that may be attached.
+
+        Places are positions [scene units], of distant lamps unit directions toward them.
+        """
+        if not self.own_lamps:
+            self.scene, self.own_lamps = with_lamps(self.scene, map(light_of, lamps_of(self.scene))), True
+            self.params = mi.traverse(self.scene)
+        for k, lamp in enumerate(lamps_of(self.scene)):
+            put(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
+
     def show(self, ring, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
         """Write a `Ring` at domain points (V, 3) with these triangles, where the flow has them at `time` in [0, 1]."""
         with torch.no_grad():
@@ -132,36 +143,21 @@ def unit_for(radius: float) -> float:
     return 1.0 if USUAL[0] <= radius <= USUAL[1] else 2.0 ** round(math.log2(radius))
 
 
-def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
-    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape."""
-    new = mi.load_dict({
-        "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
-        "face_normals": shape.has_face_normals(),
-        "bsdf": {"type": "cooktorrance"},
-    })  # fmt: skip
-    for parameter in ring.brdf_net.bsdf_parameters:
-        if not new.has_attribute(f"vertex_{parameter.name}"):
-            values = np.zeros(new.vertex_count() * parameter.channels, np.float32)
-            new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
-    new.set_bsdf(load_bsdf(ring.bsdf))
-    require_attributes(new)
-    shapes = [new if other == shape else other for other in scene.shapes()]
-    return assembled(shapes, own_emitters(scene), scene.sensors(), scene.integrator()), new
-
-
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, surface, photographs, spp, seed, shadows, names, vertices, *tensors):
+    def forward(ctx, surface, photographs, spp, seed, shadows, names, lamps, vertices, *tensors):
         gradients = any(t.requires_grad for t in (vertices, *tensors))
-        attributes, calibration = tensors[: len(names)], tensors[len(names) :]
+        attributes, others = tensors[: len(names)], tensors[len(names) :]
         arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
-        if calibration:
-            buffers = [to_drjit(t) for t in calibration]
-            for buffer, tensor in zip(buffers, calibration):
-                if tensor.requires_grad:
-                    dr.enable_grad(buffer)
-            photographs = photographs.moved(*buffers)
-            arrays += buffers
+        buffers = [to_drjit(t) for t in others]
+        for buffer, tensor in zip(buffers, others):
+            if tensor.requires_grad:
+                dr.enable_grad(buffer)
+        arrays += buffers
+        if lamps:
+            surface.relight(*buffers[-lamps:])
+        if calibration := buffers[: len(buffers) - lamps]:
+            photographs = photographs.moved(*calibration)
         photographs = photographs.in_units(surface.unit)
         if gradients:
             surface.edges = Edges.of(surface.scene, surface.edges)
@@ -195,26 +191,28 @@ class _Render(torch.autograd.Function):
             grads[0] = torch.where(own[:, None], grads[0].nan_to_num(0, 0, 0), grads[0])
         if surface.unit != 1:
             grads[0] = grads[0] / surface.unit
-        return None, None, None, None, None, None, *grads
+        return None, None, None, None, None, None, None, *grads
 
 
 def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
-    seed: int = 0, shadows: bool = True, calibration: Sequence[Tensor] = (),
+    seed: int = 0, shadows: bool = True, calibration: Sequence[Tensor] = (), lamps: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Predicted photographs of the surface, each under its own light, differentiable.
 
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
     samples. `calibration`: other cameras and lights of all photographs, as `Photographs.moved` takes them: (P, 3, 4),
-    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) each if flashes have cones and lenses distortion.
+    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) each if flashes have cones and lenses distortion. `lamps`:
+    other places and strengths (L, 3) of the scene's L lamps, point lights or distant ones, as `Surface.relight` has
+    them.
 
     Returns ((N, H, W, 3) linear radiance, (N, H, W) coverage in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage; by one backward pass,
     before the surface is written again, else RuntimeError.
     """
-    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), vertices, *attributes.values(),
-                         *calibration)  # fmt: skip
+    return _Render.apply(surface, photographs, spp, seed, shadows, list(attributes), len(lamps), vertices,
+                         *attributes.values(), *calibration, *lamps)  # fmt: skip
 
 
 def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photographs:

@@ -11,11 +11,12 @@ import numpy as np
 from mi_ring.errors import SceneError
 
 SIDEWAYS = 1e-3  #: the least cosine from the axis of a flash; beyond, its light is what it is there
+LAMPS = "PointLight", "DirectionalEmitter"  #: classes of emitters that `Light` is one of
 FAR = 1e9  #: distance of a directional light [scene units]
 
 
 class Light(NamedTuple):
-    """The light of one photograph, in the world."""
+    """The light of one photograph, or a lamp, in the world."""
 
     kind: Literal["point", "directional"]
     vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
@@ -121,6 +122,43 @@ def place_of(emitter):
             return -mi.Vector3f(m[0, 2], m[1, 2], m[2, 2]), False
 
 
+def light_of(emitter) -> Light:
+    """One of `LAMPS` as numbers."""
+    where, finite = place_of(emitter)
+    vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
+    return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
+
+
+def emitter_of(light: Light) -> mi.Emitter:
+    """A light as an emitter of Mitsuba."""
+    vector = light.vector.tolist()
+    where = {"position": vector} if light.kind == "point" else {"direction": vector}
+    strength = "intensity" if light.kind == "point" else "irradiance"
+    return mi.load_dict({"type": light.kind, **where, strength: {"type": "rgb", "value": light.rgb.tolist()}})
+
+
+def put(emitter, place, strength) -> None:
+    """Change an emitter that `emitter_of` has made: its position, or the unit direction toward it, and its RGB.
+
+    All may be attached.
+    """
+    params = mi.traverse(emitter)
+    if emitter.class_name() == "PointLight":
+        params["position"], params["intensity.value"] = mi.Point3f(place), strength
+    else:
+        frame = mi.Frame3f(-mi.Vector3f(place))
+        rows = [[frame.s[k], frame.t[k], frame.n[k], 0] for k in range(3)]
+        params["to_world"] = mi.Transform4f(mi.Matrix4f(*rows, [0, 0, 0, 1]))
+        params["irradiance.value"] = strength
+    params.update()
+
+
+def strength_of(emitter):
+    """The RGB of a point light or of a directional one, attached."""
+    name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
+    return mi.Color3f(mi.traverse(emitter)[name])
+
+
 def parts_of(sensor):
     """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength).
 
@@ -128,10 +166,10 @@ def parts_of(sensor):
     """
     light = sensor.light
     kind = light.class_name()
-    if kind not in ("PointLight", "DirectionalEmitter"):
+    if kind not in LAMPS:
         raise SceneError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
     where, finite = place_of(light)
-    strength = mi.Color3f(mi.traverse(light)["intensity.value" if finite else "irradiance.value"])
+    strength = strength_of(light)
     if not dr.all(dr.isfinite(strength) & (strength >= 0)):
         raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive, or 0 in all')
     if not dr.all(dr.isfinite(where)):

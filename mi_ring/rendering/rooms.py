@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.rendering.scenes import assembled, own_emitters
-from mi_ring.rendering.shading import is_room, lamps
+from mi_ring.rendering.shading import is_room, shared_emitters
 
 ORDER = 4  #: of the harmonics, at most
 COUNT = (ORDER + 1) ** 2
@@ -43,7 +43,7 @@ def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
 
     The same scene and None if it has none.
     """
-    found = [lamp for lamp in lamps(scene) if lamp.is_environment()]
+    found = [lamp for lamp in shared_emitters(scene) if lamp.is_environment()]
     if not found:
         return scene, None
     others = [emitter for emitter in own_emitters(scene) if emitter not in found]
@@ -56,13 +56,16 @@ def harmonics_of(environment) -> np.ndarray:
     directions, angles = directions_of(FINE_ROWS)
     toward, si = mi.Vector3f(*directions.T), dr.zeros(mi.SurfaceInteraction3f, len(angles))
     si.wi = -toward
-    radiance, basis = (
-        np.stack([np.asarray(dr.detach(value) + dr.zeros(mi.Float, len(angles))) for value in values])
-        for values in (environment.eval(si), dr.sh_eval(toward, ORDER))
-    )
+    radiance = np.stack([np.asarray(dr.detach(v) + dr.zeros(mi.Float, len(angles))) for v in environment.eval(si)])
     room = np.zeros((BASIS, 3))
-    room[:COUNT] = (basis * angles) @ radiance.T
+    room[:COUNT] = (harmonics_in(directions) * angles) @ radiance.T
     return room
+
+
+def harmonics_in(directions: np.ndarray, order: int = ORDER) -> np.ndarray:
+    """The world's harmonics up to this order, ((order + 1)², n), in unit directions (n, 3)."""
+    values = dr.sh_eval(mi.Vector3f(*directions.T.astype(np.float32)), order)
+    return np.stack([np.asarray(value + dr.zeros(mi.Float, len(directions))) for value in values])
 
 
 def directions_of(rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,31 @@
 """Mitsuba scenes, put together anew of the parts of another."""
 
+from collections.abc import Iterable
+
 import mitsuba as mi
+import numpy as np
+
+from mi_ring.rendering.attributes import require_attributes
+from mi_ring.rendering.elements import load_bsdf
+from mi_ring.rendering.lights import LAMPS, Light, emitter_of
 
 
 def own_emitters(scene) -> list:
     """The emitters of a scene that are no part of its shapes, and so do not come along with them."""
     of_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
     return [emitter for emitter in scene.emitters() if emitter not in of_shapes]
+
+
+def lamps_of(scene) -> list:
+    """The point lights and directional ones at the top level of a scene."""
+    return [emitter for emitter in own_emitters(scene) if emitter.class_name() in LAMPS]
+
+
+def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
+    """A scene with these lamps in the place of its `lamps_of`; it shares all else."""
+    before = lamps_of(scene)
+    others = [emitter for emitter in own_emitters(scene) if emitter not in before]
+    return assembled(scene.shapes(), [*others, *map(emitter_of, lamps)], scene.sensors(), scene.integrator())
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
@@ -18,6 +37,23 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
     for part, name in zip(parts, ids):  # which Mitsuba has changed to the keys
         part.set_id(name)
     return scene
+
+
+def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
+    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape."""
+    new = mi.load_dict({
+        "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
+        "face_normals": shape.has_face_normals(),
+        "bsdf": {"type": "cooktorrance"},
+    })  # fmt: skip
+    for parameter in ring.brdf_net.bsdf_parameters:
+        if not new.has_attribute(f"vertex_{parameter.name}"):
+            values = np.zeros(new.vertex_count() * parameter.channels, np.float32)
+            new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
+    new.set_bsdf(load_bsdf(ring.bsdf))
+    require_attributes(new)
+    shapes = [new if other == shape else other for other in scene.shapes()]
+    return assembled(shapes, own_emitters(scene), scene.sensors(), scene.integrator()), new
 
 
 def parted(scene) -> tuple[mi.Scene, mi.Scene | None]:

@@ -29,14 +29,14 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, around=None):
     radiance = reflected(*light(si), shadows) if light else dr.zeros(mi.Color3f, dr.width(si.t))
     if around:
         radiance += dr.select(active, around(si), 0)
-    for emitter in lamps(scene, rooms):
+    for emitter in shared_emitters(scene, rooms):
         radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
             radiance += dr.select(active, 0, emitter.eval(si, ~active))
     return radiance
 
 
-def lamps(scene, rooms: bool = False) -> list:
+def shared_emitters(scene, rooms: bool = False) -> list:
     """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own.
 
     Without `rooms`, which `Photographs` hold, none of `room` either.

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from mi_ring.capture.scenefile import (
     Element,
     add_pose,
+    emitter_element,
     move_names,
     numbers,
     photograph_element,
@@ -39,6 +40,7 @@ from mi_ring.synthesis.tracing import Shot
 from mi_ring.system.files import read_json, write_file, writing
 from mi_ring.system.progress import progress
 
+BETWEEN = 100_003  #: seeds of pictures of one photograph by different lamps
 TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
 SETTINGS = "truth/settings.json"  #: by which an interrupted capture is known
 
@@ -98,6 +100,10 @@ class Production:
         return [View(camera, light, f"{k:03}", config.seed * 40_009 + 2 * (k + novel * 10_007))
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 
+    def lamps_beside(self, view: View) -> list[Light]:
+        """The lamps that light all photographs besides the one that a photograph says is its own."""
+        return lamps.others_of(self.config.lamps - 1, view.light, self.random(8))
+
     def environment_element(self, scale: float = 1.0) -> Element:
         """The environment as XML. Raises InputError if its file cannot be read."""
         file = Path(str(self.config.environment)).resolve()
@@ -129,6 +135,8 @@ class Production:
         config, shot = self.config, Shot(camera)
         light = view.light if self.environment is None else load_element(self.environment)
         picture = stage.radiance(shot, light, spp, view.seed, config.depth, hidden=self.environment is None)
+        for n, lamp in enumerate(self.lamps_beside(view), 1):
+            picture = picture + stage.radiance(shot, lamp, spp, view.seed + BETWEEN * n, config.depth)
         if not config.room:
             return picture, 0.0
         # Apart: paths that choose between two lights are much noisier.
@@ -219,6 +227,8 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
         extra = [production.environment_element(exposure)]
     elif config.room:
         extra = room_elements(exposure * production.room_level * production.room)
+    for lamp in production.lamps_beside((seen + novel)[0]):
+        extra.append(emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
     up, ground = (config.axis, production.ground) if config.table != "none" else (None, None)
     metres = 0.001 if config.table == "sheet" else None
 

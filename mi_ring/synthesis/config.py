@@ -65,6 +65,8 @@ class SynthesizeConfig:
     light: LightKind = "flash"
     """flash: a point light at the lens; point: anywhere as far away; distant: parallel light; lamp: a point light
     that is in one place for all photographs."""
+    lamps: int = 1
+    """How many lamps there are with --light lamp. The scene has those beside the first as emitters of its own."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the flash from the lens: left, up and forward, by the distance from the camera to the object."""
     spread: float = 40.0
@@ -104,7 +106,7 @@ class SynthesizeConfig:
     """How differently photographs are exposed, which the scene file does not say: standard deviation of a factor [%],
     and by a third of that of each colour, for the white balance."""
     wrong_room: bool = False
-    """Say nothing of --room or of --environment in the scene file."""
+    """Say nothing of --room, of --environment or of more --lamps than one in the scene file."""
 
     spp: int = 64
     """Paths per pixel; a square number, or the next one is taken."""
@@ -116,7 +118,7 @@ class SynthesizeConfig:
     @property
     def exact(self) -> bool:
         """Does the scene file say nothing wrong?"""
-        unknown = self.wrong_room and bool(self.room > 0 or self.environment)
+        unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
@@ -134,8 +136,8 @@ class SynthesizeConfig:
 #: Least and most of each option that is a number.
 RANGES = {
     "views": (1, 10_000), "novel": (0, 10_000), "fov": (1, 150), "bands": (1, 1000), "radius": (1e-6, 1e6),
-    "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5), "spp": (1, 65536),
-    "depth": (2, 100), "wrong_cameras": (0, 20), "wrong_light": (0, 50), "wrong_power": (0, 100),
+    "lamps": (1, 8), "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5),
+    "spp": (1, 65536), "depth": (2, 100), "wrong_cameras": (0, 20), "wrong_light": (0, 50), "wrong_power": (0, 100),
     "wrong_exposure": (0, 100), "seed": (0, 100_000),
 }  # fmt: skip
 
@@ -159,6 +161,9 @@ def require_options(config: SynthesizeConfig) -> None:
         raise InputError(
             f"--wrong-light: is of places in the cameras' axes, which {config.light} has none of; leave it out"
         )
+    if config.lamps > 1 and (config.light != "lamp" or config.environment or config.pairs):
+        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp, without --environment and without "
+                         "--pairs; leave it out")  # fmt: skip
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
@@ -174,5 +179,5 @@ def require_options(config: SynthesizeConfig) -> None:
     if config.pairs and (config.room == 0 or config.wrong_room):
         raise InputError("--pairs: need a room whose light fits subtract; give --room, for instance 0.2, and leave out "
                          "--wrong-room")  # fmt: skip
-    if not config.environment and config.room == 0 and config.wrong_room:
-        raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, or --environment")
+    if not config.environment and config.room == 0 and config.lamps == 1 and config.wrong_room:
+        raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, --environment or --lamps")

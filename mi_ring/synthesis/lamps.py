@@ -14,6 +14,8 @@ RoomKind = Literal["constant", "harmonics"]
 
 SLOW = 9  #: harmonics of a room that are not 0, those of order 2
 TINT, WAVES = 0.12, 0.5  #: of the light of a room: how colours differ, and brightness with direction, about 1
+APART = 4  #: directions of which a further lamp has the one that is farthest from the others
+WEAKEST = 0.4  #: of a further lamp, by the first
 DARKEST = 0.15  #: radiance of a room in its darkest direction, by its mean
 
 
@@ -38,6 +40,19 @@ def lights_of(
         return [Light("directional", -place / np.linalg.norm(place), np.ones(3)) for place in places]
     intensity = np.full(3, np.median([place @ place for place in places] or [0]))
     return [Light("point", place, intensity) for place in places]
+
+
+def others_of(count: int, first: Light, random: np.random.Generator) -> list[Light]:
+    """More lamps than the `first`, as far from the origin, in other directions; each weaker, and of another colour."""
+    distance, toward = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
+    lights = []
+    for _ in range(count):
+        tries = random.normal(size=(APART, 3))
+        tries /= np.linalg.norm(tries, axis=1, keepdims=True)
+        toward.append(tries[(tries @ np.transpose(toward)).max(1).argmin()])
+        strength = random.uniform(WEAKEST, 1) * (1 + TINT * random.uniform(-1, 1, 3))
+        lights.append(Light("point", distance * toward[-1], first.rgb * strength))
+    return lights
 
 
 def strayed(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
