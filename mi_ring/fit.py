@@ -23,7 +23,6 @@ from mi_ring.system import command
 from mi_ring.system.files import locked, read_json
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
-AFTERWARDS = 30.0  #: seconds that pictures before a fit and its results after it are taken to take
 PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
 
 
@@ -97,7 +96,7 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
     """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
     minutes, costs = choice[0].minutes, measure(fit, all_stages(fit, choice))
-    spent = fit.processes.told(time.monotonic() - started) + AFTERWARDS
+    spent = fit.processes.told(time.monotonic() - started)
     if (needed := spent + fewest_seconds(choice, fit.near, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
                          f"{math.ceil(needed / 6) / 10:g} or more")  # fmt: skip

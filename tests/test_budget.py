@@ -23,17 +23,17 @@ CHOICE = [Config.preset(name) for name in ("fast", "default", "fine")]
 
 
 def test_seconds_are_those_of_the_stages():
-    """Of 100 iterations from a sphere 60 are at level 4 and 40 at level 5."""
+    """Of 100 iterations from a sphere 60 are at level 4 and 40 at level 5; what is around them takes 40 of these."""
     config = Config(iterations=100, levels=(4, 5), widths=(128, 256), shares=(0.6, 0.4))
-    assert budget.seconds_of(config, False, COSTS) == pytest.approx(60 * 0.25 + 40 * 1.0)
+    assert budget.seconds_of(config, False, COSTS) == pytest.approx(60 * 0.25 + 80 * 1.0)
     # From a hull two thirds of the first 60 are exchanged for 40 % as many of the second: 20 and 56.
-    assert budget.seconds_of(config, True, COSTS) == pytest.approx(20 * 0.25 + 56 * 1.0)
+    assert budget.seconds_of(config, True, COSTS) == pytest.approx(20 * 0.25 + 96 * 1.0)
 
 
 @pytest.mark.parametrize("near", [False, True])
 def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near):
     subdivisions, iterations = [], []
-    for seconds in (20, 60, 150, 300, 900, 3000, 9000):
+    for seconds in (60, 100, 150, 300, 900, 3000, 9000):
         config = budget.fitting_into(seconds, CHOICE, near, COSTS)
         taken = budget.seconds_of(config, near, COSTS)
         assert taken <= 1.05 * seconds and taken > 0.9 * seconds
@@ -80,13 +80,13 @@ SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "
 
 
 def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):
-    """Of 60 s 30 are for start and results; at 0.5 s an iteration 60 are left, if the start has taken no time."""
+    """At 0.5 s an iteration 20 of 60 s are for pictures and results, and 80 iterations are left."""
     monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
     monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0))
     call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
     assert command.main(call) == 0
     options = json.loads((tmp_path / "run/config.json").read_text())
-    assert options["iterations"] == 60 and options["minutes"] == 1
+    assert options["iterations"] == 80 and options["minutes"] == 1
     assert read_log(tmp_path / "run")[-1]["iteration"] == options["iterations"]
     assert f"--preset {options['preset']} --iterations {options['iterations']}" in capsys.readouterr().out
     assert command.main([*call, "--resume"]) == 0

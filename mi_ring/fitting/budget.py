@@ -12,6 +12,7 @@ from mi_ring.fitting.schedule import Stage, stages_of
 from mi_ring.system.machine import release_memory
 
 FEWEST = 40  #: iterations: with fewer nothing is to be expected
+AROUND = 40  #: iterations of the last stage that take as long as pictures before a fit and its results after it
 
 Settings = TypeVar("Settings", bound=Config)
 Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and width of its stage
@@ -53,10 +54,10 @@ def fitting_into(seconds: float, configs: Sequence[Settings], near: bool, costs:
 
     `near`: is the start near the object?
     """
-    own = [seconds_of(config, near, costs) for config in configs]
-    nearest = min(range(len(configs)), key=lambda k: abs(math.log(own[k] / seconds)))
-    config = configs[nearest]
-    return dataclasses.replace(config, iterations=max(FEWEST, int(config.iterations * seconds / own[nearest])))
+    config = min(configs, key=lambda config: abs(math.log(seconds_of(config, near, costs) / seconds)))
+    around = seconds_around(config, near, costs)
+    share = (seconds - around) / (seconds_of(config, near, costs) - around)
+    return dataclasses.replace(config, iterations=max(FEWEST, int(config.iterations * share)))
 
 
 def fewest_seconds(configs: Sequence[Config], near: bool, costs: Costs) -> float:
@@ -65,8 +66,15 @@ def fewest_seconds(configs: Sequence[Config], near: bool, costs: Costs) -> float
 
 
 def seconds_of(config: Config, near: bool, costs: Costs) -> float:
-    """What the iterations of a fit take."""
-    return sum((s.last - s.first) * costs[s.level, s.width] for s in stages_of(config, near))
+    """What a fit takes, with pictures before it and results after it."""
+    iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in stages_of(config, near))
+    return iterations + seconds_around(config, near, costs)
+
+
+def seconds_around(config: Config, near: bool, costs: Costs) -> float:
+    """What pictures before a fit and its results after it take, which are as large as photographs of the last stage."""
+    last = stages_of(config, near)[-1]
+    return AROUND * costs[last.level, last.width]
 
 
 def replan(fit: Fit, config: Config) -> None:
