@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,8 @@ from test_bridge import OFF_CAMERA, Setting, tensor
 import mi_ring
 from mi_ring import synthesize
 from mi_ring.fitting.calibration import Calibration, refined_of
-from mi_ring.fitting.lighting import Lighting, brightest, lit
+from mi_ring.fitting.lighting import Lighting, lit
+from mi_ring.fitting.trials import brightest
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light, emitter_of, light_of, place_of, put
 from mi_ring.rendering.rooms import BASIS
@@ -107,11 +107,10 @@ def test_lamps_begin_where_the_environment_is_brightest(count):
     harmonics = np.stack(
         [np.ravel(v) + np.zeros(count) for v in dr.sh_eval(mi.Vector3f(*toward.T.astype(np.float32)), 4)]
     )
-    room = torch.zeros(BASIS, 3)
-    room[:25] = torch.from_numpy(harmonics @ colours).float()
+    room = np.zeros((BASIS, 3))
+    room[:25] = harmonics @ colours
     room[0] += 0.2  # and as much from all sides
-    fit = SimpleNamespace(calibration=SimpleNamespace(room=SimpleNamespace(harmonics=room)))
-    found = brightest(fit, count)
+    found = brightest(room, count)
     assert len(found) == count
     for (direction, colour), true, strength in zip(found, toward, colours):
         assert np.degrees(np.arccos(np.dot(direction, true))) < 10

@@ -21,7 +21,7 @@ from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.lighting import Lighting, frames, lighting_of, lit, smoothed
+from mi_ring.fitting.lighting import Lighting, frames, lit, smoothed
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
@@ -33,6 +33,7 @@ from mi_ring.fitting.start import require_settings, starting_ring
 from mi_ring.fitting.summary import summary
 from mi_ring.fitting.surroundings import with_surroundings
 from mi_ring.fitting.terms import Term, default_terms
+from mi_ring.fitting.trials import lighting_of
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
@@ -182,7 +183,7 @@ class Fit:
         with self.autocast():
             vertices, material = self.ring(s[points.part])
         vertices, *parameters = points.joined([vertices, *material.values()])
-        material = dict(zip(material, parameters))
+        material = self.lighting.shared(dict(zip(material, parameters)), number / self.iterations)
 
         everything, size = self.rounds.draw(config.batch, self.random)
         share = self.processes.share(len(everything))

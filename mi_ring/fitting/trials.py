@@ -1,0 +1,163 @@
+"""Coarse fits, which find out what lights the photographs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import nnls
+
+from mi_ring.capture.capture import Capture
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.lighting import Lighting, exposures, require_unknown, unlit
+from mi_ring.rendering.rooms import directions_of, harmonics_in
+from mi_ring.system.progress import progress
+
+if TYPE_CHECKING:
+    from mi_ring.fitting.fit import Fit
+
+#: Settings of a trial: those that decide alike, whatever the fit's own are.
+COARSE: dict[str, Any] = {
+    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "weights": {},
+    **{name: getattr(Config(), name) for name in (
+        "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
+}  # fmt: skip
+LAST = 12  #: iterations of a trial that tell how well it explains the photographs
+ALIKE = 1.1  #: times that lights may differ in strength without a word
+#: What the scene says is believed unless another light leaves less of its error than this. An environment that is fixed
+#: in the camera looks much like a flash.
+BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
+MOST = 3  #: lamps
+FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
+SHOWN = 1, 2 / 3, 1 / 4  #: of the harmonics of each degree by a diffuse surface
+PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
+LOOSE = 0.6  #: progress at which the material may vary, where it has been taken to be one
+FAINT = 0.02  #: the least strength of a lamp to begin with, by the first
+ROWS = 16  #: of a map of the directions in which lamps are sought
+
+
+def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> Lighting:
+    """What `Config.light` asks for; what is to be found out coarse fits tell, made by `trial`.
+
+    Raises InputError where nothing lights the object, and for what does not go together.
+    """
+    require_unknown(capture, config)
+    if config.light == "capture":
+        return Lighting("capture")
+    exposed = exposures(capture)
+    if exposed.max() > ALIKE * exposed.min():
+        print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
+              "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
+    trials = Trials(capture, config, trial)
+    if config.light in ("environment", "turntable"):
+        found = trials.best(Lighting(config.light))
+    elif config.light == "lamps":
+        found = trials.lamps()
+    else:
+        likely = [Lighting("environment"), trials.one_lamp(), Lighting("turntable")]
+        if not unlit(capture):
+            own = trials.left(Lighting("capture"))
+            likely = [one for one in likely if trials.left(one) < BETTER[one.kind] * own] or [Lighting("capture")]
+        found = trials.best(*likely)
+        if found.kind in ("environment", "lamps"):  # several lamps are between the two
+            found = trials.best(found, trials.lamps())
+    if found.kind in ("environment", "turntable"):
+        found = trials.plain(found)
+    errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
+    print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}")
+    return found
+
+
+class Trials:
+    """Coarse fits of a capture under different lights, each made once."""
+
+    def __init__(self, capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> None:
+        """`config`: of the fit that they are for; `trial`: makes one."""
+        self.capture, self.config, self.trial = capture, config, trial
+        self.errors: dict[Lighting, float] = {}  #: that they leave of the photographs
+        self.environment: np.ndarray | None = None  #: harmonics (BASIS, 3) that a fit under one has found
+
+    def left(self, lighting: Lighting) -> float:
+        """The error that a coarse fit leaves."""
+        if lighting in self.errors:
+            return self.errors[lighting]
+        refine = self.config.refine if lighting.kind == "capture" else recording(self.config)
+        config = replace(self.config, **COARSE, light=lighting.kind, refine=refine)
+        fit = self.trial(self.capture, config, lighting=lighting)
+        iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
+        errors = [it.terms["rgb"] for it in iterations][-LAST:]
+        if lighting == Lighting("environment"):
+            assert fit.calibration is not None
+            self.environment = fit.calibration.room.harmonics.double().numpy(force=True)
+        self.errors[lighting] = float(np.nan_to_num(np.mean(errors), nan=np.inf))
+        return self.errors[lighting]
+
+    def best(self, *lightings: Lighting) -> Lighting:
+        """That which leaves the least."""
+        return min(lightings, key=self.left) if len(lightings) > 1 else lightings[0]
+
+    def lamps(self) -> Lighting:
+        """As few as explain the photographs about as well as more, as far away as the cameras or infinitely far."""
+        several = [self.one_lamp(), *(self.lamps_like(count) for count in range(2, MOST + 1))]
+        enough = FEWER * self.left(self.best(*several))
+        lamps = next(some for some in several if self.left(some) <= enough)
+        return self.best(lamps, lamps._replace(distant=True))
+
+    def one_lamp(self) -> Lighting:
+        """Where the environment is brightest."""
+        return self.lamps_like(1)
+
+    def lamps_like(self, count: int) -> Lighting:
+        """So many lamps that light the object as the environment does."""
+        self.left(Lighting("environment"))
+        assert self.environment is not None
+        return Lighting("lamps", brightest(self.environment, count))
+
+    def plain(self, lighting: Lighting) -> Lighting:
+        """The same, at first on one material, if that explains the photographs about as well."""
+        begun = self.left(lighting._replace(plain=1.0)) < PLAIN * self.left(lighting)
+        return lighting._replace(plain=LOOSE) if begun else lighting
+
+
+def recording(config: Config) -> tuple[Any, ...]:
+    """What a coarse fit under an unknown light refines of what `Config.refine` has: exposures alone."""
+    return tuple(name for name in config.refine if name in ("auto", "gain")) or ("none",)
+
+
+def brightest(environment: np.ndarray, count: int) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+    """So many lamps, as `Lighting` has them, that light an object as an environment does, harmonics (BASIS, 3).
+
+    Of its harmonics up to degree 2, which are what diffuse surfaces show ("An Efficient Representation for Irradiance
+    Environment Maps", Ramamoorthi and Hanrahan 2001), by least squares, beside light that is alike from all sides: each
+    direction in turn is put where it is best, until none moves.
+    """
+    shown = np.repeat(SHOWN, [2 * degree + 1 for degree in range(len(SHOWN))])[:, None]
+    seen = shown * environment[: len(shown)]
+    directions, _ = directions_of(ROWS)
+    lobes = shown * harmonics_in(directions, len(SHOWN) - 1)  # (harmonics, directions)
+    grey = np.eye(len(shown))[:, :1]
+
+    def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
+        """Strengths (n + 1, C) and what is left."""
+        design = np.concatenate([lobes[:, chosen], grey], 1)
+        solved = [nnls(design, colour) for colour in colours.T]
+        return np.stack([strengths for strengths, _ in solved], 1), sum(rest**2 for _, rest in solved)
+
+    chosen: list[int] = []
+    mean = seen.mean(1, keepdims=True)
+    while len(chosen) < count:
+        chosen.append(-1)
+        before: list[int] = []
+        while chosen != before:
+            before = [*chosen]
+            for k in reversed(range(len(chosen))):
+                others = [c for n, c in enumerate(chosen) if n != k and c >= 0]
+                rest = [fitted([*others, c], mean)[1] for c in range(len(directions))]
+                chosen[k] = int(np.argmin(rest))
+    strengths, _ = fitted(chosen, seen)
+    order = np.argsort(-strengths[:-1].mean(1))
+    # The first is white: which colour it has nobody can tell from the object's.
+    relative = strengths / np.maximum(strengths[order[0]], FAINT * strengths[order[0]].mean() + 1e-12)
+    relative = relative.clip(FAINT, 1 / FAINT)
+    relative[order[0]] = 1.0
+    return tuple((tuple(directions[chosen[k]].tolist()), tuple(relative[k].tolist())) for k in order)
