@@ -282,18 +282,23 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
     class Trial:
         iterations = 60
         harmonics = torch.linspace(1, -1, BASIS)[:, None].expand(-1, 3)
-        calibration = SimpleNamespace(room=SimpleNamespace(harmonics=harmonics))
+        calibration = SimpleNamespace(
+            room=SimpleNamespace(harmonics=harmonics, matrix=torch.eye(BASIS).expand(3, -1, -1))
+        )
 
         def __init__(self, capture, config, lighting):
             tried.append(str(lighting))
             assert config.light == lighting.kind and config.widths == (64,)
-            self.error = errors.get(str(lighting), 0.1)
+            self.error, self.capture = errors.get(str(lighting), 0.1), lit(capture, lighting)
+
+        def calibrated(self):
+            return self.capture
 
         def __iter__(self):
             return iter([SimpleNamespace(terms={"rgb": 9.0})] * 48 + [SimpleNamespace(terms={"rgb": self.error})] * 12)
 
-    config = mi_ring.Config.preset("fast", light=light)
-    found = trials.lighting_of(mi_ring.load_capture(small_capture), config, Trial)
+    config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
+    found = trials.lighting_of(capture, config, Trial)
     assert str(found) == believed and found.plain == plain
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
 

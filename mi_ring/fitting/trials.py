@@ -9,8 +9,8 @@ from scipy.optimize import nnls
 
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.lighting import Lighting, exposures, require_unknown, unlit
-from mi_ring.rendering.rooms import directions_of, harmonics_in
+from mi_ring.fitting.lighting import Lighting, exposures, moved, require_unknown, unlit
+from mi_ring.rendering.rooms import COUNT, directions_of, harmonics_in
 from mi_ring.system.progress import progress
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ ALIKE = 1.1  #: times that lights may differ in strength without a word
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
 FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
-SHOWN = 1, 2 / 3, 1 / 4  #: of the harmonics of each degree by a diffuse surface
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
 LOOSE = 0.6  #: progress at which the material may vary, where it has been taken to be one
 FAINT = 0.02  #: the least strength of a lamp to begin with, by the first
@@ -65,7 +64,7 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
         found = trials.plain(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}")
-    return found
+    return trials.found.get(found, found)
 
 
 class Trials:
@@ -75,7 +74,9 @@ class Trials:
         """`config`: of the fit that they are for; `trial`: makes one."""
         self.capture, self.config, self.trial = capture, config, trial
         self.errors: dict[Lighting, float] = {}  #: that they leave of the photographs
-        self.environment: np.ndarray | None = None  #: harmonics (BASIS, 3) that a fit under one has found
+        self.found: dict[Lighting, Lighting] = {}  #: where each has its lamps in the end
+        #: harmonics (COUNT, 3) that a fit under one has found, and how much photographs tell of each (COUNT,)
+        self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def left(self, lighting: Lighting) -> float:
         """The error that a coarse fit leaves."""
@@ -86,9 +87,11 @@ class Trials:
         fit = self.trial(self.capture, config, lighting=lighting)
         iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
         errors = [it.terms["rgb"] for it in iterations][-LAST:]
-        if lighting == Lighting("environment"):
-            assert fit.calibration is not None
-            self.environment = fit.calibration.room.harmonics.double().numpy(force=True)
+        self.found[lighting] = moved(lighting, fit.calibrated())
+        if lighting == Lighting("environment") and fit.calibration:
+            room = fit.calibration.room
+            told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
+            self.environment = room.harmonics.numpy(force=True)[:COUNT], told.numpy(force=True)[:COUNT]
         self.errors[lighting] = float(np.nan_to_num(np.mean(errors), nan=np.inf))
         return self.errors[lighting]
 
@@ -111,7 +114,7 @@ class Trials:
         """So many lamps that light the object as the environment does."""
         self.left(Lighting("environment"))
         assert self.environment is not None
-        return Lighting("lamps", brightest(self.environment, count))
+        return Lighting("lamps", brightest(*self.environment, count))
 
     def plain(self, lighting: Lighting) -> Lighting:
         """The same, at first on one material, if that explains the photographs about as well."""
@@ -124,18 +127,19 @@ def recording(config: Config) -> tuple[Any, ...]:
     return tuple(name for name in config.refine if name in ("auto", "gain")) or ("none",)
 
 
-def brightest(environment: np.ndarray, count: int) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-    """So many lamps, as `Lighting` has them, that light an object as an environment does, harmonics (BASIS, 3).
+def brightest(
+    harmonics: np.ndarray, certainty: np.ndarray, count: int
+) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+    """So many lamps, as `Lighting` has them, that light an object as an environment does.
 
-    Of its harmonics up to degree 2, which are what diffuse surfaces show ("An Efficient Representation for Irradiance
-    Environment Maps", Ramamoorthi and Hanrahan 2001), by least squares, beside light that is alike from all sides: each
-    direction in turn is put where it is best, until none moves.
+    `harmonics` (COUNT, 3) of that, and how much photographs tell of each, `certainty` (COUNT,). By least squares,
+    beside light that is alike from all sides: each direction in turn is put where it is best, until none moves.
     """
-    shown = np.repeat(SHOWN, [2 * degree + 1 for degree in range(len(SHOWN))])[:, None]
-    seen = shown * environment[: len(shown)]
+    shown = np.sqrt(np.maximum(certainty, 0))[:, None]
+    seen = shown * harmonics
     directions, _ = directions_of(ROWS)
-    lobes = shown * harmonics_in(directions, len(SHOWN) - 1)  # (harmonics, directions)
-    grey = np.eye(len(shown))[:, :1]
+    lobes = shown * harmonics_in(directions)  # (harmonics, directions)
+    grey = shown * np.eye(COUNT)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
         """Strengths (n + 1, C) and what is left."""
