@@ -12,6 +12,7 @@ from mi_ring.errors import InputError
 from mi_ring.experiments.catalogue import EXPERIMENTS
 from mi_ring.experiments.engine import perform
 from mi_ring.experiments.experiment import Asked
+from mi_ring.fit_config import MOST_THREADS
 from mi_ring.fitting.config import as_typed
 from mi_ring.system import command
 from mi_ring.system.files import locked
@@ -61,8 +62,8 @@ class PaperConfig:
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if a run has failed."""
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
-    if config.threads < 0:
-        raise InputError(f"--threads: is {config.threads}, must be 0 or more")
+    if not 0 <= config.threads <= MOST_THREADS:
+        raise InputError(f"--threads: is {config.threads}, must be 0 to {MOST_THREADS}")
     if not config.seeds or len({*config.seeds}) < len(config.seeds):
         raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
     if missing := next((path for path in config.data if not path.exists()), None):

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import re
 import shutil
+import threading
 import time
 from pathlib import Path
 from unittest.mock import Mock
@@ -154,7 +155,7 @@ MISTAKES = [
     (["table1", "--seeds", "1", "1"], "--seeds: is 1 1, must be different"),
     (["table1", "--seeds", "x"], r"--seeds: is x, must be INT \[INT \.\.\.\]"),
     (["table1", "--quick", "--preset", "fine"], "--preset: is fine, but --quick is by fast; leave one of the two out"),
-    (["table1", "--threads", "-1"], "--threads: is -1, must be 0 or more"),
+    (["table1", "--threads", "-1"], "--threads: is -1, must be 0 to 1024"),
     (["table1", "EMPTY"], "scene.xml"),
     (["table1", "--only", "other"], "--only: has other, must be of"),
     (["table2"], "DATA: table2 needs one folder, that of DiLiGenT-MV"),
@@ -375,3 +376,21 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     wrong = recipes.Perturbed("said", exact, 0.5, 0)
     assert load_capture(exact.scene).known and not load_capture(wrong.made(tmp_path)).known
     said.unlink()
+
+
+def test_captures_are_made_in_turn(tmp_path):
+    """What one experiment makes another waits for."""
+    done = []
+
+    def make(name):
+        with in_turn(tmp_path / "captures"):
+            done.append(name)
+
+    with in_turn(tmp_path / "captures"):
+        other = threading.Thread(target=make, args=["second"])
+        other.start()
+        other.join(0.3)
+        assert other.is_alive() and not done
+        done.append("first")
+    other.join(10)
+    assert done == ["first", "second"]

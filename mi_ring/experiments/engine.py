@@ -24,7 +24,7 @@ from mi_ring.metrics.evaluation import rounded
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.rendering.plain_mesh import scene_of
 from mi_ring.system.command import interrupted
-from mi_ring.system.files import read_json, write_file
+from mi_ring.system.files import in_turn, read_json, write_file
 from mi_ring.system.machine import threads_of
 from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
@@ -66,7 +66,8 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
         captures, folder = out.parent / "captures" / asked.size, out.resolve() / "runs" / run.name
         if not wanted and not run.recipe.place(captures).is_file():
             return Outcome(run)
-        scene = run.recipe.made(captures)
+        with in_turn(captures):  # other experiments may make the same
+            scene = run.recipe.made(captures)
         made = Made(folder, scene, run.recipe.truth(captures), captures, asked)
         job = Job(scene.resolve(), folder, run.options(asked))
         fingerprint = job.fingerprint()

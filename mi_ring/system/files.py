@@ -124,6 +124,15 @@ def read_json(path: Path) -> Any:
 
 
 @contextlib.contextmanager
+def in_turn(folder: Path) -> Iterator[None]:
+    """Make something in a folder, which is made if it is not there, after other processes that do so have done it."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with filelock.FileLock(folder / ".lock"):
+        yield
+
+
+@contextlib.contextmanager
 def locked(folder: Path, field: str = "--out") -> Iterator[None]:
     """Keep other processes from writing into a folder. Raises InputError if one does already.
 
