@@ -31,6 +31,7 @@ from mi_ring.ring.ring import Ring
 from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import load_material, pattern_of
 from mi_ring.synthesis.stage import shape_of
+from mi_ring.system.files import in_turn
 
 TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
 
