@@ -181,6 +181,7 @@ def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 12}, light="lamps")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("lamps", begun))
     assert fit.calibration.refined == ("light", "gain", "ambient", "lamps")
+    assert fit.calibration.widths["light"] == fit.calibration.widths["lamp"] == pytest.approx(0.3)  # nobody measured them
     errors = [it.terms["rgb"] for it in fit]
     assert np.mean(errors[-4:]) < 0.8 * errors[0]
     resumed = mi_ring.Fit(capture, config, state=fit.state())

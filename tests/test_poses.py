@@ -1,5 +1,7 @@
 """Gauss-Newton steps of the cameras: how pictures move with them, and where the steps lead."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import mi_ring
 from mi_ring.fitting.poses import curvature, motion, slopes
+from mi_ring.fitting.powers import Powers
 from mi_ring.geometry.camera import Camera
 
 SIZE = (7, 5)
@@ -168,3 +171,27 @@ def test_powers_go_where_photographs_were_lit(small_capture):
         fit.step()
     assert wrong > 1 and off() < 0.1  # of 10 %
     assert torch.equal(calibration.power[others], before)
+
+
+def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
+    """Blue is a tenth as bright as red; highlights, where the prediction is wrong, are bright in it alone."""
+    fit, _ = posed(small_capture, refine=("power",))
+    powers = Powers(fit.calibration, "power")
+    predicted = torch.tensor([0.4, 0.2, 0.03]).expand(3, 8, 10, 3).clone()
+    factors = torch.tensor([[1.2, 1.0, 0.9], [0.8, 1.1, 1.0], [1.0, 1.0, 1.3]])
+    observed = predicted * factors[:, None, None]
+    predicted[:, :2, :5] += 0.5
+    observed[:, :2, :5] += torch.tensor([0.9, 0.2, 0.5])[:, None, None, None]
+    observed[2, :, :, 1] = 1e-4  # nothing to be told of
+    inside = torch.ones(3, 8, 10, dtype=torch.bool)
+    it = SimpleNamespace(
+        progress=0.5, fit=fit, surely=lambda: inside, clipped=torch.zeros(3, 8, 10, 3, dtype=torch.bool),
+        observed=observed, predicted=predicted, index=[4, 7, 2], everything=np.array([4, 7, 2]),
+        share=SimpleNamespace(gathered=lambda t: t),
+    )  # fmt: skip
+    powers.look(it)
+    found = torch.stack([brighter for _, brighter in powers.seen])
+    expected = factors.log() - factors.log().mean(0)
+    expected[:, 1] = torch.tensor([-0.5, 0.5, 0.0]) * np.log(1.1)
+    assert [k for k, _ in powers.seen] == [4, 7, 2]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

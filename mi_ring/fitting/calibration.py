@@ -64,6 +64,7 @@ AUTO = "light", "power", "ambient"
 OF_ONE = {"cameras", "power", "gain"}  #: what is another in each photograph; steps of their own find it
 #: What is of the photographs' own lights, which an unknown environment takes the place of.
 OF_LIGHTS = {"light", "power", "falloff", "scale"}
+VAGUE = 3.0  #: times as wide are the priors of where lights are that nobody has measured
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 START = 0.2  #: progress of the fit when refinement begins
 LIT = 0.15  #: and when that of the room's light does
@@ -114,12 +115,13 @@ class Calibration(nn.Module):
 
     def __init__(
         self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0,
-        fitted: np.ndarray | None = None, frames: Collection[str] = ("world",),
+        fitted: np.ndarray | None = None, frames: Collection[str] = ("world",), guessed: bool = False,
     ) -> None:  # fmt: skip
         """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
 
         `power`: a factor of what the capture says of the lights' intensities, to begin with; `fitted`: indices of the
-        photographs that are not kept out, by default all; `frames`: axes in which a room's light is fixed.
+        photographs that are not kept out, by default all; `frames`: axes in which a room's light is fixed; `guessed`:
+        has nobody measured where the lights are?
         """
         super().__init__()
         self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
@@ -166,7 +168,9 @@ class Calibration(nn.Module):
                   "light": (int(places.max()) + 1, 3), "power": (count, 3), "gain": (count, 3),
                   "curve": (), "contrast": (), "scale": (),
                   "lamp": self.lamps.places.shape, "strength": self.lamps.places.shape}  # fmt: skip
-        self.widths = {name: width for group in self.refined for name, width in UNKNOWNS[group].items()}
+        vague = dict.fromkeys(("light", "lamp"), VAGUE if guessed else 1.0)
+        self.widths = {name: width * vague.get(name, 1.0)
+                       for group in self.refined for name, width in UNKNOWNS[group].items()}  # fmt: skip
         for name in self.widths:
             self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
         given = capture.photographs.room

@@ -118,7 +118,7 @@ class Fit:
         if refined := refined_of(seen, chosen, self.albedo):
             power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
             self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
-                                           frames(capture, self.lighting))  # fmt: skip
+                                           frames(capture, self.lighting), bool(self.lighting.lamps))  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)

@@ -17,7 +17,8 @@ from mi_ring.fitting.terms import Term
 
 RATE, DECAY = 0.5, 0.1  #: share of what an iteration says that is believed at first, and what that falls to
 PULL = 0.01  #: toward what the scene says, by that
-BRIGHT = 0.3  #: radiance from which pixels tell, in units of the exposure
+BRIGHT = 0.3  #: radiance from which pixels tell, by the object's median in that photograph and colour
+BLACK = 0.01  #: and below which none does, in units of the exposure
 ENOUGH = 30  #: pixels
 
 
@@ -34,23 +35,28 @@ class Powers(torch.optim.Optimizer):
     def look(self, it: Iteration) -> None:
         """Take note of how much brighter photographs are than predicted: in the median of the object's pixels.
 
-        By all that were seen together: what is common to them is the reflectance's, which changes in each iteration.
+        In each colour by those that are bright enough in it, as bright as the object is in that colour. By all
+        photographs that were seen together: what is common to them is the reflectance's, which changes in each
+        iteration.
         """
         self.seen = []
         if it.progress < START:
             return
-        least = BRIGHT * it.fit.exposure
-        telling = it.surely() & ~it.clipped.any(-1) & (torch.minimum(it.observed, it.predicted) > least).all(-1)
+        surely, floor = it.surely() & ~it.clipped.any(-1), BLACK * it.fit.exposure
         brighter = torch.full((len(it.index), 3), torch.nan)
-        for n in range(len(it.index)):
-            if int(telling[n].sum()) >= ENOUGH:
-                brighter[n] = (it.observed[n][telling[n]] / it.predicted[n][telling[n]]).log().median(0).values
+        for n, inside in enumerate(surely):
+            if not inside.any():
+                continue
+            both = torch.stack([it.observed[n][inside], it.predicted[n][inside]])  # (2, pixels, 3)
+            telling = both.amin(0) > (BRIGHT * both.median(1).values.amin(0)).clamp(min=floor)
+            for colour in range(3):
+                observed, predicted = both[:, telling[:, colour], colour]
+                if len(observed) >= ENOUGH:
+                    brighter[n, colour] = (observed / predicted).log().median()
         brighter = it.share.gathered(brighter)
-        told = ~brighter.isnan().any(1)
-        if int(told.sum()) < 2:
-            return
-        brighter = brighter[told]
-        self.seen = list(zip(it.everything[told.numpy()].tolist(), brighter - brighter.mean(0)))
+        told = (~brighter.isnan()).sum(0) >= 2  # colours
+        usual = torch.where(told, brighter.nanmean(0), torch.nan)
+        self.seen = list(zip(it.everything.tolist(), (brighter - usual).nan_to_num(0.0)))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
