@@ -250,7 +250,7 @@ def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
 
 
 def test_a_lamp_is_one_for_all(small_capture):
-    one = Lighting("lamps", (((0.6, -0.64, 0.48), (1.0, 1.0, 1.0)),))
+    one = Lighting("lamps", (((30.0, -40.0, 20.0), (500.0, 500.0, 500.0)),))
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamps")
     fit = mi_ring.Fit(mi_ring.load_capture(small_capture), config, lighting=one)
     assert fit.calibration.refined == ("light", "gain", "ambient")

@@ -61,10 +61,12 @@ UNKNOWNS: dict[str, dict[str, float]] = {
 #: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
 #: the reflectance, and takes the flash's place and the room along (docs/phone.md).
 AUTO = "light", "power", "ambient"
+#: What is unknown under each `Config.light` that is.
+NOBODY_KNOWS = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
 OF_ONE = {"cameras", "power", "gain"}  #: what is another in each photograph; steps of their own find it
 #: What is of the photographs' own lights, which an unknown environment takes the place of.
 OF_LIGHTS = {"light", "power", "falloff", "scale"}
-VAGUE = 3.0  #: times as wide are the priors of where lights are that nobody has measured
+VAGUE = 3.0  #: times as wide are priors, and steps, of where lights are that nobody has measured
 RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
 START = 0.2  #: progress of the fit when refinement begins
 LIT = 0.15  #: and when that of the room's light does
@@ -78,9 +80,7 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
-    unknown = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient"}}.get(config.light)
-    if config.light == "lamps" and lamps_of(capture.scene):
-        names.add("lamps")
+    unknown = NOBODY_KNOWS.get(config.light)
     if unknown or capture.photographs.dark:
         names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
@@ -89,7 +89,7 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
-    return tuple(name for name in UNKNOWNS if name in names)
+    return tuple(name for name in UNKNOWNS if name in names and (name != "lamps" or lamps_of(capture.scene)))
 
 
 def overall(refined: Sequence[str], albedo: float) -> float:
@@ -148,8 +148,7 @@ class Calibration(nn.Module):
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
-        #: of the scene, if they are unknown
-        self.lamps = Lamps.of([light_of(lamp) for lamp in lamps_of(capture.scene) if "lamps" in refined])
+        self.lamps = Lamps.of([light_of(lamp) for lamp in lamps_of(capture.scene) if "lamps" in refined])  #: unknown
         self.sizes = [sensor.size for sensor in capture.sensors]
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
@@ -212,20 +211,21 @@ class Calibration(nn.Module):
 
     def lamps_now(self) -> Lamps:
         """The lamps of the scene as they are by now."""
-        power = self.value("strength") + self.value("scale").detach()
-        lamps = self.lamps._replace(strengths=self.first_power * self.lamps.strengths * power.exp())
-        return lamps.moved(self.value("lamp"), self.distance)
+        factor = self.first_power * (self.value("strength") + self.value("scale").detach()).exp()
+        return self.lamps._replace(strengths=factor * self.lamps.strengths).moved(self.value("lamp"), self.distance)
 
-    def lighting(self) -> list[Tensor]:
+    def lamp_tensors(self) -> list[Tensor]:
         """What `bridge.render` takes as `lamps`: nothing if these stay as they are."""
+        if "lamps" not in self.refined:
+            return []
         now = self.lamps_now()
-        return [now.places.to(device()), now.strengths.to(device())] if "lamps" in self.refined else []
+        return [now.places.to(device()), now.strengths.to(device())]
 
     @torch.no_grad()
     def relight(self, surface: bridge.Surface) -> None:
         """Light a surface by the lamps of the scene as they are by now."""
-        if "lamps" in self.refined:
-            surface.relight(*map(bridge.to_drjit, self.lighting()))
+        if lamps := self.lamp_tensors():
+            surface.relight(*map(bridge.to_drjit, lamps))
 
     def centred(self, name: str) -> Tensor:
         """(P, 3) `power` or `gain`, logarithms of factors, of mean 0; 0 of photographs that are kept out."""

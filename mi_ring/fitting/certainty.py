@@ -73,6 +73,7 @@ def deviations(fit: "Fit") -> dict[str, np.ndarray]:
     for index in fit.capture.together(fit.fitted):
         scale = -(-fit.capture.sensors[index[0]].size[0] // WIDTH)
         compare(fit, calibration, index, scale, entries, colours, outlines)
+    calibration.relight(fit.surface)  # as it was
     precision = np.eye(entries.count) + colours.information() + outlines.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
     return {

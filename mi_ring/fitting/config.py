@@ -79,7 +79,8 @@ class Config:
     """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
     base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
     shadows: bool = True
-    """Is a point lit only if it sees the light, while fitting? Pictures of the result follow the scene's integrator."""
+    """Is a point lit only if it sees its photograph's light, while fitting? The scene's own lamps cast shadows in any
+    case, and pictures of the result follow the scene's integrator."""
     indirect: bool = True
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))

@@ -92,7 +92,7 @@ class Fit:
         if self.config.deterministic:
             recompute_normals(capture.scene)
         lighting = Lighting(*state["lighting"]) if state else lighting  # under which `capture` is
-        self.lighting = lighting or lighting_of(capture.part(self.fitted), self.config, Fit)
+        self.lighting = lighting or self.processes.told(lighting_of(capture.part(self.fitted), self.config, Fit))
         #: `environment`: harmonics of what the scene says of one, if it says so.
         self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
         capture = self.capture
@@ -197,7 +197,7 @@ class Fit:
         predicted, coverage = bridge.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
-            lamps=self.calibration.lighting() if self.calibration else [],
+            lamps=self.calibration.lamp_tensors() if self.calibration else [],
         )  # fmt: skip
         predicted = with_surroundings(self, predicted, coverage, photographs, seen, everything, scale, share)
         if self.calibration:

@@ -76,17 +76,19 @@ def confirm(fit: "Fit") -> dict:
     if calibration is None:
         return {"unexplained": now, "put_back": back}
     for name in [name for name in calibration.refined if name in SHARED]:
-        unknown, given = calibration.unknown(name)
-        found = unknown.detach().clone()
-        if torch.equal(found, given):  # nothing was found that could be put back
+        unknowns = [calibration.unknown(own) for own in UNKNOWNS[name] or [name]]
+        found = [unknown.detach().clone() for unknown, _ in unknowns]
+        if all(torch.equal(one, given) for one, (_, given) in zip(found, unknowns)):  # nothing could be put back
             continue
         with torch.no_grad():
-            unknown.copy_(given)
+            for unknown, given in unknowns:
+                unknown.copy_(given)
             without = unexplained_now()
             if without <= now:
                 now, back = without, [*back, name]
             else:
-                unknown.copy_(found)
+                for one, (unknown, _) in zip(found, unknowns):
+                    unknown.copy_(one)
                 fit.follow_power()
     found_by_now = copy.deepcopy(calibration.state_dict())
     with torch.no_grad():

@@ -23,15 +23,15 @@ from mi_ring.rendering.scenes import lamps_of
 from mi_ring.rendering.shading import shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
+Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `rgb` of a `Light`, that can be saved
 
 
 class Lighting(NamedTuple):
     """The lights of the photographs, as a fit begins."""
 
     kind: Kind  #: of `Config.light`, but for "auto"
-    #: Where they are from the object, by the cameras' distance, and how strong each colour is, by the first's.
-    lamps: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
-    distant: bool = False  #: Are they infinitely far away, in these directions?
+    lamps: tuple[Lamp, ...] = ()
+    distant: bool = False  #: Are they infinitely far away?
     plain: float = 0.0  #: progress of the fit until which the object is taken to be of one material
 
     def __str__(self) -> str:
@@ -91,26 +91,16 @@ def exposures(capture: Capture) -> np.ndarray:
     return strengths / strengths.mean(0)
 
 
-def middle_of(capture: Capture) -> tuple[np.ndarray, float]:
-    """Where the object is, (3,), and how far the cameras are from there, in the median."""
-    center, _ = capture.sphere()
-    return center, float(np.median([np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors]))
-
-
 def moved(lighting: Lighting, capture: Capture) -> Lighting:
-    """The same with lamps where a fit that began so, `capture` as it has calibrated it, has them in the end."""
+    """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it."""
     if not lighting.lamps:
         return lighting
-    center, away = middle_of(capture)
     lights = [capture.photographs.lights[0], *map(light_of, lamps_of(capture.scene))]
-    places = [-light.vector if lighting.distant else (light.vector - center) / away for light in lights]
-    colours = [light.rgb / lights[0].rgb for light in lights]
-    lamps = tuple((tuple(place.tolist()), tuple(colour.tolist())) for place, colour in zip(places, colours))
-    return lighting._replace(lamps=lamps)
+    return lighting._replace(lamps=tuple((tuple(light.vector), tuple(light.rgb)) for light in lights))
 
 
 def lit(capture: Capture, lighting: Lighting) -> Capture:
-    """The capture under these lights: an environment is grey and alike from all sides to begin with, a lamp white.
+    """The capture under these lights: an environment is grey and alike from all sides to begin with.
 
     More lamps than one are the scene's.
     """
@@ -118,12 +108,8 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
         return capture
     cameras, exposure = [sensor.camera for sensor in capture.sensors], capture.exposure()
     if lighting.lamps:
-        center, away = middle_of(capture)
-        lights = []
-        for place, colour in lighting.lamps:
-            rgb = math.pi * exposure / ALBEDO * np.array(colour)
-            lights.append(Light("directional", -np.array(place), rgb) if lighting.distant else
-                          Light("point", center + away * np.array(place), away**2 * rgb))  # fmt: skip
+        kind: Literal["point", "directional"] = "directional" if lighting.distant else "point"
+        lights = [Light(kind, np.array(vector), np.array(rgb)) for vector, rgb in lighting.lamps]
         return with_calibration(capture, cameras, lights[:1] * len(cameras), falloff=[0.0] * len(cameras),
                                 gains=exposures(capture), lamps=lights[1:] or None)  # fmt: skip
     harmonics = np.zeros((BASIS, 3))

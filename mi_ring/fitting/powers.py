@@ -29,15 +29,15 @@ class Powers(torch.optim.Optimizer):
         """`name`: power or gain."""
         self.power, self.width = calibration.unknown(name)[0], calibration.widths[name]
         super().__init__([{"params": [self.power], "initial_lr": RATE, "decay": DECAY, "start": START}], {"lr": RATE})
-        self.seen: list[tuple[int, Tensor]] = []  # which photographs, and logarithms (3,) of how much brighter
+        #: which photographs, and logarithms (3,) of how much brighter, NaN where they tell nothing
+        self.seen: list[tuple[int, Tensor]] = []
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
         """Take note of how much brighter photographs are than predicted: in the median of the object's pixels.
 
-        In each colour by those that are bright enough in it, as bright as the object is in that colour. By all
-        photographs that were seen together: what is common to them is the reflectance's, which changes in each
-        iteration.
+        In each colour by those that are not much darker in it than the object mostly is. By all photographs that were
+        seen together: what is common to them is the reflectance's, which changes in each iteration.
         """
         self.seen = []
         if it.progress < START:
@@ -56,14 +56,15 @@ class Powers(torch.optim.Optimizer):
         brighter = it.share.gathered(brighter)
         told = (~brighter.isnan()).sum(0) >= 2  # colours
         usual = torch.where(told, brighter.nanmean(0), torch.nan)
-        self.seen = list(zip(it.everything.tolist(), (brighter - usual).nan_to_num(0.0)))
+        self.seen = list(zip(it.everything.tolist(), brighter - usual))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
         """One; none if it has not begun."""
         (group,) = self.param_groups
         for k, brighter in self.seen:
-            self.power[k] += group["lr"] * (brighter / self.width - PULL * self.power[k])
+            change = group["lr"] * (brighter / self.width - PULL * self.power[k])
+            self.power[k] += change.nan_to_num(0.0)  # of colours of which the photograph tells nothing
 
 
 Looker: TypeAlias = GaussNewton | Powers  #: an optimiser that goes by more of an iteration than its gradients

@@ -32,7 +32,7 @@ def require_settings(capture: Capture, config: Config) -> None:
     if "masks" in config.refine and capture.threshold is not None:
         raise InputError(f"{capture.path}: --refine masks: they are those of a dark room, found by brightness; "
                          "leave it out, or give others")  # fmt: skip
-    if "lamps" in config.refine and config.light == "capture" and not lamps_of(capture.scene):
+    if "lamps" in config.refine and config.light != "lamps" and not lamps_of(capture.scene):
         raise InputError(f"{capture.path}: emitter: --refine lamps: the scene has none, point or directional, beside "
                          "the photographs' own lights; leave it out")  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Coarse fits, which find out what lights the photographs."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import nnls
 
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.lighting import Lighting, exposures, moved, require_unknown, unlit
 from mi_ring.rendering.rooms import COUNT, directions_of, harmonics_in
@@ -31,7 +32,7 @@ MOST = 3  #: lamps
 FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
 LOOSE = 0.6  #: progress at which the material may vary, where it has been taken to be one
-FAINT = 0.02  #: the least strength of a lamp to begin with, by the first
+FAINT = 0.1  #: the least strength of a lamp to begin with, by the first
 ROWS = 16  #: of a map of the directions in which lamps are sought
 
 
@@ -49,11 +50,11 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
               "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
     trials = Trials(capture, config, trial)
     if config.light in ("environment", "turntable"):
-        found = trials.best(Lighting(config.light))
+        found = Lighting(config.light)
     elif config.light == "lamps":
         found = trials.lamps()
     else:
-        likely = [Lighting("environment"), trials.one_lamp(), Lighting("turntable")]
+        likely = [Lighting("environment"), trials.brightest(1), Lighting("turntable")]
         if not unlit(capture):
             own = trials.left(Lighting("capture"))
             likely = [one for one in likely if trials.left(one) < BETTER[one.kind] * own] or [Lighting("capture")]
@@ -97,24 +98,26 @@ class Trials:
 
     def best(self, *lightings: Lighting) -> Lighting:
         """That which leaves the least."""
-        return min(lightings, key=self.left) if len(lightings) > 1 else lightings[0]
+        return min(lightings, key=self.left)
 
     def lamps(self) -> Lighting:
         """As few as explain the photographs about as well as more, as far away as the cameras or infinitely far."""
-        several = [self.one_lamp(), *(self.lamps_like(count) for count in range(2, MOST + 1))]
-        enough = FEWER * self.left(self.best(*several))
+        several = [self.brightest(count) for count in range(1, MOST + 1)]
+        enough = FEWER * min(map(self.left, several))
         lamps = next(some for some in several if self.left(some) <= enough)
-        return self.best(lamps, lamps._replace(distant=True))
+        return self.best(lamps, self.brightest(len(lamps.lamps), distant=True))
 
-    def one_lamp(self) -> Lighting:
-        """Where the environment is brightest."""
-        return self.lamps_like(1)
-
-    def lamps_like(self, count: int) -> Lighting:
-        """So many lamps that light the object as the environment does."""
+    def brightest(self, count: int, distant: bool = False) -> Lighting:
+        """So many lamps that light the object as the environment does, and as strongly as makes its albedo a half."""
         self.left(Lighting("environment"))
         assert self.environment is not None
-        return Lighting("lamps", brightest(*self.environment, count))
+        center, _ = self.capture.sphere()
+        away = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in self.capture.sensors])
+        directions, colours = brightest(*self.environment, count)
+        vectors = -directions if distant else center + away * directions
+        rgb = math.pi * self.capture.exposure() / ALBEDO * colours * (1.0 if distant else away**2)
+        lamps = tuple((tuple(vector), tuple(one)) for vector, one in zip(vectors.tolist(), rgb.tolist()))
+        return Lighting("lamps", lamps, distant)
 
     def plain(self, lighting: Lighting) -> Lighting:
         """The same, at first on one material, if that explains the photographs about as well."""
@@ -127,12 +130,11 @@ def recording(config: Config) -> tuple[Any, ...]:
     return tuple(name for name in config.refine if name in ("auto", "gain")) or ("none",)
 
 
-def brightest(
-    harmonics: np.ndarray, certainty: np.ndarray, count: int
-) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-    """So many lamps, as `Lighting` has them, that light an object as an environment does.
+def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """So many directions (count, 3) of lamps that light an object as an environment does, and colours (count, 3).
 
-    `harmonics` (COUNT, 3) of that, and how much photographs tell of each, `certainty` (COUNT,). By least squares,
+    Colours are by the first's, which is white: which colour it has nobody can tell from the object's. `harmonics`
+    (COUNT, 3) of the environment, and how much photographs tell of each, `certainty` (COUNT,). By least squares,
     beside light that is alike from all sides: each direction in turn is put where it is best, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
@@ -160,8 +162,7 @@ def brightest(
                 chosen[k] = int(np.argmin(rest))
     strengths, _ = fitted(chosen, seen)
     order = np.argsort(-strengths[:-1].mean(1))
-    # The first is white: which colour it has nobody can tell from the object's.
-    relative = strengths / np.maximum(strengths[order[0]], FAINT * strengths[order[0]].mean() + 1e-12)
-    relative = relative.clip(FAINT, 1 / FAINT)
-    relative[order[0]] = 1.0
-    return tuple((tuple(directions[chosen[k]].tolist()), tuple(relative[k].tolist())) for k in order)
+    first = strengths[order[0]]
+    colours = (strengths[order] / np.maximum(first, FAINT * first.mean() + 1e-12)).clip(FAINT, 1 / FAINT)
+    colours[0] = 1.0
+    return directions[chosen][order], colours

@@ -17,7 +17,7 @@ from mi_ring.images import blur
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
 from mi_ring.rendering.edges import Edges
 from mi_ring.rendering.indirect import BOUNCES, render_indirect
-from mi_ring.rendering.lights import light_of, put
+from mi_ring.rendering.lights import light_of, place_lamp
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
@@ -113,7 +113,7 @@ class Surface:
             self.scene, self.own_lamps = with_lamps(self.scene, map(light_of, lamps_of(self.scene))), True
             self.params = mi.traverse(self.scene)
         for k, lamp in enumerate(lamps_of(self.scene)):
-            put(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
+            place_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
     def show(self, ring, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
         """Write a `Ring` at domain points (V, 3) with these triangles, where the flow has them at `time` in [0, 1]."""

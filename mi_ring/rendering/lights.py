@@ -137,7 +137,7 @@ def emitter_of(light: Light) -> mi.Emitter:
     return mi.load_dict({"type": light.kind, **where, strength: {"type": "rgb", "value": light.rgb.tolist()}})
 
 
-def put(emitter, place, strength) -> None:
+def place_lamp(emitter, place, strength) -> None:
     """Change an emitter that `emitter_of` has made: its position, or the unit direction toward it, and its RGB.
 
     All may be attached.
