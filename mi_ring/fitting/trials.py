@@ -29,6 +29,7 @@ ALIKE = 1.1  #: times that lights may differ in strength without a word
 #: in the camera looks much like a flash.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
+APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
 LOOSE = 0.6  #: progress at which the material may vary, where it has been taken to be one
@@ -103,9 +104,18 @@ class Trials:
     def lamps(self) -> Lighting:
         """As few as explain the photographs about as well as more, as far away as the cameras or infinitely far."""
         several = [self.brightest(count) for count in range(1, MOST + 1)]
-        enough = FEWER * min(map(self.left, several))
-        lamps = next(some for some in several if self.left(some) <= enough)
+        enough = FEWER * min(self.left(some) for some in several if self.apart(some))
+        lamps = next(some for some in several if self.apart(some) and self.left(some) <= enough)
         return self.best(lamps, self.brightest(len(lamps.lamps), distant=True))
+
+    def apart(self, lamps: Lighting) -> bool:
+        """Are they, seen from the object, where a coarse fit has moved them? Else two stand for one elsewhere."""
+        self.left(lamps)
+        center, _ = self.capture.sphere()
+        toward = np.array([vector for vector, _ in self.found[lamps].lamps]) - center
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        cosines = (toward @ toward.T)[~np.eye(len(toward), dtype=bool)]
+        return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
         """So many lamps that light the object as the environment does, and as strongly as makes its albedo a half."""
