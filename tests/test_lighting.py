@@ -264,7 +264,7 @@ DECISIONS = [
     ("lamps", {"1 lamp": 0.08, "2 lamps": 0.079, "3 lamps": 0.09, "1 distant lamp": 0.07}, "1 distant lamp", 0),
     ("lamps", {"1 lamp": 0.06, "2 lamps": 0.05, "3 lamps": 0.058, "together": ("2 lamps", "3 lamps"),
                "1 distant lamp": 0.07}, "1 lamp", 0),
-    ("environment", {"environment": 0.1, "environment on one material": 0.11}, "environment on one material", 0.6),
+    ("environment", {"environment": 0.1, "environment on one material": 0.11}, "environment on one material", 0.35),
     ("environment", {"environment": 0.1, "environment on one material": 0.13}, "environment", 0),
     ("turntable", {"turntable": 0.1, "turntable on one material": 0.13}, "turntable", 0),
     ("auto", {"environment": 0.095, "1 lamp": 0.094, "turntable": 0.07, "capture": 0.1}, "capture", 0),
@@ -272,7 +272,7 @@ DECISIONS = [
               "2 distant lamps": 0.09}, "2 lamps", 0),
     ("auto", {"environment": 0.08, "1 lamp": 0.095, "turntable": 0.07, "capture": 0.1, "2 lamps": 0.09, "3 lamps": 0.09,
               "1 distant lamp": 0.09, "2 distant lamps": 0.09, "environment on one material": 0.09},
-     "environment on one material", 0.6),
+     "environment on one material", 0.35),
 ]  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def require_settings(capture: Capture, config: Config) -> None:
                          "leave it out, or give others")  # fmt: skip
     if "lamps" in config.refine and config.light != "lamps" and not lamps_of(capture.scene):
         raise InputError(f"{capture.path}: emitter: --refine lamps: the scene has none, point or directional, beside "
-                         "the photographs' own lights; leave it out")  # fmt: skip
+                         "the photographs' own lights; leave it out, or find them all by --light lamps")  # fmt: skip
 
 
 def starting_ring(

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
     """What was refined: of each unknown `before`, `after` and, but for the room's light, `std`, given the surface.
 
-    `photographs`: of each that was not kept out how far its picture of the object moved [px]; if cameras were refined
-    how far it was turned and moved, if powers or gains were, the factor of each colour. `refined`: the capture with all
-    of it; `deviations`: as `mi_ring.fitting.certainty` has them.
+    `light`: what it was taken to be. `photographs`: of each that was not kept out how far its picture of the object
+    moved [px]; if cameras were refined how far it was turned and moved, if powers or gains were, the factor of each
+    colour. `refined`: the capture with all of it; `deviations`: as `mi_ring.fitting.certainty` has them.
     """
     calibration = fit.calibration
     assert calibration is not None
@@ -43,14 +43,19 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         first = np.unique(calibration.place.numpy(), return_index=True)[1]
         before, after = (c.photographs.lights.positions()[first] for c in (fit.capture, refined))
         units = np.where(calibration.finite.numpy()[first], calibration.distance, 1.0)
-        add("light", "places of the lights [scene units], directions to distant ones", before, after,
+        which = "place of the first lamp" if fit.lighting.lamps else "places of the lights"
+        add("light", f"{which} [scene units], directions to distant ones", before, after,
             units * deviations["light"])  # fmt: skip
     if "lamp" in now:
         with torch.no_grad():
             lamps, found = calibration.lamps, calibration.lamps_now()
-        add("lamp", "places of the scene's lamps [scene units], directions to distant ones", lamps.places, found.places,
+        which, by = "the scene's lamps", ""
+        if fit.lighting.lamps:
+            first = refined.photographs.lights[0].rgb[0]
+            which, by = "the other lamps", f" (of the first, by which all are, {first:.4g})"
+        add("lamp", f"places of {which} [scene units], directions to distant ones", lamps.places, found.places,
             np.where(lamps.finite, calibration.distance, 1.0) * deviations["lamp"])  # fmt: skip
-        add("strength", "strengths of the scene's lamps: red, green, blue", lamps.strengths, found.strengths,
+        add("strength", f"strengths of {which}: red, green, blue{by}", lamps.strengths, found.strengths,
             found.strengths.numpy() * deviations["strength"])  # fmt: skip
     if "focal" in now:
         add("focal", "focal length [px]", [old[k].camera.focal.mean() for k in lenses], focal.mean(1),
@@ -79,7 +84,8 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     if "scale" in now:
         add("scale", "power of all lights together", 1, strengthened, strengthened * deviations["scale"])
     if "ambient" in calibration.refined:
-        what = "light of the room on the object, as shares of the flash's: red, green, blue"
+        own = "first lamp" if fit.lighting.lamps else "flash"
+        what = f"light of the room on the object, as shares of the {own}'s: red, green, blue"
         if fit.capture.photographs.dark:
             what = "mean radiance of the environment: red, green, blue"
         unknowns["ambient"] = {"what": what, "before": given, "after": share, "harmonics": room.harmonics.tolist()}
@@ -102,4 +108,5 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         for name, factor in factors.items():
             entry[name], std[name] = factor[k].tolist(), (factor[k] * deviations[name][k]).tolist()
         photographs[fit.capture.names[k]] = entry | {"std": std}
-    return {"refined": list(calibration.refined), "unknowns": unknowns, "photographs": photographs}
+    return {"refined": list(calibration.refined), "light": str(fit.lighting), "unknowns": unknowns,
+            "photographs": photographs}  # fmt: skip

@@ -32,7 +32,7 @@ MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.05  #: Fewer lamps are believed that leave no more of the error of the best than this.
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
-LOOSE = 0.6  #: progress at which the material may vary, where it has been taken to be one
+LOOSE = 0.35  #: progress at which the material may vary, where it has been taken to be one
 FAINT = 0.1  #: the least strength of a lamp to begin with, by the first
 ROWS = 16  #: of a map of the directions in which lamps are sought
 

@@ -27,6 +27,8 @@ class Panel(NamedTuple):
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     """`refined`: a fit's `summary`, of what has made the one capture the other."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
+    if refined.get("light", "capture") != "capture":
+        rows.insert(0, ("what lights the object, by coarse fits", "", refined["light"], ""))
     rows += [row(entry) for entry in of_photographs(refined["photographs"])]
     return Panel(rows, chart(before, after, refined["photographs"]))
 

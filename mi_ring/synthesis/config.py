@@ -162,8 +162,8 @@ def require_options(config: SynthesizeConfig) -> None:
             f"--wrong-light: is of places in the cameras' axes, which {config.light} has none of; leave it out"
         )
     if config.lamps > 1 and (config.light != "lamp" or config.environment or config.pairs):
-        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp, without --environment and without "
-                         "--pairs; leave it out")  # fmt: skip
+        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp, which must be given, without "
+                         "--environment and without --pairs")  # fmt: skip
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
