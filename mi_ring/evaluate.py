@@ -64,7 +64,7 @@ def main(arguments: Sequence[str]) -> None:
     options = read_json(config.run / "config.json")
     if config.novel and isinstance(options, dict) and options.get("light", "capture") != "capture":
         print("The light was unknown to this fit. How bright it is, and of which colour, cannot be told from the "
-              "object's: novel views in a known light may be too bright or too dark all over", file=sys.stderr)  # fmt: skip
+              "object's: novel views in a known light may be too bright or too dark", file=sys.stderr)  # fmt: skip
     print(json.dumps(totals))
 
 
