@@ -23,6 +23,7 @@ from mi_ring.system import command
 from mi_ring.system.files import locked, read_json
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
+MARGIN = 1.2  #: by which a time that is said to be enough is more than was measured: machines are shared
 PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
 
 
@@ -95,11 +96,14 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
     """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
-    minutes, costs = choice[0].minutes, measure(fit, all_stages(fit, choice))
+    minutes, spent = choice[0].minutes, fit.processes.told(time.monotonic() - started)
+    if spent > 60 * minutes:
+        raise InputError(f"--minutes: is {minutes:g}, but the start alone has taken {spent:.0f} s; give more")
+    costs = measure(fit, all_stages(fit, choice))
     spent = fit.processes.told(time.monotonic() - started)
     if (needed := spent + fewest_seconds(choice, fit.near, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
-                         f"{math.ceil(needed / 6) / 10:g} or more")  # fmt: skip
+                         f"{math.ceil(MARGIN * needed / 6) / 10:g} or more")  # fmt: skip
     chosen = fitting_into(60 * minutes - spent, choice, fit.near, costs)
     print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
     return chosen, costs

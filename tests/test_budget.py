@@ -84,6 +84,8 @@ def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkey
     monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
     monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0))
     call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
+    with pytest.raises(InputError, match="is 0.5, too few for a fit of this capture on this machine; give 0.8 or more"):
+        command.main([*call[:-1], "0.5"])  # 40 iterations, and what takes as long: 40 s, and a fifth more
     assert command.main(call) == 0
     options = json.loads((tmp_path / "run/config.json").read_text())
     assert options["iterations"] == 80 and options["minutes"] == 1
@@ -119,7 +121,7 @@ def test_presets_that_do_not_go_with_the_other_options_are_no_choice(small_captu
     (["--threads", "20000"], "--threads: is 20000, must be 0 to 1024"),
     (["--minutes", "1", "--deterministic"], "--deterministic: does not go with --minutes"),
     (["--minutes", "1", "--iterations", "9"], "--minutes: chooses --iterations; give one of the two"),
-    (["--minutes", "0.01"], "too few for a fit of this capture on this machine; give "),
+    (["--minutes", "0.001"], "--minutes: is 0.001, but the start alone has taken "),
 ])  # fmt: skip
 def test_mistakes_are_told(small_capture, tmp_path, options, complaint):
     with pytest.raises(InputError, match=re.escape(complaint)):
