@@ -29,7 +29,7 @@ class Powers(torch.optim.Optimizer):
         """`name`: power or gain."""
         self.power, self.width = calibration.unknown(name)[0], calibration.widths[name]
         super().__init__([{"params": [self.power], "initial_lr": RATE, "decay": DECAY, "start": START}], {"lr": RATE})
-        #: which photographs, and logarithms (3,) of how much brighter, NaN where they tell nothing
+        #: which photographs, and logarithms (3,) of how much brighter, NaN of colours of which they tell nothing
         self.seen: list[tuple[int, Tensor]] = []
 
     @torch.no_grad()
@@ -56,7 +56,8 @@ class Powers(torch.optim.Optimizer):
         brighter = it.share.gathered(brighter)
         told = (~brighter.isnan()).sum(0) >= 2  # colours
         usual = torch.where(told, brighter.nanmean(0), torch.nan)
-        self.seen = list(zip(it.everything.tolist(), brighter - usual))
+        found = zip(it.everything.tolist(), brighter - usual)
+        self.seen = [(k, one) for k, one in found if not one.isnan().all()]
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
