@@ -422,7 +422,7 @@ from mi_ring import validate, render
 mi.set_variant("scalar_rgb")
 mi.set_variant("llvm_ad_rgb")
 scene, sensors = path_tracing.open_lit_scene(Path(sys.argv[1]))
-assert len(sensors) == 1 and not shading.lamps(scene)
+assert len(sensors) == 1 and not shading.shared_emitters(scene)
 assert sum(isinstance(e, path_tracing.flash.Flash) for e in scene.emitters()) == 1
 assert loading.load_capture(sys.argv[1], images=False).sensors
 """
