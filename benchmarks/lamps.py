@@ -23,8 +23,8 @@ import torch
 from accuracy import processor, product_speed, table
 from environments import PLASTIC, run
 
-from mi_ring.rendering.lights import Light, light_of
-from mi_ring.rendering.scenes import lamps_of
+from mi_ring.rendering.lights import Light
+from mi_ring.rendering.scenes import lamp_lights
 
 LIGHTS = "lamps", "environment"
 
@@ -32,7 +32,7 @@ LIGHTS = "lamps", "environment"
 def lamps_in(scene: Path) -> list[Light]:
     """All of a scene whose photographs have one place of their lights."""
     capture = mi_ring.load_capture(scene, images=False)
-    return [capture.photographs.lights[0], *map(light_of, lamps_of(capture.scene))]
+    return [capture.photographs.lights[0], *lamp_lights(capture.scene)]
 
 
 def off(found: list[Light], true: list[Light]) -> tuple[float, float]:

@@ -28,10 +28,9 @@ from mi_ring.fitting.room import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
 from mi_ring.geometry.rotations import quarter_turns, rotations
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.rooms import BASIS
-from mi_ring.rendering.scenes import has_table, lamps_of
+from mi_ring.rendering.scenes import has_table, lamp_lights, lamps_of
 from mi_ring.rendering.shading import shared_emitters
 from mi_ring.system.machine import device
 
@@ -148,7 +147,7 @@ class Calibration(nn.Module):
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
-        self.lamps = Lamps.of([light_of(lamp) for lamp in lamps_of(capture.scene) if "lamps" in refined])  #: unknown
+        self.lamps = Lamps.of(lamp_lights(capture.scene) if "lamps" in refined else [])  #: unknown
         self.sizes = [sensor.size for sensor in capture.sensors]
         self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
         self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])

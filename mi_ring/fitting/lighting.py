@@ -17,9 +17,9 @@ from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
-from mi_ring.rendering.lights import Light, light_of
+from mi_ring.rendering.lights import Light
 from mi_ring.rendering.rooms import BASIS, frames_of, without_environment
-from mi_ring.rendering.scenes import lamps_of
+from mi_ring.rendering.scenes import lamp_lights
 from mi_ring.rendering.shading import shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
@@ -95,7 +95,7 @@ def moved(lighting: Lighting, capture: Capture) -> Lighting:
     """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it."""
     if not lighting.lamps:
         return lighting
-    lights = [capture.photographs.lights[0], *map(light_of, lamps_of(capture.scene))]
+    lights = [capture.photographs.lights[0], *lamp_lights(capture.scene)]
     return lighting._replace(lamps=tuple((tuple(light.vector), tuple(light.rgb)) for light in lights))
 
 

@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.figures import svg_uri
-from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.rooms import COUNT, seen_from_within
-from mi_ring.rendering.scenes import lamps_of
+from mi_ring.rendering.scenes import lamp_lights
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 LISTED = 6  #: unknowns of one kind that are listed one by one
@@ -127,6 +126,6 @@ def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, labe
     lights = capture.photographs.lights
     x, y = (lights.positions()[lights.is_finite()] @ plane.T).T
     axes.scatter(x, y, s=8, c=colour)
-    lamps = [lamp.vector for lamp in map(light_of, lamps_of(capture.scene)) if lamp.kind == "point"]
+    lamps = [lamp.vector for lamp in lamp_lights(capture.scene) if lamp.kind == "point"]
     x, y = plane @ np.reshape(lamps, (-1, 3)).T
     axes.scatter(x, y, s=60, c=colour, marker="*")

@@ -17,9 +17,8 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import light_of
 from mi_ring.rendering.rooms import seen_from_within
-from mi_ring.rendering.scenes import lamps_of
+from mi_ring.rendering.scenes import lamp_lights
 from mi_ring.rendering.shading import shared_emitters
 from mi_ring.rendering.visibility import View
 from mi_ring.ring.ring import Ring
@@ -140,7 +139,7 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
     if fit.calibration:
         frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
-        lamps = map(light_of, lamps_of(capture.scene)) if "lamps" in fit.calibration.refined else None
+        lamps = lamp_lights(capture.scene) if "lamps" in fit.calibration.refined else None
         scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames, lamps)
     if fit.outlines:
         scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))

@@ -17,11 +17,11 @@ from mi_ring.images import blur
 from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
 from mi_ring.rendering.edges import Edges
 from mi_ring.rendering.indirect import BOUNCES, render_indirect
-from mi_ring.rendering.lights import light_of, place_lamp
+from mi_ring.rendering.lights import place_lamp
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pictures import render_maps, render_photographs
 from mi_ring.rendering.plain_mesh import FACES, POSITIONS
-from mi_ring.rendering.scenes import dressed, lamps_of, parted, with_lamps
+from mi_ring.rendering.scenes import dressed, lamp_lights, lamps_of, parted, with_lamps
 from mi_ring.rendering.shading import shared_emitters
 
 WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
@@ -110,7 +110,7 @@ class Surface:
         Places are positions [scene units], of distant lamps unit directions toward them.
         """
         if not self.own_lamps:
-            self.scene, self.own_lamps = with_lamps(self.scene, map(light_of, lamps_of(self.scene))), True
+            self.scene, self.own_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
             self.params = mi.traverse(self.scene)
         for k, lamp in enumerate(lamps_of(self.scene)):
             place_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))

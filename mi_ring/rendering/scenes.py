@@ -7,7 +7,7 @@ import numpy as np
 
 from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.elements import load_bsdf
-from mi_ring.rendering.lights import LAMPS, Light, emitter_of
+from mi_ring.rendering.lights import LAMPS, Light, emitter_of, light_of
 
 
 def own_emitters(scene) -> list:
@@ -19,6 +19,11 @@ def own_emitters(scene) -> list:
 def lamps_of(scene) -> list:
     """The point lights and directional ones at the top level of a scene."""
     return [emitter for emitter in own_emitters(scene) if emitter.class_name() in LAMPS]
+
+
+def lamp_lights(scene) -> list[Light]:
+    """The `lamps_of` a scene as numbers."""
+    return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
