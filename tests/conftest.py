@@ -140,3 +140,18 @@ def broken_capture(small_capture, tmp_path):
         path.write_text(text.replace(old, new, count))
 
     return path, edit
+
+
+def photographed_ellipsoid(folder, *options):
+    """Path of the scene of a small path-traced capture of an ellipsoid, ten photographs, by options of synthesize."""
+    import trimesh
+
+    from mi_ring import synthesize
+
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball.vertices = ball.vertices * AXES
+    ball.export(folder / "ball.ply")
+    small = ["--views", "10", "--novel", "0", "--size", "40", "32", "--spp", "16"]
+    material = ["--material", "diffuse reflectance=0.5"]
+    synthesize.main([str(folder / "ball.ply"), str(folder / "capture"), *small, *material, *options])
+    return folder / "capture/scene.xml"

@@ -9,19 +9,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-import trimesh
-from conftest import AXES
+from conftest import photographed_ellipsoid
 from test_bridge import OFF_CAMERA, Setting, tensor
 
 import mi_ring
-from mi_ring import synthesize
 from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.fitting.trials import Trials, brightest
 from mi_ring.rendering import bridge
 from mi_ring.rendering.lights import Light, emitter_of, light_of, place_lamp, place_of
-from mi_ring.rendering.scenes import lamps_of, with_lamps
+from mi_ring.rendering.scenes import lamp_lights, lamps_of, with_lamps
 
 LAMPS = [
     Light("point", np.array([-1.9, 2.4, 1.8]), np.array([9.0, 12.0, 7.0])),
@@ -36,17 +34,12 @@ TINY = {
 def under_two_lamps(tmp_path_factory):
     """Path of a capture of an ellipsoid by two lamps; scene.xml says nothing of the second, truth/exact.xml all."""
     folder = tmp_path_factory.mktemp("lamps")
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    ball.vertices = ball.vertices * AXES
-    ball.export(folder / "ball.ply")
-    small = ["--views", "10", "--novel", "0", "--size", "40", "32", "--spp", "16", "--depth", "2", "--seed", "4"]
-    lamps = ["--light", "lamp", "--lamps", "2", "--wrong-room", "--material", "diffuse reflectance=0.5"]
-    synthesize.main([str(folder / "ball.ply"), str(folder / "capture"), *small, *lamps])
-    return folder / "capture/scene.xml"
+    lamps = ["--light", "lamp", "--lamps", "2", "--wrong-room", "--depth", "2", "--seed", "4"]
+    return photographed_ellipsoid(folder, *lamps)
 
 
 def lamps_in(capture):
-    return [light_of(lamp) for lamp in lamps_of(capture.scene)]
+    return lamp_lights(capture.scene)
 
 
 @pytest.mark.parametrize("light", LAMPS)

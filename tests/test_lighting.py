@@ -9,11 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import trimesh
-from conftest import AXES
+from conftest import photographed_ellipsoid
 
 import mi_ring
-from mi_ring import synthesize
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import trials
@@ -51,14 +49,7 @@ def short_trials(monkeypatch):
 def in_an_environment(tmp_path_factory):
     """Path of a scene of an ellipsoid in `lobe`, of which the scene says nothing."""
     folder = tmp_path_factory.mktemp("environment")
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    ball.vertices = ball.vertices * AXES
-    ball.export(folder / "ball.ply")
-    small = ["--views", "10", "--novel", "0", "--size", "40", "32", "--spp", "16"]
-    light = ["--environment", str(lobe(folder / "lobe.exr")), "--wrong-room"]
-    out = folder / "capture"
-    synthesize.main([str(folder / "ball.ply"), str(out), *small, *light, "--material", "diffuse reflectance=0.5"])
-    return out / "scene.xml"
+    return photographed_ellipsoid(folder, "--environment", str(lobe(folder / "lobe.exr")), "--wrong-room")
 
 
 def test_an_environment_is_found_and_written(in_an_environment, tmp_path):
