@@ -212,23 +212,20 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_captur
         edit("</scene>", TABLE)
     start = SPHERE if table else QUICK
     arguments = [str(small_capture), "--iterations", "14", "--deterministic", "--seed", "4", *start]
-    for name in ("a", "b"):
-        assert fit.main([*arguments, "--out", str(tmp_path / name)]) == 0
+    assert fit.main([*arguments, "--out", str(tmp_path / "a")]) == 0
 
-    interrupted = fit.parse_options([*arguments, "--out", str(tmp_path / "c")])
+    interrupted = fit.parse_options([*arguments, "--out", str(tmp_path / "b")])
     with machine.threads_of(1):
         first = Fit(load_capture(small_capture), interrupted)
-        results.prepare_folder(tmp_path / "c", small_capture, interrupted.settings())
-        keeper = session.Keeper(first, tmp_path / "c", lambda: None)
+        results.prepare_folder(tmp_path / "b", small_capture, interrupted.settings())
+        keeper = session.Keeper(first, tmp_path / "b", lambda: None)
         session.train(first, keeper, lambda: first.iteration == 9, None)  # in the second stage
-    assert fit.main([*arguments, "--out", str(tmp_path / "c"), "--resume"]) == 0
+    assert fit.main([*arguments, "--out", str(tmp_path / "b"), "--resume"]) == 0
 
-    rings = [torch.load(tmp_path / name / "ring.pt")["networks"] for name in ("a", "b", "c")]
-    for other in rings[1:]:
-        assert all(torch.equal(rings[0][key], other[key]) for key in rings[0])
-    meshes = {(tmp_path / name / "mesh.ply").read_bytes() for name in ("a", "b", "c")}
-    assert len(meshes) == 1
-    logs = [[{**e, "seconds": 0} for e in results.read_log(tmp_path / name)] for name in ("a", "c")]
+    rings = [torch.load(tmp_path / name / "ring.pt")["networks"] for name in ("a", "b")]
+    assert all(torch.equal(rings[0][key], rings[1][key]) for key in rings[0])
+    assert (tmp_path / "a" / "mesh.ply").read_bytes() == (tmp_path / "b" / "mesh.ply").read_bytes()
+    logs = [[{**e, "seconds": 0} for e in results.read_log(tmp_path / name)] for name in ("a", "b")]
     assert logs[0] == logs[1]
 
 
