@@ -32,7 +32,8 @@ MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.1  #: Fewer lamps are believed that leave no more of the error of the best than this.
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
-LOOSE = 0.35  #: progress at which the material may vary, where it has been taken to be one
+#: Progress at which the material may vary, where it has been taken to be one.
+LOOSE = {"environment": 0.35, "turntable": 0.35, "lamps": 0.6}
 FAINT = 0.1  #: the least strength of a lamp to begin with, by the first
 ROWS = 16  #: of a map of the directions in which lamps are sought
 
@@ -62,11 +63,12 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
         found = trials.best(*likely)
         if found.kind in ("environment", "lamps"):  # several lamps are between the two
             found = trials.best(found, trials.lamps())
-    if found.kind in ("environment", "turntable"):
+    if found.kind != "capture":
         found = trials.plain(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
-    print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}")
-    return trials.found.get(found, found)
+    rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
+    print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
+    return found
 
 
 class Trials:
@@ -130,9 +132,11 @@ class Trials:
         return Lighting("lamps", lamps, distant)
 
     def plain(self, lighting: Lighting) -> Lighting:
-        """The same, at first on one material, if that explains the photographs about as well."""
-        begun = self.left(lighting._replace(plain=1.0)) < PLAIN * self.left(lighting)
-        return lighting._replace(plain=LOOSE) if begun else lighting
+        """As a coarse fit has it in the end; at first on one material if that explains the photographs as well."""
+        one = lighting._replace(plain=1.0)
+        if self.left(one) >= PLAIN * self.left(lighting):
+            return self.found[lighting]
+        return self.found[one]._replace(plain=LOOSE[lighting.kind])
 
 
 def recording(config: Config) -> tuple[Any, ...]:
