@@ -92,7 +92,9 @@ class Fit:
         if self.config.deterministic:
             recompute_normals(capture.scene)
         lighting = Lighting(*state["lighting"]) if state else lighting  # under which `capture` is
+        began = time.perf_counter()
         self.lighting = lighting or self.processes.told(lighting_of(capture.part(self.fitted), self.config, Fit))
+        self.seconds = time.perf_counter() - began  #: that iterations, and coarse fits before them, have taken
         #: `environment`: harmonics of what the scene says of one, if it says so.
         self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
         capture = self.capture
@@ -127,7 +129,7 @@ class Fit:
         self.autocast = autocast(self.config.precision, self.device)
         #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.
         self.outlines: dict[int, Tensor] = {}
-        self.iteration, self.seconds = 0, 0.0
+        self.iteration = 0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
         self.restraint = Restraint()
         self.averages = Averages()
