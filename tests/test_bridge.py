@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring.rendering import bridge, photographs
+from mi_ring.rendering import bridge, photographs, scenes
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.rooms import BASIS
 from mi_ring.ring.ring import Ring
@@ -318,6 +318,24 @@ def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
     ours, theirs = (np.array(mi.render(scene, sensor=1, integrator=mi.load_dict({"type": "direct"}), spp=4))
                     for scene in (surface.scene, setting.scene))  # fmt: skip
     assert np.abs(ours - theirs).max() > 0.1 and ours.max() > 0.1  # another ball, lit by the same light
+
+
+@pytest.mark.parametrize("light", ["directional", "constant", "envmap"])
+def test_distant_emitters_of_a_surface_are_beyond_all_of_it(light):
+    """Also of one that is far from the origin and large, in its first picture: what is in the way casts shadows."""
+    emitter = mi.load_dict({
+        "directional": {"type": "directional", "direction": [0.48, 0.6, -0.64]}, "constant": {"type": "constant"},
+        "envmap": {"type": "envmap", "bitmap": mi.Bitmap(np.ones((5, 7, 3), np.float32))},
+    }[light])  # fmt: skip
+    shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
+    center, radius = np.array([400.0, -150.0, 90.0]), 700.0  # the origin is within
+    ring = Ring(center, radius)
+    surface = bridge.Surface(scenes.assembled([shape], [emitter]), shape, ring)
+    surface.show(ring, *ring.domain.sample(2))
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = mi.Point3f(0.5 / surface.unit)
+    ds, _ = surface.scene.emitters()[0].sample_direction(si, mi.Point2f(0.3, 0.8))
+    assert surface.unit * ds.dist[0] > 2 * radius
 
 
 def test_the_backward_pass_may_be_taken_by_another_thread():

@@ -56,10 +56,10 @@ class Surface:
         scene, self.table = parted(scene)
         self.unit = 1.0
         if ring is not None:
-            scene, shape = dressed(scene, shape, ring)
             alone = self.table is None and len(scene.shapes()) == 1
             if alone and not as_it_is and all(lamp.is_environment() for lamp in shared_emitters(scene)):
                 self.unit = unit_for(float(ring.radius))
+            scene, shape = dressed(scene, shape, ring, self.unit)
         self.scene, self.shape = scene, shape
         self.params = mi.traverse(scene)
         self.own_lamps = False  #: or the given scene's, which are not to be changed?

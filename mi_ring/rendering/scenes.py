@@ -9,6 +9,8 @@ from mi_ring.rendering.attributes import require_attributes
 from mi_ring.rendering.elements import load_bsdf
 from mi_ring.rendering.lights import LAMPS, Light, emitter_of, light_of
 
+REACH = 4.0  #: radii of the normalising sphere, within which the object is
+
 
 def own_emitters(scene) -> list:
     """The emitters of a scene that are no part of its shapes, and so do not come along with them."""
@@ -44,8 +46,12 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
     return scene
 
 
-def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
-    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape."""
+def dressed(scene: mi.Scene, shape: mi.Mesh, ring, unit: float = 1.0) -> tuple[mi.Scene, mi.Mesh]:
+    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape.
+
+    It is to be drawn in units of `unit` scene units, and is a ball about the object until it is written to: distant
+    emitters take nothing to be farther away than a scene reaches when it is put together.
+    """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
         "face_normals": shape.has_face_normals(),
@@ -57,6 +63,11 @@ def dressed(scene: mi.Scene, shape: mi.Mesh, ring) -> tuple[mi.Scene, mi.Mesh]:
             new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
     new.set_bsdf(load_bsdf(ring.bsdf))
     require_attributes(new)
+    params = mi.traverse(new)
+    points = np.array(params["vertex_positions"]).reshape(-1, 3)
+    ball = ring.center.numpy(force=True) + REACH * float(ring.radius) * points
+    params["vertex_positions"] = mi.Float((ball / unit).astype(np.float32).ravel())
+    params.update()
     shapes = [new if other == shape else other for other in scene.shapes()]
     return assembled(shapes, own_emitters(scene), scene.sensors(), scene.integrator()), new
 
