@@ -15,7 +15,7 @@ import mi_ring
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import trials
-from mi_ring.fitting.calibration import refined_of
+from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
 from mi_ring.rendering import bridge
@@ -243,12 +243,15 @@ def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
 def test_a_lamp_is_one_for_all(small_capture):
     one = Lighting("lamps", (((30.0, -40.0, 20.0), (500.0, 500.0, 500.0)),))
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 2}, light="lamps")
-    fit = mi_ring.Fit(mi_ring.load_capture(small_capture), config, lighting=one)
+    capture = mi_ring.load_capture(small_capture)
+    fit = mi_ring.Fit(capture, config, lighting=one)
     assert fit.calibration.refined == ("light", "gain", "ambient")
     assert len(fit.calibration.light) == 1  # one place for all photographs
+    alone = lit(capture.part(np.array([0])), one)  # in which it might be a flash that moves with the camera
+    assert Calibration(alone, ["light"], np.zeros(3), 0.5, guessed=True).flash is None
 
 
-#: What coarse fits leave, by how lightings are called, and what is believed: how it is called, and until when plain.
+#: What coarse fits leave (None: they fail), by how lightings are called; what is believed, and until when plain.
 DECISIONS = [
     ("lamps", {"1 lamp": 0.083, "2 lamps": 0.069, "3 lamps": 0.0685, "2 distant lamps": 0.074,
                "2 lamps on one material": 0.082}, "2 lamps on one material", 0.6),
@@ -256,6 +259,8 @@ DECISIONS = [
                "3 lamps on one material": 0.09}, "3 lamps", 0),
     ("lamps", {"1 lamp": 0.08, "2 lamps": 0.079, "3 lamps": 0.09, "1 distant lamp": 0.07,
                "1 distant lamp on one material": 0.09}, "1 distant lamp", 0),
+    ("lamps", {"1 lamp": 0.08, "2 lamps": None, "3 lamps": 0.079, "1 distant lamp": 0.09,
+               "1 lamp on one material": None}, "1 lamp", 0),
     ("lamps", {"1 lamp": 0.06, "2 lamps": 0.05, "3 lamps": 0.058, "together": ("2 lamps", "3 lamps"),
                "1 distant lamp": 0.07, "1 lamp on one material": 0.08}, "1 lamp", 0),
     ("environment", {"environment": 0.1, "environment on one material": 0.11}, "environment on one material", 0.35),
@@ -287,8 +292,11 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
 
         def __init__(self, capture, config, lighting):
             tried.append(name := str(lighting))
+            begun = lighting
             assert config.light == lighting.kind and config.widths == (64,)
             self.error = errors.get(name, 0.1)
+            if self.error is None:
+                raise InputError("diverged at iteration 9")
             if lighting.plain and lighting.lamps:  # which has found the first lamp farther away
                 (vector, rgb), *others = lighting.lamps
                 lighting = lighting._replace(lamps=((tuple(2 * x for x in vector), rgb), *others))
@@ -297,7 +305,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
                 near = tuple((np.array(vector) + 0.2 * np.linalg.norm(vector) * np.array([0.6, 0.8, 0])).tolist())
                 lighting = lighting._replace(lamps=((vector, rgb), (near, rgb), *others))
             self.capture = lit(capture, lighting)
-            ended[name] = moved(lighting, self.capture)
+            ended[name] = moved(begun, self.capture)
 
         def calibrated(self):
             return self.capture

@@ -143,7 +143,8 @@ class Calibration(nn.Module):
         self.level = level.mean(0)  #: (3,) where the flash is in the axes of a camera that is held upright
         #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
         spread = float((level.amax(0) - level.amin(0)).max())
-        self.flash = inside if self.finite.all() and spread < RIGID * self.distance else None
+        moves = self.finite.all() and spread < RIGID * self.distance and not guessed
+        self.flash = inside if moves else None
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip

@@ -92,11 +92,18 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def moved(lighting: Lighting, capture: Capture) -> Lighting:
-    """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it."""
+    """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it.
+
+    As strong together as makes the first bring the object as much light as before, for the albedo's sake.
+    """
     if not lighting.lamps:
         return lighting
     lights = [capture.photographs.lights[0], *lamp_lights(capture.scene)]
-    return lighting._replace(lamps=tuple((tuple(light.vector), tuple(light.rgb)) for light in lights))
+    (before, _), center = lighting.lamps[0], capture.sphere()[0]
+    distances = [np.linalg.norm(place - center) for place in (before, lights[0].vector)]
+    factor = 1.0 if lighting.distant else (distances[1] / distances[0]) ** 2
+    lamps = [(light.vector, factor * light.rgb) for light in lights]
+    return lighting._replace(lamps=tuple((tuple(vector.tolist()), tuple(rgb.tolist())) for vector, rgb in lamps))
 
 
 def lit(capture: Capture, lighting: Lighting) -> Capture:

@@ -9,6 +9,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.errors import InputError
+from mi_ring.fitting.calibration import OF_LIGHTS
+from mi_ring.fitting.certainty import RECORDED
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.lighting import Lighting, exposures, moved, require_unknown, unlit
 from mi_ring.rendering.rooms import COUNT, directions_of, harmonics_in
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Settings of a trial: those that decide alike, whatever the fit's own are.
 COARSE: dict[str, Any] = {
-    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "weights": {},
+    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0,
     **{name: getattr(Config(), name) for name in (
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip
@@ -63,6 +66,8 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
         found = trials.best(*likely)
         if found.kind in ("environment", "lamps"):  # several lamps are between the two
             found = trials.best(found, trials.lamps())
+    if math.isinf(trials.left(found)):
+        raise trials.failures[-1]
     if found.kind != "capture":
         found = trials.plain(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
@@ -79,6 +84,7 @@ class Trials:
         self.capture, self.config, self.trial = capture, config, trial
         self.errors: dict[Lighting, float] = {}  #: that they leave of the photographs
         self.found: dict[Lighting, Lighting] = {}  #: where each has its lamps in the end
+        self.failures: list[InputError] = []  #: of those that came to no end
         #: harmonics (COUNT, 3) that a fit under one has found, and how much photographs tell of each (COUNT,)
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -86,11 +92,17 @@ class Trials:
         """The error that a coarse fit leaves."""
         if lighting in self.errors:
             return self.errors[lighting]
-        refine = self.config.refine if lighting.kind == "capture" else recording(self.config)
-        config = replace(self.config, **COARSE, light=lighting.kind, refine=refine)
-        fit = self.trial(self.capture, config, lighting=lighting)
-        iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
-        errors = [it.terms["rgb"] for it in iterations][-LAST:]
+        refine = refined_under(lighting, self.config)
+        weights = {"mask": self.config.weights["mask"]}
+        config = replace(self.config, **COARSE, weights=weights, light=lighting.kind, refine=refine)
+        try:
+            fit = self.trial(self.capture, config, lighting=lighting)
+            iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
+            errors = [it.terms["rgb"] for it in iterations][-LAST:]
+        except InputError as error:  # it diverged, or has a lamp within the object: that light it is not
+            self.failures.append(error)
+            self.errors[lighting], self.found[lighting] = math.inf, lighting
+            return math.inf
         self.found[lighting] = moved(lighting, fit.calibrated())
         if lighting == Lighting("environment") and fit.calibration:
             room = fit.calibration.room
@@ -108,13 +120,16 @@ class Trials:
         several = [self.brightest(count) for count in range(1, MOST + 1)]
         enough = FEWER * min(self.left(some) for some in several if self.apart(some))
         lamps = next(some for some in several if self.apart(some) and self.left(some) <= enough)
-        return self.best(lamps, self.brightest(len(lamps.lamps), distant=True))
+        distant = self.brightest(len(lamps.lamps), distant=True)
+        return self.best(lamps, distant) if self.apart(distant) else lamps
 
     def apart(self, lamps: Lighting) -> bool:
         """Are they, seen from the object, where a coarse fit has moved them? Else two stand for one elsewhere."""
         self.left(lamps)
-        center, _ = self.capture.sphere()
-        toward = np.array([vector for vector, _ in self.found[lamps].lamps]) - center
+        if len(lamps.lamps) < 2:
+            return True
+        vectors = np.array([vector for vector, _ in self.found[lamps].lamps])
+        toward = -vectors if lamps.distant else vectors - self.capture.sphere()[0]
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         cosines = (toward @ toward.T)[~np.eye(len(toward), dtype=bool)]
         return bool((cosines < math.cos(math.radians(APART))).all())
@@ -122,7 +137,8 @@ class Trials:
     def brightest(self, count: int, distant: bool = False) -> Lighting:
         """So many lamps that light the object as the environment does, and as strongly as makes its albedo a half."""
         self.left(Lighting("environment"))
-        assert self.environment is not None
+        if self.environment is None:
+            raise self.failures[0]
         center, _ = self.capture.sphere()
         away = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in self.capture.sensors])
         directions, colours = brightest(*self.environment, count)
@@ -134,14 +150,15 @@ class Trials:
     def plain(self, lighting: Lighting) -> Lighting:
         """As a coarse fit has it in the end; at first on one material if that explains the photographs as well."""
         one = lighting._replace(plain=1.0)
-        if self.left(one) >= PLAIN * self.left(lighting):
+        if self.left(one) >= PLAIN * self.left(lighting) or not self.apart(one):
             return self.found[lighting]
         return self.found[one]._replace(plain=LOOSE[lighting.kind])
 
 
-def recording(config: Config) -> tuple[Any, ...]:
-    """What a coarse fit under an unknown light refines of what `Config.refine` has: exposures alone."""
-    return tuple(name for name in config.refine if name in ("auto", "gain")) or ("none",)
+def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
+    """What a coarse fit refines of what `Config.refine` has: how photographs were recorded, and their own lights."""
+    own = {*OF_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
+    return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDED, *own}) or ("none",)
 
 
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
