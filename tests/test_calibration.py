@@ -347,6 +347,23 @@ def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_ca
         np.testing.assert_allclose(calibration.level, FLASH, atol=1e-3)
 
 
+def test_a_flash_that_is_found_by_default_stays_beside_the_lens(small_capture):
+    """How far ahead it is photographs hardly tell from how dark the surface is; `light` by name asks for that, too."""
+    capture = mi_ring.load_capture(small_capture)
+    moves = []
+    for refine in ("auto", "light"):
+        calibration = Fit(capture, Config(refine=(refine,), domain="sphere")).calibration
+        before = calibration().places
+        with torch.no_grad():
+            calibration.light[0] = tensor([0.5, -0.3, 0.2])
+        cameras = calibration.base.cameras[:, :, :3]
+        moves.append(torch.einsum("pij,pi->pj", cameras, calibration().places - before) / calibration.distance)
+    beside = tensor([0.5, -0.3, 0.2]) * UNKNOWNS["light"]["light"]
+    torch.testing.assert_close(moves[1], beside.expand(len(capture), 3), rtol=1e-4, atol=1e-5)
+    beside[2] = 0
+    torch.testing.assert_close(moves[0], beside.expand(len(capture), 3), rtol=1e-4, atol=1e-5)
+
+
 def test_powers_of_the_photographs_that_are_fitted_have_the_mean_one(small_capture):
     """Of the others nobody knows: they must not take part in what keeps brightness and albedo apart."""
     capture, fitted = mi_ring.load_capture(small_capture), np.array([0, 1, 3, 4, 5, 6, 8, 9, 10, 11])

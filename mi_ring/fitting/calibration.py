@@ -57,8 +57,8 @@ UNKNOWNS: dict[str, dict[str, float]] = {
         "strength": 0.5,  # logarithm, of each lamp and colour
     },
 }
-#: What is refined by default; `scale`, too, where it must be wrong. Not `curve`: from one flash it cannot be told from
-#: the reflectance, and takes the flash's place and the room along (docs/phone.md).
+#: What is refined by default; `scale`, too, where it must be wrong. Of a flash what is beside the lens: one ahead looks
+#: like a darker surface. Not `curve`: it looks like another, and takes light and room along (docs/phone.md).
 AUTO = "light", "power", "ambient"
 #: What is unknown under each `Config.light` that is.
 NOBODY_KNOWS = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
@@ -115,12 +115,13 @@ class Calibration(nn.Module):
     def __init__(
         self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0,
         fitted: np.ndarray | None = None, frames: Collection[str] = ("world",), guessed: bool = False,
+        ahead: bool = True,
     ) -> None:  # fmt: skip
         """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
 
         `power`: a factor of what the capture says of the lights' intensities, to begin with; `fitted`: indices of the
         photographs that are not kept out, by default all; `frames`: axes in which a room's light is fixed; `guessed`:
-        has nobody measured where the lights are?
+        has nobody measured where the lights are? `ahead`: may a flash be found along its camera's axis, too?
         """
         super().__init__()
         self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
@@ -143,8 +144,8 @@ class Calibration(nn.Module):
         self.level = level.mean(0)  #: (3,) where the flash is in the axes of a camera that is held upright
         #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
         spread = float((level.amax(0) - level.amin(0)).max())
-        moves = self.finite.all() and spread < RIGID * self.distance and not guessed
-        self.flash = inside if moves else None
+        self.flash = inside if self.finite.all() and spread < RIGID * self.distance and not guessed else None
+        self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  # components of `light`
         if "falloff" in refined and self.flash is None:
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
@@ -199,7 +200,7 @@ class Calibration(nn.Module):
             if "distortion" in self.refined:
                 distortion = distortion + self.value("distortion")[self.lens]
             distortion = distortion.clamp(0.999 * least, 0.999 * most)
-        offset = self.value("light").expand(int(self.place.max()) + 1, 3)[self.place]
+        offset = (self.free * self.value("light")).expand(int(self.place.max()) + 1, 3)[self.place]
         if self.flash is not None:
             moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
             places = cameras[:, :, 3] + (cameras[:, :, :3] @ moved)[..., 0]
@@ -314,8 +315,7 @@ class Calibration(nn.Module):
 
     def prior(self) -> Tensor:
         """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""
-        total = sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(()))
-        return total / 2 / len(self.lens)
+        return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.lens)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         """Adam, whose groups say when they begin, for all but what is `OF_ONE`; none if nothing is left to find."""

@@ -120,7 +120,8 @@ class Fit:
         if refined := refined_of(seen, chosen, self.albedo):
             power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
             self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
-                                           frames(capture, self.lighting), bool(self.lighting.lamps))  # fmt: skip
+                                           frames(capture, self.lighting), bool(self.lighting.lamps),
+                                           ahead="light" in self.config.refine)  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
@@ -131,8 +132,7 @@ class Fit:
         self.outlines: dict[int, Tensor] = {}
         self.iteration = 0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.restraint = Restraint()
-        self.averages = Averages()
+        self.restraint, self.averages = Restraint(), Averages()
         self.rounds = Rounds(capture, self.fitted)
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         if state:

@@ -36,9 +36,9 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
     lenses = np.unique(calibration.lens.numpy(), return_index=True)[1]
     focal = np.stack([new[k].camera.focal for k in lenses])
     if "light" in now and calibration.flash is not None:
-        flash, unit = calibration.level.numpy(), calibration.distance
+        flash, units = calibration.level.numpy(), calibration.distance * calibration.free.numpy()
         add("light", "place of the flash in the cameras' axes: to the left, up, ahead [scene units]", flash,
-            flash + unit * now["light"][0], unit * deviations["light"][0])  # fmt: skip
+            flash + units * now["light"][0], units * deviations["light"][0])  # fmt: skip
     elif "light" in now:
         first = np.unique(calibration.place.numpy(), return_index=True)[1]
         before, after = (c.photographs.lights.positions()[first] for c in (fit.capture, refined))
