@@ -29,7 +29,7 @@ from mi_ring.images import linear_to_srgb, read_image, to_bytes, write_image
 from mi_ring.rendering import bridge
 
 DARK, CLOSED = 24, 3  #: brightness (of 255) of what is background; how far gaps are closed [px]
-SHOWN = 1, 5, 8, 12  #: photographs of the picture
+SHOWN = 1, 4, 8, 12  #: photographs of the picture
 
 
 def mask_of(pixels: np.ndarray) -> np.ndarray:
