@@ -120,9 +120,10 @@ class Config:
     the scene has a `room` in its axes, as that of a turntable has; lamps: places and strengths of the scene's point and
     directional emitters, which light all photographs; masks: the object's outlines in the photographs,
     found anew about the surface at half and at three quarters of the fit. auto: light (of a flash that moves with the
-    camera what is beside the lens, not how far ahead), power (unless gain is given) and ambient (unless it is subtracted), and scale where lights cannot be as strong as the scene says;
-    under an unknown light, or where photographs have none of their own, gain, and ambient unless lamps light them;
-    nothing if the scene says that it is calibrated. none: nothing."""
+    camera what is beside the lens, not how far ahead), power (unless gain is given) and ambient (unless it is
+    subtracted), and scale where lights cannot be as strong as the scene says; under an unknown light, or where
+    photographs have none of their own, gain, and ambient unless lamps light them; nothing if the scene says that it is
+    calibrated. none: nothing."""
     holdout: int = 0
     """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
     thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.
