@@ -112,6 +112,7 @@ def test_lamps_begin_where_the_environment_is_brightest(count):
 def test_the_first_lamp_is_the_photographs_own(small_capture):
     """The others are the scene's; a fit under them begins there, and says where they have gone."""
     capture = mi_ring.load_capture(small_capture)
+    center, exposure = capture.sphere()[0], capture.exposure()
     said = (((30.0, 40.0, -20.0), (900.0, 900.0, 900.0)), ((-0.6, 0.0, 0.8), (450.0, 100.0, 1800.0)))
     for distant in (False, True):
         lighting = Lighting("lamps", said, distant)
@@ -123,14 +124,14 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
             scale = np.linalg.norm(vector) if distant else 1.0
             np.testing.assert_allclose(light.vector, np.array(vector) / scale, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(light.rgb, rgb, rtol=1e-5)
-        assert moved(lighting, under)._replace(lamps=()) == lighting._replace(lamps=())
-        for found, light in zip(moved(lighting, under).lamps, (own, lamp)):
+        assert moved(lighting, under, center)._replace(lamps=()) == lighting._replace(lamps=())
+        for found, light in zip(moved(lighting, under, center).lamps, (own, lamp)):
             np.testing.assert_allclose(found, light[1:], rtol=1e-5, atol=1e-6)
         assert not lamps_of(capture.scene)
-    center, exposure = capture.sphere()[0], capture.exposure()
     near = Lighting("lamps", said)
     away = tuple((center + 3 * (np.array(said[0][0]) - center)).tolist())
-    far = moved(near, lit(capture, Lighting("lamps", ((away, said[0][1]), said[1]))))  # where a coarse fit has moved it
+    gone = lit(capture, Lighting("lamps", ((away, said[0][1]), said[1])))  # where a coarse fit has moved it
+    far = moved(near, gone, center)
     np.testing.assert_allclose(far.lamps[0], (away, np.multiply(9, said[0][1])), rtol=1e-4)
     np.testing.assert_allclose(far.lamps[1][1], np.multiply(9, said[1][1]), rtol=1e-4)
     seen, said_first = (lit(capture, lighting).reflectance(center, exposure) for lighting in (far, near))

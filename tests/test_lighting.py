@@ -305,7 +305,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
                 near = tuple((np.array(vector) + 0.2 * np.linalg.norm(vector) * np.array([0.6, 0.8, 0])).tolist())
                 lighting = lighting._replace(lamps=((vector, rgb), (near, rgb), *others))
             self.capture = lit(capture, lighting)
-            ended[name] = moved(begun, self.capture)
+            ended[name] = moved(begun, self.capture, center)
 
         def calibrated(self):
             return self.capture
@@ -314,6 +314,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
             return iter([SimpleNamespace(terms={"rgb": 9.0})] * 48 + [SimpleNamespace(terms={"rgb": self.error})] * 12)
 
     config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
+    center, _ = capture.sphere()
     found = trials.lighting_of(capture, config, Trial)
     assert str(found) == believed and found.plain == plain and found.lamps == ended[believed].lamps
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}

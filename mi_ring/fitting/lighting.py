@@ -91,15 +91,16 @@ def exposures(capture: Capture) -> np.ndarray:
     return strengths / strengths.mean(0)
 
 
-def moved(lighting: Lighting, capture: Capture) -> Lighting:
+def moved(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
     """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it.
 
-    As strong together as makes the first bring the object as much light as before, for the albedo's sake.
+    As strong together as makes the first bring the object, at `center` (3,), as much light as before, for the albedo's
+    sake.
     """
     if not lighting.lamps:
         return lighting
     lights = [capture.photographs.lights[0], *lamp_lights(capture.scene)]
-    (before, _), center = lighting.lamps[0], capture.sphere()[0]
+    before, _ = lighting.lamps[0]
     distances = [np.linalg.norm(place - center) for place in (before, lights[0].vector)]
     factor = 1.0 if lighting.distant else (distances[1] / distances[0]) ** 2
     lamps = [(light.vector, factor * light.rgb) for light in lights]
@@ -114,16 +115,19 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
     if lighting.kind == "capture":
         return capture
     cameras, exposure = [sensor.camera for sensor in capture.sensors], capture.exposure()
+    room, lamps = None, None
     if lighting.lamps:
         kind: Literal["point", "directional"] = "directional" if lighting.distant else "point"
-        lights = [Light(kind, np.array(vector), np.array(rgb)) for vector, rgb in lighting.lamps]
-        return with_calibration(capture, cameras, lights[:1] * len(cameras), falloff=[0.0] * len(cameras),
-                                gains=exposures(capture), lamps=lights[1:] or None)  # fmt: skip
-    harmonics = np.zeros((BASIS, 3))
-    harmonics[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
-    dark = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
-    return with_calibration(capture, cameras, dark, room=harmonics, falloff=[0.0] * len(cameras),
-                            gains=exposures(capture))  # fmt: skip
+        first, *others = [Light(kind, np.array(vector), np.array(rgb)) for vector, rgb in lighting.lamps]
+        lights, lamps = [first] * len(cameras), others or None
+    else:
+        room = np.zeros((BASIS, 3))
+        room[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
+        lights = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
+    result = with_calibration(capture, cameras, lights, room=room, falloff=[0.0] * len(cameras),
+                              gains=exposures(capture), lamps=lamps)  # fmt: skip
+    result.hull = capture.hull  # the same masks from the same places, which takes a while
+    return result
 
 
 def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:

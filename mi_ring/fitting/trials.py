@@ -103,7 +103,7 @@ class Trials:
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
-        self.found[lighting] = moved(lighting, fit.calibrated())
+        self.found[lighting] = moved(lighting, fit.calibrated(), self.capture.sphere()[0])
         if lighting == Lighting("environment") and fit.calibration:
             room = fit.calibration.room
             told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
