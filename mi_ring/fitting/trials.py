@@ -82,6 +82,7 @@ class Trials:
     def __init__(self, capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> None:
         """`config`: of the fit that they are for; `trial`: makes one."""
         self.capture, self.config, self.trial = capture, config, trial
+        self.center, _ = capture.sphere()
         self.errors: dict[Lighting, float] = {}  #: that they leave of the photographs
         self.found: dict[Lighting, Lighting] = {}  #: where each has its lamps in the end
         self.failures: list[InputError] = []  #: of those that came to no end
@@ -103,7 +104,7 @@ class Trials:
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
-        self.found[lighting] = moved(lighting, fit.calibrated(), self.capture.sphere()[0])
+        self.found[lighting] = moved(lighting, fit.calibrated(), self.center)
         if lighting == Lighting("environment") and fit.calibration:
             room = fit.calibration.room
             told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
@@ -129,7 +130,7 @@ class Trials:
         if len(lamps.lamps) < 2:
             return True
         vectors = np.array([vector for vector, _ in self.found[lamps].lamps])
-        toward = -vectors if lamps.distant else vectors - self.capture.sphere()[0]
+        toward = -vectors if lamps.distant else vectors - self.center
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         cosines = (toward @ toward.T)[~np.eye(len(toward), dtype=bool)]
         return bool((cosines < math.cos(math.radians(APART))).all())
@@ -139,10 +140,9 @@ class Trials:
         self.left(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
-        center, _ = self.capture.sphere()
-        away = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in self.capture.sensors])
+        away = np.median([np.linalg.norm(sensor.camera.position - self.center) for sensor in self.capture.sensors])
         directions, colours = brightest(*self.environment, count)
-        vectors = -directions if distant else center + away * directions
+        vectors = -directions if distant else self.center + away * directions
         rgb = math.pi * self.capture.exposure() / ALBEDO * colours * (1.0 if distant else away**2)
         lamps = tuple((tuple(vector), tuple(one)) for vector, one in zip(vectors.tolist(), rgb.tolist()))
         return Lighting("lamps", lamps, distant)
