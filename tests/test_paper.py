@@ -166,7 +166,12 @@ MISTAKES = [
     (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
     (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
     (["specularity", "--materials", ""], "--materials: one is empty"),
-    (["table1", "a.ply", "--materials", "diffuse", "plastic"], "a.ply: DATA: is not there"),
+    (["table1", "PLY", "--materials", " "], "--materials: one is empty"),
+    (["table1", "PLY", "--materials", "diffuse", "plastic"], "--materials: are 2 for 1 meshes"),
+    (["table1", "GLTF"], r"a.gltf: DATA: is neither a scene file, .xml, nor a mesh, .ply, .obj"),
+    (["specularity", "--materials", "nowhere.binary"], "nowhere.binary: --materials: no such file"),
+    (["specularity", "PLY", "--materials", "principled base_color=vertex_color"], "--materials: .* varies over the"),
+    (["stripes", "PLY", "--materials", "diffuse", "TEXTURED"], "--materials: .*wood.xml: varies over the surface"),
     (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
     (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
     (["specularity", "EMPTY"], "DATA: must be one mesh"),
@@ -177,11 +182,29 @@ MISTAKES = [
 
 def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
     (tmp_path / "empty").mkdir()
-    places = {"EMPTY": str(tmp_path / "empty"), "KNOWN": str(known_capture)}
+    trimesh.creation.box().export(tmp_path / "a.ply")
+    (tmp_path / "a.gltf").write_text("{}")
+    mi.Bitmap(np.ones((2, 2, 3), np.float32)).write(str(tmp_path / "wood.exr"))
+    (tmp_path / "wood.xml").write_text('<bsdf type="diffuse"><texture name="reflectance" type="bitmap">'
+                                       '<string name="filename" value="wood.exr"/></texture></bsdf>')  # fmt: skip
+    files = {"EMPTY": "empty", "PLY": "a.ply", "GLTF": "a.gltf", "TEXTURED": "wood.xml"}
+    places = {"KNOWN": str(known_capture), **{name: str(tmp_path / file) for name, file in files.items()}}
     for arguments, message in MISTAKES:
         with pytest.raises(InputError, match=message):
             paper.main([*(places.get(word, word) for word in arguments), "--out", str(tmp_path / "out")])
     assert not list((tmp_path).rglob("table.md"))
+
+
+def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypatch):
+    folders = []
+    monkeypatch.setattr(paper, "perform", lambda experiment, asked, out, *_: folders.append(out.name) or 0)
+    for options in ([], ["--preset", "fast"], ["--preset", "paper"], ["--quick"]):
+        paper.main(["ablation", *options, "--out", str(tmp_path)])
+    assert folders == ["ablation", "ablation-fast", "ablation-paper", "ablation-quick"]
+    asked = [Asked(data, materials) for data in [(tmp_path / "a.ply",), (tmp_path / "b" / "a.ply",)]
+             for materials in [("diffuse reflectance=0.2", "diffuse"), ("diffuse reflectance=0.3", "diffuse")]]  # fmt: skip
+    for name, different in (("specularity", 6), ("stripes", 4)):
+        assert len({run.name for a in asked for run in EXPERIMENTS[name].runs(a)}) == different
 
 
 def test_a_capture_without_truth_is_refused(small_capture):

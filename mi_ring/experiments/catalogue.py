@@ -8,27 +8,11 @@ from typing import Any
 from mi_ring.errors import InputError
 from mi_ring.experiments import figures, measures, published
 from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
-from mi_ring.experiments.recipes import (
-    DiligentObject,
-    Part,
-    Perturbed,
-    Recipe,
-    SingleView,
-    Synthetic,
-    given,
-    own,
-)
-from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.experiments.recipes import DiligentObject, Part, Perturbed, SingleView, own
+from mi_ring.experiments.sources import captures, one_mesh, require_no_materials, short, traced
 
 DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its photographs are to be had
-MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
 WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
-#: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.
-SIZES: dict[str, dict[str, Any]] = {
-    "full": {},
-    "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
-    "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
-}
 VIEWS = 5, 10, 15, 25, 35, 50
 BANDS = 6  #: of the stripes
 #: Of rising gloss, and those of the stripes, where no others are given.
@@ -43,32 +27,6 @@ TIME = {"seconds": Column("fit s", 0)}
 USUAL = {**NORMALS, **DEPTHS, **PHOTOGRAPHS, **TIME}
 SHAPE = {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **FLAWS, **TIME}
 CAPTURES = "folders of captures with scene.xml and truth/mesh.ply"
-
-
-def captures(asked: Asked) -> list[Recipe]:
-    """Those that are given, else the one at hand; a mesh is path traced with a material of its own."""
-    meshes = [path for path in asked.data if path.suffix.lower() in MESHES]
-    if asked.materials and not meshes:
-        raise InputError("--materials: are what meshes are made of; give meshes as DATA")
-    if len(asked.materials) > max(1, len(meshes)):
-        raise InputError(f"--materials: are {len(asked.materials)} for {len(meshes)} meshes; give one each, or fewer, "
-                         "which are taken in turn")  # fmt: skip
-    found: list[Recipe] = []
-    for path in asked.data:
-        if path in meshes:
-            material = asked.materials[meshes.index(path) % len(asked.materials)] if asked.materials else None
-            found.append(traced(asked, path, material))
-        else:
-            found.append(given(path))
-    return found or [own()]
-
-
-def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = "", **options: Any) -> Synthetic:
-    """A capture as the paper's: 50 photographs, 60° wide, flash at the camera, overexposed in parts, of 8 bits."""
-    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[asked.size], **options}
-    return Synthetic(
-        name or (mesh.stem if mesh else "pot"), SynthesizeConfig(Path(), Path(), material, **settings), mesh
-    )
 
 
 def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
@@ -140,11 +98,9 @@ def specularity(asked: Asked) -> list[Run]:
     names = [short(material) for material in materials]
     if len({*names}) < len(names):  # what differs is among the parameters that are left out
         names = list(materials)
-    return seeded([
-        Run(f"{k}", traced(asked, mesh, material, f"gloss-{mesh.stem if mesh else 'pot'}-{short(material)}"),
-            {"material": called}, measure=measures.with_slices)
-        for k, (material, called) in enumerate(zip(materials, names))
-    ], asked)  # fmt: skip
+    recipes = [traced(asked, mesh, m, f"gloss-{mesh.stem if mesh else 'pot'}-{short(m)}") for m in materials]
+    return seeded([Run(recipe.folder_in(Path()).name, recipe, {"material": called}, measure=measures.with_slices)
+                   for recipe, called in zip(recipes, names)], asked)  # fmt: skip
 
 
 def stripes(asked: Asked) -> list[Run]:
@@ -156,31 +112,7 @@ def stripes(asked: Asked) -> list[Run]:
     name = f"stripes-{mesh.stem if mesh else 'pot'}-{short(first)}-{short(second)}"
     recipe = traced(asked, mesh, first, name, second=second, bands=BANDS)
     labels = {"materials": f"{short(first)} and {short(second)}"}
-    return seeded([Run("stripes", recipe, labels, measure=measures.with_slices)], asked)
-
-
-def require_no_materials(asked: Asked) -> None:
-    """Raise InputError if materials are given where nothing is made of them."""
-    if asked.materials:
-        raise InputError("--materials: are what meshes are made of, and this experiment takes none; leave them out")
-
-
-def one_mesh(asked: Asked) -> Path | None:
-    """That is given, if one is. Raises InputError if that is not one mesh, or if a material is an empty word."""
-    if not all(material.strip() for material in asked.materials):
-        raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
-    if len(asked.data) > 1 or any(path.suffix.lower() not in MESHES for path in asked.data):
-        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
-    return asked.data[0] if asked.data else None
-
-
-def short(material: str) -> str:
-    """A name for a material that is fit for a file."""
-    if ".npz:" in material:
-        return material.rpartition(":")[2]
-    words = material.split()
-    values = [word.replace("roughness=", "r") for word in words[1:] if word.startswith("roughness=")]
-    return "-".join([Path(words[0]).stem, *values])
+    return seeded([Run(recipe.folder_in(Path()).name, recipe, labels, measure=measures.with_slices)], asked)
 
 
 def views(asked: Asked) -> list[Run]:
