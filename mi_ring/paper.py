@@ -26,8 +26,8 @@ class PaperConfig:
     """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
 
     Each run is a fit whose results are in OUT/NAME/runs/, by another preset than default in OUT/NAME-PRESET/runs/;
-    table.csv, table.md and figure.png beside it are there after each. The same command again goes on where it stopped. A run that fails is shown as such and does not stop the
-    others; the exit status is then 1.
+    table.csv, table.md and figure.png beside it are there after each. The same command again goes on where it stopped.
+    A run that fails is shown as such and does not stop the others; the exit status is then 1.
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
@@ -79,6 +79,7 @@ def main(arguments: Sequence[str]) -> int:
     kind = "quick" if config.quick else preset
     out = config.out / (config.name if kind == "default" else f"{config.name}-{kind}")
     settings = "--quick" if config.quick else f"--preset {preset}"
+    settings += f" --variant {variant}" * (variant != PaperConfig.variant)
     what = [path.name or str(path.resolve().name) for path in config.data]
     if config.materials:
         what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
         said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
         failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
-    print(f"{out}/table.md and figure.png{runs}")
+    print(f"{out}/table.md{' and figure.png' * (out / 'figure.png').is_file()}{runs}")
     return int(failed > 0)
 
 

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.experiment import Made, Row, Run
-from mi_ring.experiments.recipes import AXES, Perturbed, SingleView, Synthetic
+from mi_ring.experiments.recipes import Perturbed, Synthetic
+from mi_ring.experiments.single_view import AXES, SingleView
 from mi_ring.experiments.slices import bsdf_of, second_at, slices
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.metrics.evaluation import evaluate_fit
@@ -63,7 +64,7 @@ def aligned(run: Run, made: Made) -> list[Row]:
     """As `evaluated` after rigid alignment, and the root mean square of what is left of cameras' turns [°]."""
     (row,) = evaluated(run, made, align="rigid")
     exact = run.recipe.source if isinstance(run.recipe, Perturbed) else run.recipe
-    return [row | {"turned": turns(exact.made(made.captures), made.folder / "scene.xml")}]
+    return [row | {"turned": turns(exact.place(made.captures), made.folder / "scene.xml")}]
 
 
 def turns(a: Path, b: Path) -> float:
