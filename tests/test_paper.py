@@ -2,10 +2,13 @@
 
 import csv
 import dataclasses
+import os
 import re
 import shutil
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -18,21 +21,27 @@ from conftest import AXES, CENTER
 from scipy.spatial.transform import Rotation
 
 from mi_ring import paper
+from mi_ring.capture import scenefile
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection import fits
 from mi_ring.errors import InputError
 from mi_ring.experiments import engine, measures, published, recipes, single_view, slices, tables
 from mi_ring.experiments.catalogue import EXPERIMENTS
-from mi_ring.experiments.experiment import QUICK, Asked, Column, Experiment, Made, Outcome, Run
+from mi_ring.experiments.experiment import NOT_RUN, QUICK, Asked, Column, Experiment, Made, Outcome, Run
 from mi_ring.experiments.figures import bars
 from mi_ring.fit import parse_options
 from mi_ring.fitting.config import Config
+from mi_ring.metrics import evaluation, surfaces
+from mi_ring.metrics.surfaces import hits, load_true_mesh
+from mi_ring.rendering.lights import Lights
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
+from mi_ring.synthesis.capture import settings_of
 from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import load_material, pattern_of
 from mi_ring.synthesis.stage import shape_of
-from mi_ring.system.files import in_turn
 
+ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
 TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
 
 
@@ -63,10 +72,12 @@ def photographed_ball(tmp_path):
     points = rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None]
     normals = np.where(mask[..., None], (points - middle) / radius, 0) * [1, -1, -1]  # x right, y up, z to the viewer
     lights = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.6, 0.8]])
-    pixels = (20000 * np.maximum(normals[mask] @ lights.T, 0)).T[..., None].repeat(3, -1).astype(np.uint16)
+    power = np.array([[1.0, 0.8, 0.5], [0.9, 1.1, 0.7], [0.6, 0.7, 1.2]])
+    shading = np.maximum(normals[mask] @ lights.T, 0).T
+    pixels = np.round(65535 * ALBEDO * power[:, None] * shading[..., None]).astype(np.uint16)
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     file = tmp_path / "ball.npz"
-    np.savez(file, mask=mask, pixels_uint16=pixels, light_dir=lights, light_int=np.ones((3, 3)), normal_gt=normals, K=K)
+    np.savez(file, mask=mask, pixels_uint16=pixels, light_dir=lights, light_int=power, normal_gt=normals, K=K)
     return file, middle * [-1, -1, 1], radius  # as Mitsuba's camera, at the origin, has it
 
 
@@ -310,7 +321,7 @@ def test_slices_are_those_of_equation_1():
     random = np.random.default_rng(1)
     material = {"diffuse": random.uniform(0.1, 0.5, (5, 3)), "specular": random.uniform(0.02, 0.2, 5),
                 "roughness": random.uniform(0.2, 0.8, 5)}  # fmt: skip
-    found = slices.slices(slices.bsdf_of(Ring(torch.zeros(3), 1.0), material), 5)
+    found = slices.slices(slices.bsdf_of(material), 5)
     cosine, r = np.cos(slices.ANGLES), material["roughness"][:, None]
     d = r**2 / (cosine**2 * (r**2 - 1) + 1) ** 2
     g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(slices.ANGLES) ** 2))) ** 2
@@ -340,8 +351,48 @@ def test_places_of_the_second_material_are_where_it_is_seen():
     out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))
     seen = np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi))[0] > 0.1
-    found = slices.second_at(config, np.concatenate([ball.vertices, points]))[len(ball.vertices) :]
+    found = slices.second_at(config, ball.bounds, points)
     assert np.array_equal(found, seen) and 0.3 < found.mean() < 0.7
+
+
+def test_each_point_has_its_stripe_however_coarse_the_mesh_is():
+    """A fit's points are beside the true surface, too, beyond its lowest and its highest."""
+    bounds = np.array([[-3.0, 10.0, -1.0], [3.0, 16.0, 5.0]])
+    config = SynthesizeConfig(Path(), Path(), second="diffuse", bands=6)
+    heights = np.array([9.9, 10.4, 11.5, 12.9, 13.1, 14.6, 15.9, 16.2])
+    points = np.stack([np.linspace(-4, 4, 8), heights, np.linspace(6, -2, 8)], 1)
+    assert slices.second_at(config, bounds, points).tolist() == [k % 2 == 1 for k in (0, 0, 1, 2, 3, 4, 5, 5)]
+
+
+def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path, monkeypatch):
+    """Concentric ones: between them it is 1.5 mm, along a ray that passes the middle at a distance b a little more."""
+    monkeypatch.setattr(surfaces, "POINTS", 2000)
+    monkeypatch.setattr(evaluation, "compare_photographs", lambda *_: ({}, [{}]))  # which are no lengths
+    part = recipes.Part("part", recipes.given(known_capture), 3)
+    scene = part.made(tmp_path / "captures")
+    radius, more, ball = 16.0, 1.5, trimesh.creation.icosphere(subdivisions=4)
+    ring = Ring(CENTER, radius, scale=0.5, subdivisions=2)
+    torch.save(ring_state(ring), tmp_path / "ring.pt")
+    (tmp_path / "log.jsonl").write_text('{"seconds": 7.0}\n')
+    fitted = scenefile.fitted_scene_xml(scene, tmp_path, 2, '<bsdf type="cooktorrance"/>')
+    (tmp_path / "scene.xml").write_bytes(fitted)
+    (tmp_path / "truth").mkdir()
+    for file, r in (("mesh.ply", radius + more), ("truth/mesh.ply", radius)):
+        trimesh.Trimesh(CENTER + r * ball.vertices, ball.faces).export(tmp_path / file)
+    made = Made(tmp_path, scene, tmp_path / "truth", tmp_path / "captures", Asked())
+    (row,) = measures.in_millimetres(Run("ball", part, {}), made)
+    depths = []
+    for sensor in load_capture(scene, images=False).sensors:
+        camera = sensor.camera
+        x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size))
+        rays = np.stack([(camera.centre[0] - x) / camera.focal[0], (camera.centre[1] - y) / camera.focal[1], x**0], -1)
+        rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.to_world[:3, :3].T
+        middle = CENTER - camera.to_world[:3, 3]
+        squared = middle @ middle - (rays @ middle) ** 2
+        squared = squared[squared < radius**2]
+        depths.append(np.sqrt((radius + more) ** 2 - squared) - np.sqrt(radius**2 - squared))
+    assert row["chamfer_mm"] == pytest.approx(more, rel=0.01)
+    assert row["depth_mm"] == pytest.approx(np.concatenate(depths).mean(), rel=0.01)
 
 
 def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp_path):
@@ -358,6 +409,17 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     made = Made(folder, scene, tmp_path / "none", tmp_path / "captures", Asked())
     (row,) = measures.normals_from_one_side(Run("ball", recipe, {}), made)
     assert row["normal_mean"] < 0.5 and row["missed"] < 2 and row["seconds"] == 7
+    capture = load_capture(scene)
+    seen, _, normals, _ = hits(load_true_mesh(folder / "mesh.ply")[1], capture.photograph(0))
+    for k, observed in enumerate(capture.observe([0, 1, 2]).rgb.numpy()):
+        light = Lights.of(capture.sensors)[k]
+        brightness = ALBEDO * light.rgb * np.maximum(normals @ -light.vector, 0)[:, None]  # by Lambert
+        there = seen & (observed.reshape(-1, 3) > 0).any(1)
+        assert there.sum() > 0.5 * seen.sum()
+        np.testing.assert_allclose(observed.reshape(-1, 3)[there], brightness[there], atol=0.01)
+    with pytest.raises(InputError, match="pixels_uint16: is of float64, must be of uint16"):
+        np.savez(tmp_path / "float.npz", **{**np.load(file), "pixels_uint16": np.load(file)["pixels_uint16"] / 65535})
+        single_view.SingleView("float", tmp_path / "float.npz").read()
     with pytest.raises(InputError, match=r"light_int: is of shape \(2, 3\), must be \(3, 3\) by mask and"):
         np.savez(file, **{**np.load(file), "light_int": np.ones((2, 3))})
         recipe.read()
@@ -402,19 +464,77 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     said.unlink()
 
 
-def test_captures_are_made_in_turn(tmp_path):
-    """What one experiment makes another waits for."""
-    done = []
+@dataclasses.dataclass(frozen=True)
+class Slow(recipes.Recipe):
+    """A capture that takes a while and comes to nothing."""
 
-    def make(name):
-        with in_turn(tmp_path / "captures"):
-            done.append(name)
+    events: list
+    pause: Callable = lambda: time.sleep(0.3)
 
-    with in_turn(tmp_path / "captures"):
-        other = threading.Thread(target=make, args=["second"])
-        other.start()
-        other.join(0.3)
-        assert other.is_alive() and not done
-        done.append("first")
-    other.join(10)
-    assert done == ["first", "second"]
+    def make(self, captures):
+        self.events.append("begun")
+        self.pause()
+        self.events.append("done")
+        raise InputError("there is\nnone")
+
+
+def both_attempted(first, second, out):
+    """What has become of two runs that are made at the same time."""
+    asked = Asked(preset="fast", quick=True)
+    with ThreadPoolExecutor(2) as pool:
+        return [*pool.map(lambda recipe: engine.attempted(Run("a", recipe, {}), asked, out).failed, [first, second])]
+
+
+def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsys):
+    events = []
+    assert both_attempted(Slow("cup", events), Slow("cup", events), tmp_path / "out") == ["there is none"] * 2
+    assert events == ["begun", "done"] * 2
+    assert "cup, which another process makes" in capsys.readouterr().out
+    barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
+    two = [Slow(name, [], barrier.wait) for name in ("cup", "pot")]
+    assert both_attempted(*two, tmp_path / "out") == ["there is none"] * 2
+    assert "waiting" not in capsys.readouterr().out
+
+
+def test_captures_of_runs_that_are_not_asked_for_are_not_made(tmp_path):
+    asked, events = Asked(preset="fast", quick=True), []
+    nowhere = recipes.Given("cup", tmp_path / "cup.xml")  # has no truth
+    for recipe in (Slow("cup", events), nowhere, recipes.Part("part", nowhere, 3)):
+        outcome = engine.attempted(Run("a", recipe, {}), asked, tmp_path / "out", wanted=False)
+        assert outcome.failed == NOT_RUN and not events
+
+
+def test_a_converted_capture_is_made_again_when_any_of_its_files_changes(tmp_path, monkeypatch):
+    bear = tmp_path / "bearPNG"
+    (bear / "view_01").mkdir(parents=True)
+    names = "001.png", "mask.png", "light_directions.txt", "light_intensities.txt"
+    names = "Calib_Results.mat", "mesh_Gt.ply", *(f"view_01/{name}" for name in names)
+    for name in names:
+        (bear / name).touch()
+    written = []
+    monkeypatch.setattr(recipes, "write_scene", lambda source: written.append(source.scene.write_text("<scene/>")))
+    recipe = recipes.DiligentObject("bear", bear)
+    for count, name in enumerate(names, 1):
+        recipe.made(tmp_path / "captures")
+        recipe.made(tmp_path / "captures")
+        assert len(written) == count
+        os.utime(bear / name, (count, count))
+
+
+def test_captures_are_known_by_the_files_that_theirs_name(tmp_path):
+    (tmp_path / "textures").mkdir()
+    files = {
+        "wood.xml": '<bsdf type="diffuse"><texture type="bitmap"><string name="filename" value="textures/wood.png"/>'
+                    "</texture></bsdf>",
+        "cup.obj": "mtllib cup.mtl\nv 0 0 0\n", "cup.mtl": "newmtl a\nmap_Kd cup.png\n", "cup.png": "", "other.png": "",
+        "textures/wood.png": "",
+    }  # fmt: skip
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    config, found = SynthesizeConfig(tmp_path / "cup.obj", Path(), str(tmp_path / "wood.xml")), []
+    for name in ("other.png", "textures/wood.png", "cup.mtl", "cup.png"):
+        (tmp_path / name).write_text(files[name] + "\n")
+        found.append(settings_of(config)["digests"])
+    mesh, material = ([digests[name] for digests in found] for name in ("mesh", "material"))
+    assert material[0] != material[1] == material[2] and mesh[0] == mesh[1]
+    assert len({*mesh}) == 3
