@@ -26,9 +26,19 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.collection import fits
 from mi_ring.errors import InputError
 from mi_ring.experiments import engine, measures, published, recipes, single_view, slices, tables
-from mi_ring.experiments.catalogue import EXPERIMENTS
-from mi_ring.experiments.experiment import NOT_RUN, QUICK, Asked, Column, Experiment, Made, Outcome, Run
-from mi_ring.experiments.figures import bars
+from mi_ring.experiments.catalogue import EXPERIMENTS, seeded
+from mi_ring.experiments.experiment import (
+    NOT_RUN,
+    QUICK,
+    Asked,
+    Column,
+    Experiment,
+    Made,
+    Outcome,
+    Run,
+    require_distinct,
+)
+from mi_ring.experiments.figures import bars, curves
 from mi_ring.fit import parse_options
 from mi_ring.fitting.config import Config
 from mi_ring.metrics import evaluation, surfaces
@@ -40,6 +50,7 @@ from mi_ring.synthesis.capture import settings_of
 from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import load_material, pattern_of
 from mi_ring.synthesis.stage import shape_of
+from mi_ring.system import machine
 
 ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
 TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
@@ -176,6 +187,7 @@ MISTAKES = [
     (["single", "EMPTY"], "is a folder"),
     (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
     (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
+    (["timing", "KNOWN", "--seeds", "0", "1"], "--seeds: are several; timing takes one"),
     (["specularity", "--materials", ""], "--materials: one is empty"),
     (["table1", "PLY", "--materials", " "], "--materials: one is empty"),
     (["table1", "PLY", "--materials", "diffuse", "plastic"], "--materials: are 2 for 1 meshes"),
@@ -206,11 +218,22 @@ def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
     assert not list((tmp_path).rglob("table.md"))
 
 
-def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypatch):
+def test_each_run_has_a_folder_of_its_own(known_capture):
+    """Captures egg with seed 3 and egg-3, and one that would be among the records."""
+    egg, three, batch = (recipes.Given(name, known_capture / "scene.xml") for name in ("egg", "egg-3", "batch"))
+    seeds = seeded([Run(r.name, r, {"capture": r.name}) for r in (egg, three)], Asked(seeds=(0, 3)))
+    with pytest.raises(InputError, match="DATA: two runs would both be called egg-3; rename a capture, leave out what"):
+        require_distinct(seeds)
+    with pytest.raises(InputError, match="DATA: a run would be called batch, as the folder of records is; rename"):
+        require_distinct([Run(batch.name, batch, {})])
+
+
+def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypatch, capsys):
     folders = []
-    monkeypatch.setattr(paper, "perform", lambda experiment, asked, out, *_: folders.append(out.name) or 0)
+    monkeypatch.setattr(paper, "perform", lambda experiment, asked, out, *_: folders.append(out.name) or 2)
     for options in ([], ["--preset", "fast"], ["--preset", "paper"], ["--quick"]):
-        paper.main(["ablation", *options, "--out", str(tmp_path)])
+        assert paper.main(["ablation", *options, "--out", str(tmp_path)]) == 1
+    assert "ablation/table.md; 2 runs failed" in capsys.readouterr().out  # and no figure
     assert folders == ["ablation", "ablation-fast", "ablation-paper", "ablation-quick"]
     materials = [("diffuse reflectance=0.2", "diffuse"), ("diffuse reflectance=0.3", "diffuse")]
     asked = [Asked((tmp_path / mesh,), two) for mesh in ("a.ply", "b/a.ply") for two in materials]
@@ -250,7 +273,9 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
         return measures.evaluated(run, made)
 
     monkeypatch.setattr(engine, "evaluated", evaluated)
+    monkeypatch.setattr(engine, "show", Mock(wraps=engine.show))
     assert engine.perform(trial(runs), asked, out) == 1
+    assert engine.show.call_count == 2  # nothing is new of the first
     assert measured == ["egg-1"] and (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns == ring
     rows = list(csv.DictReader((out / "table.csv").open()))
     assert [(row["capture"], row["seed"], row["by"]) for row in rows] == [
@@ -291,6 +316,59 @@ def test_interrupts_are_no_deaths(known_capture, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             engine.attempted(run, Asked(preset="fast", threads=1, quick=True), tmp_path / "trial")
     assert begun.call_count == engine.RETRIES + 2
+
+
+def test_a_figure_that_cannot_be_drawn_stops_nothing(tmp_path, capsys):
+    def broken(ran):
+        raise ValueError("too\nlarge")
+
+    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    (tmp_path / "figure.png").touch()  # of before
+    engine.show(
+        dataclasses.replace(trial([run]), figure=broken), [Outcome(run, None, [{"iou": 0.5}], "")], tmp_path, ""
+    )
+    assert capsys.readouterr().out == f"{tmp_path}/figure.png: cannot be drawn: too large\n"
+    assert (tmp_path / "table.md").is_file() and not (tmp_path / "figure.png").exists()
+
+
+def of_labels(rows, **labels):
+    """Outcomes of runs of an egg, one for each of some rows, with other values of labels; no row: one that failed."""
+    runs = [Run("a", recipes.Example("example"), {"capture": "egg", **dict(zip(labels, values))})
+            for values in zip(*labels.values())]  # fmt: skip
+    return [Outcome(run, None, [row], "") if row else Outcome(run, failed="burst") for run, row in zip(runs, rows)]
+
+
+def test_figures_leave_out_nothing():
+    nan = float("nan")
+    rows = [{"iou": nan}, {"iou": 0.5}, {}, {"iou": 0.7}, {"iou": 0.3}]
+    outcomes = of_labels(rows, T=[3, 10, 5, 3, 10], seed=[0, 0, 0, 4, 4])
+    (axes,) = bars(("iou", "IoU"))(outcomes).axes
+    assert [label.get_text() for label in axes.get_yticklabels()][:3] == [
+        "egg, T 3, seed 0", "egg, T 10, seed 0", "egg, T 5, seed 0"]  # fmt: skip
+    assert [(text.get_text(), text.get_position()[1]) for text in axes.texts] == [(" NaN", 0), (" failed", 2)]
+    assert [(bar.get_width(), bar.get_y() + 0.4) for bar in axes.patches] == [(0.5, 1), (0.7, 3), (0.3, 4)]
+    figure = curves(("T", "T"), ("iou", "IoU"))(outcomes)
+    lines = {line.get_label(): line.get_xydata().tolist() for line in figure.axes[0].lines}
+    assert lines.keys() == {"egg, seed 0; NaN at 3", "egg, seed 4"} and lines["egg, seed 4"] == [[3, 0.7], [10, 0.3]]
+    assert figure.get_supxlabel() == "failed: egg, T 5, seed 0"
+
+
+def test_means_are_over_seeds_and_over_objects():
+    outcomes = of_labels(
+        [{"iou": value} for value in (0.1, 0.3, 0.6, 0.8)], object=["a", "a", "b", "b"], seed=[0, 1] * 2
+    )
+    rows = tables.means(dataclasses.replace(trial([]), mean_over="object"), outcomes)
+    assert [(row["object"], row.get("seed"), row["iou"]) for row in rows] == [
+        ("a", "mean of 2", pytest.approx(0.2)), ("b", "mean of 2", pytest.approx(0.7)),
+        ("mean of 4", None, pytest.approx(0.45)),
+    ]  # fmt: skip
+
+
+def test_a_table_says_on_which_gpu(monkeypatch):
+    assert "RTX" not in tables.markdown(trial([]), {"by": "by"}, [], "said")
+    monkeypatch.setattr(machine, "device", lambda: torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA RTX 1")
+    assert "said; NVIDIA RTX 1, " in tables.markdown(trial([]), {"by": "by"}, [], "said")
 
 
 def test_numbers_that_are_none_are_shown():

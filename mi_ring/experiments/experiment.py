@@ -114,7 +114,7 @@ class Experiment:
     figure: Callable[[list[Outcome]], Figure]  #: of all runs that are done or have failed
     data: str  #: what DATA must be
     published: Sequence[Row] = ()  #: rows beside ours
-    mean_over: str = "seed"  #: label that more rows have the mean over: over all seeds, whose mean others have
+    mean_over: str = "seed"  #: label over which further rows have means, beside those over seeds
 
 
 def words(settings: Mapping[str, Any]) -> list[str]:
