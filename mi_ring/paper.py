@@ -25,9 +25,9 @@ Name: Any = Literal[tuple(EXPERIMENTS)]
 class PaperConfig:
     """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
 
-    Each run is a fit whose results are in OUT/NAME/runs/; table.csv, table.md and figure.png beside it are there after
-    each. The same command again goes on where it stopped. A run that fails is shown as such and does not stop the
-    others; the exit status is then 1.
+    Each run is a fit whose results are in OUT/NAME/runs/, by another preset than default in OUT/NAME-PRESET/runs/;
+    table.csv, table.md and figure.png beside it are there after each. The same command again goes on where it stopped.
+    A run that fails is shown as such and does not stop the others; the exit status is then 1.
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
@@ -43,7 +43,8 @@ class PaperConfig:
     """What meshes are made of, as mi-ring synthesize has them: in turn, all on the one mesh of specularity, two in
     stripes."""
     out: Path = Path("out/paper")
-    """Folder of the results of all experiments, each in a folder of its name, and of the captures that they make."""
+    """Folder of the results of all experiments, each in a folder of its name and preset, and of the captures that they
+    make."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
     """Of the fits, as mi-ring fit has them. Default: default, and fast with --quick, which goes with no other."""
     seeds: tuple[int, ...] = (0,)
@@ -51,8 +52,8 @@ class PaperConfig:
     only: tuple[str, ...] = ()
     """Names of runs to make now, the others later. Default: all."""
     quick: bool = False
-    """A small version of everything, in minutes: few runs, few iterations of small photographs. Its results are in a
-    folder of their own, NAME-quick."""
+    """A small version of everything, in minutes: few runs, few iterations of small photographs. Its results are in
+    OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Variant of Mitsuba: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
     threads: int = 0
@@ -70,11 +71,15 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
     if config.quick and config.preset not in (None, "fast"):
         raise InputError(f"--preset: is {config.preset}, but --quick is by fast; leave one of the two out")
+    if not all(material.strip() for material in config.materials):
+        raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
     preset = config.preset or ("fast" if config.quick else "default")
     variant = set_variant(config.variant)
     asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
-    out = config.out / f"{config.name}{'-quick' * config.quick}"
+    kind = "quick" if config.quick else preset
+    out = config.out / (config.name if kind == "default" else f"{config.name}-{kind}")
     settings = "--quick" if config.quick else f"--preset {preset}"
+    settings += f" --variant {variant}" * (variant != PaperConfig.variant)
     what = [path.name or str(path.resolve().name) for path in config.data]
     if config.materials:
         what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
@@ -83,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
         said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
         failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
-    print(f"{out}/table.md and figure.png{runs}")
+    print(f"{out}/table.md{' and figure.png' * (out / 'figure.png').is_file()}{runs}")
     return int(failed > 0)
 
 

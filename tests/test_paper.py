@@ -2,10 +2,13 @@
 
 import csv
 import dataclasses
+import os
 import re
 import shutil
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -18,21 +21,38 @@ from conftest import AXES, CENTER
 from scipy.spatial.transform import Rotation
 
 from mi_ring import paper
+from mi_ring.capture import scenefile
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection import fits
 from mi_ring.errors import InputError
-from mi_ring.experiments import engine, measures, published, recipes, slices, tables
-from mi_ring.experiments.catalogue import EXPERIMENTS
-from mi_ring.experiments.experiment import QUICK, Asked, Column, Experiment, Made, Outcome, Run
-from mi_ring.experiments.figures import bars
+from mi_ring.experiments import engine, measures, published, recipes, single_view, slices, tables
+from mi_ring.experiments.catalogue import EXPERIMENTS, seeded
+from mi_ring.experiments.experiment import (
+    NOT_RUN,
+    QUICK,
+    Asked,
+    Column,
+    Experiment,
+    Made,
+    Outcome,
+    Run,
+    require_distinct,
+)
+from mi_ring.experiments.figures import bars, curves
 from mi_ring.fit import parse_options
 from mi_ring.fitting.config import Config
+from mi_ring.metrics import evaluation, surfaces
+from mi_ring.metrics.surfaces import hits, load_true_mesh
+from mi_ring.rendering.lights import Lights
 from mi_ring.ring.ring import Ring
+from mi_ring.ring.saved import ring_state
+from mi_ring.synthesis.capture import settings_of
 from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import load_material, pattern_of
 from mi_ring.synthesis.stage import shape_of
-from mi_ring.system.files import in_turn
+from mi_ring.system import machine
 
+ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
 TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
 
 
@@ -56,17 +76,19 @@ def photographed_ball(tmp_path):
     y, x = np.mgrid[:height, :width]
     rays = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones((height, width))], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)  # OpenCV's axes: x right, y down, z forward
-    middle = np.array([2.0, -3.0, recipes.DISTANCE])
+    middle = np.array([2.0, -3.0, single_view.DISTANCE])
     along = rays @ middle
     inside = along**2 - middle @ middle + radius**2
     mask = inside > 0
     points = rays * (along - np.sqrt(np.maximum(inside, 0)))[..., None]
     normals = np.where(mask[..., None], (points - middle) / radius, 0) * [1, -1, -1]  # x right, y up, z to the viewer
     lights = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.6, 0.8]])
-    pixels = (20000 * np.maximum(normals[mask] @ lights.T, 0)).T[..., None].repeat(3, -1).astype(np.uint16)
+    power = np.array([[1.0, 0.8, 0.5], [0.9, 1.1, 0.7], [0.6, 0.7, 1.2]])
+    shading = np.maximum(normals[mask] @ lights.T, 0).T
+    pixels = np.round(65535 * ALBEDO * power[:, None] * shading[..., None]).astype(np.uint16)
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     file = tmp_path / "ball.npz"
-    np.savez(file, mask=mask, pixels_uint16=pixels, light_dir=lights, light_int=np.ones((3, 3)), normal_gt=normals, K=K)
+    np.savez(file, mask=mask, pixels_uint16=pixels, light_dir=lights, light_int=power, normal_gt=normals, K=K)
     return file, middle * [-1, -1, 1], radius  # as Mitsuba's camera, at the origin, has it
 
 
@@ -84,7 +106,7 @@ def data_for(name, known_capture, ball, tmp_path):
 
 def test_every_run_is_one_that_a_fit_takes(known_capture, photographed_ball, tmp_path):
     for name, experiment in EXPERIMENTS.items():
-        seeds = (0,) if name == "swap" else (0, 1)
+        seeds = (0,) if name in ("swap", "resolution", "timing") else (0, 1)
         data = data_for(name, known_capture, photographed_ball[0], tmp_path)
         require_valid(experiment, data, known_capture, seeds)
 
@@ -165,23 +187,58 @@ MISTAKES = [
     (["single", "EMPTY"], "is a folder"),
     (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
     (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
+    (["timing", "KNOWN", "--seeds", "0", "1"], "--seeds: are several; timing takes one"),
     (["specularity", "--materials", ""], "--materials: one is empty"),
-    (["table1", "a.ply", "--materials", "diffuse", "plastic"], "a.ply: DATA: is not there"),
+    (["table1", "PLY", "--materials", " "], "--materials: one is empty"),
+    (["table1", "PLY", "--materials", "diffuse", "plastic"], "--materials: are 2 for 1 meshes"),
+    (["table1", "GLTF"], r"a.gltf: DATA: is neither a scene file, .xml, nor a mesh, .ply, .obj"),
+    (["specularity", "--materials", "nowhere.binary"], "nowhere.binary: --materials: no such file"),
+    (["specularity", "PLY", "--materials", "principled base_color=vertex_color"], "--materials: .* varies over the"),
+    (["stripes", "PLY", "--materials", "diffuse", "TEXTURED"], "--materials: .*wood.xml: varies over the surface"),
     (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
     (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
     (["specularity", "EMPTY"], "DATA: must be one mesh"),
     (["swap", "KNOWN"], "DATA: is one capture; swap exchanges"),
-    (["table1", "KNOWN", "KNOWN"], "two captures of one name would both be egg"),
+    (["table1", "KNOWN", "KNOWN"], "DATA: two runs would both be called egg; rename"),
 ]  # fmt: skip
 
 
 def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
     (tmp_path / "empty").mkdir()
-    places = {"EMPTY": str(tmp_path / "empty"), "KNOWN": str(known_capture)}
+    trimesh.creation.box().export(tmp_path / "a.ply")
+    (tmp_path / "a.gltf").write_text("{}")
+    mi.Bitmap(np.ones((2, 2, 3), np.float32)).write(str(tmp_path / "wood.exr"))
+    (tmp_path / "wood.xml").write_text('<bsdf type="diffuse"><texture name="reflectance" type="bitmap">'
+                                       '<string name="filename" value="wood.exr"/></texture></bsdf>')  # fmt: skip
+    files = {"EMPTY": "empty", "PLY": "a.ply", "GLTF": "a.gltf", "TEXTURED": "wood.xml"}
+    places = {"KNOWN": str(known_capture), **{name: str(tmp_path / file) for name, file in files.items()}}
     for arguments, message in MISTAKES:
         with pytest.raises(InputError, match=message):
             paper.main([*(places.get(word, word) for word in arguments), "--out", str(tmp_path / "out")])
     assert not list((tmp_path).rglob("table.md"))
+
+
+def test_each_run_has_a_folder_of_its_own(known_capture):
+    """Captures egg with seed 3 and egg-3, and one that would be among the records."""
+    egg, three, batch = (recipes.Given(name, known_capture / "scene.xml") for name in ("egg", "egg-3", "batch"))
+    seeds = seeded([Run(r.name, r, {"capture": r.name}) for r in (egg, three)], Asked(seeds=(0, 3)))
+    with pytest.raises(InputError, match="DATA: two runs would both be called egg-3; rename a capture, leave out what"):
+        require_distinct(seeds)
+    with pytest.raises(InputError, match="DATA: a run would be called batch, as the folder of records is; rename"):
+        require_distinct([Run(batch.name, batch, {})])
+
+
+def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypatch, capsys):
+    folders = []
+    monkeypatch.setattr(paper, "perform", lambda experiment, asked, out, *_: folders.append(out.name) or 2)
+    for options in ([], ["--preset", "fast"], ["--preset", "paper"], ["--quick"]):
+        assert paper.main(["ablation", *options, "--out", str(tmp_path)]) == 1
+    assert "ablation/table.md; 2 runs failed" in capsys.readouterr().out  # and no figure
+    assert folders == ["ablation", "ablation-fast", "ablation-paper", "ablation-quick"]
+    materials = [("diffuse reflectance=0.2", "diffuse"), ("diffuse reflectance=0.3", "diffuse")]
+    asked = [Asked((tmp_path / mesh,), two) for mesh in ("a.ply", "b/a.ply") for two in materials]
+    for name, different in (("specularity", 6), ("stripes", 4)):
+        assert len({run.name for a in asked for run in EXPERIMENTS[name].runs(a)}) == different
 
 
 def test_a_capture_without_truth_is_refused(small_capture):
@@ -195,7 +252,7 @@ def test_a_capture_without_truth_is_refused(small_capture):
 def trial(runs):
     columns = {"normal_mean": Column("normals °"), "iou": Column("IoU", 3)}
     reference = [{"capture": "egg", "by": "somebody", "normal_mean": 5.0}]
-    return Experiment("A trial.", lambda asked: runs, columns, bars(("normal_mean", "°")), reference, "seed")
+    return Experiment("A trial.", lambda asked: runs, columns, bars(("normal_mean", "°")), "none", reference)
 
 
 def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, tmp_path, monkeypatch):
@@ -216,7 +273,9 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
         return measures.evaluated(run, made)
 
     monkeypatch.setattr(engine, "evaluated", evaluated)
+    monkeypatch.setattr(engine, "show", Mock(wraps=engine.show))
     assert engine.perform(trial(runs), asked, out) == 1
+    assert engine.show.call_count == 2  # nothing is new of the first
     assert measured == ["egg-1"] and (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns == ring
     rows = list(csv.DictReader((out / "table.csv").open()))
     assert [(row["capture"], row["seed"], row["by"]) for row in rows] == [
@@ -259,6 +318,59 @@ def test_interrupts_are_no_deaths(known_capture, tmp_path, monkeypatch):
     assert begun.call_count == engine.RETRIES + 2
 
 
+def test_a_figure_that_cannot_be_drawn_stops_nothing(tmp_path, capsys):
+    def broken(ran):
+        raise ValueError("too\nlarge")
+
+    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    (tmp_path / "figure.png").touch()  # of before
+    engine.show(
+        dataclasses.replace(trial([run]), figure=broken), [Outcome(run, None, [{"iou": 0.5}], "")], tmp_path, ""
+    )
+    assert capsys.readouterr().out == f"{tmp_path}/figure.png: cannot be drawn: too large\n"
+    assert (tmp_path / "table.md").is_file() and not (tmp_path / "figure.png").exists()
+
+
+def of_labels(rows, **labels):
+    """Outcomes of runs of an egg, one for each of some rows, with other values of labels; no row: one that failed."""
+    runs = [Run("a", recipes.Example("example"), {"capture": "egg", **dict(zip(labels, values))})
+            for values in zip(*labels.values())]  # fmt: skip
+    return [Outcome(run, None, [row], "") if row else Outcome(run, failed="burst") for run, row in zip(runs, rows)]
+
+
+def test_figures_leave_out_nothing():
+    nan = float("nan")
+    rows = [{"iou": nan}, {"iou": 0.5}, {}, {"iou": 0.7}, {"iou": 0.3}]
+    outcomes = of_labels(rows, T=[3, 10, 5, 3, 10], seed=[0, 0, 0, 4, 4])
+    (axes,) = bars(("iou", "IoU"))(outcomes).axes
+    assert [label.get_text() for label in axes.get_yticklabels()][:3] == [
+        "egg, T 3, seed 0", "egg, T 10, seed 0", "egg, T 5, seed 0"]  # fmt: skip
+    assert [(text.get_text(), text.get_position()[1]) for text in axes.texts] == [(" NaN", 0), (" failed", 2)]
+    assert [(bar.get_width(), bar.get_y() + 0.4) for bar in axes.patches] == [(0.5, 1), (0.7, 3), (0.3, 4)]
+    figure = curves(("T", "T"), ("iou", "IoU"))(outcomes)
+    lines = {line.get_label(): line.get_xydata().tolist() for line in figure.axes[0].lines}
+    assert lines.keys() == {"egg, seed 0; NaN at 3", "egg, seed 4"} and lines["egg, seed 4"] == [[3, 0.7], [10, 0.3]]
+    assert figure.get_supxlabel() == "failed: egg, T 5, seed 0"
+
+
+def test_means_are_over_seeds_and_over_objects():
+    outcomes = of_labels(
+        [{"iou": value} for value in (0.1, 0.3, 0.6, 0.8)], object=["a", "a", "b", "b"], seed=[0, 1] * 2
+    )
+    rows = tables.means(dataclasses.replace(trial([]), mean_over="object"), outcomes)
+    assert [(row["object"], row.get("seed"), row["iou"]) for row in rows] == [
+        ("a", "mean of 2", pytest.approx(0.2)), ("b", "mean of 2", pytest.approx(0.7)),
+        ("mean of 4", None, pytest.approx(0.45)),
+    ]  # fmt: skip
+
+
+def test_a_table_says_on_which_gpu(monkeypatch):
+    assert "RTX" not in tables.markdown(trial([]), {"by": "by"}, [], "said")
+    monkeypatch.setattr(machine, "device", lambda: torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA RTX 1")
+    assert "said; NVIDIA RTX 1, " in tables.markdown(trial([]), {"by": "by"}, [], "said")
+
+
 def test_numbers_that_are_none_are_shown():
     run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
     other = dataclasses.replace(run, name="b", labels={"capture": "egg", "seed": 1})
@@ -287,7 +399,7 @@ def test_slices_are_those_of_equation_1():
     random = np.random.default_rng(1)
     material = {"diffuse": random.uniform(0.1, 0.5, (5, 3)), "specular": random.uniform(0.02, 0.2, 5),
                 "roughness": random.uniform(0.2, 0.8, 5)}  # fmt: skip
-    found = slices.slices(slices.bsdf_of(Ring(torch.zeros(3), 1.0), material), 5)
+    found = slices.slices(slices.bsdf_of(material), 5)
     cosine, r = np.cos(slices.ANGLES), material["roughness"][:, None]
     d = r**2 / (cosine**2 * (r**2 - 1) + 1) ** 2
     g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(slices.ANGLES) ** 2))) ** 2
@@ -317,13 +429,53 @@ def test_places_of_the_second_material_are_where_it_is_seen():
     out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))
     seen = np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi))[0] > 0.1
-    found = slices.second_at(config, np.concatenate([ball.vertices, points]))[len(ball.vertices) :]
+    found = slices.second_at(config, ball.bounds, points)
     assert np.array_equal(found, seen) and 0.3 < found.mean() < 0.7
+
+
+def test_each_point_has_its_stripe_however_coarse_the_mesh_is():
+    """A fit's points are beside the true surface, too, beyond its lowest and its highest."""
+    bounds = np.array([[-3.0, 10.0, -1.0], [3.0, 16.0, 5.0]])
+    config = SynthesizeConfig(Path(), Path(), second="diffuse", bands=6)
+    heights = np.array([9.9, 10.4, 11.5, 12.9, 13.1, 14.6, 15.9, 16.2])
+    points = np.stack([np.linspace(-4, 4, 8), heights, np.linspace(6, -2, 8)], 1)
+    assert slices.second_at(config, bounds, points).tolist() == [k % 2 == 1 for k in (0, 0, 1, 2, 3, 4, 5, 5)]
+
+
+def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path, monkeypatch):
+    """Concentric ones: between them it is 1.5 mm, along a ray that passes the middle at a distance b a little more."""
+    monkeypatch.setattr(surfaces, "POINTS", 2000)
+    monkeypatch.setattr(evaluation, "compare_photographs", lambda *_: ({}, [{}]))  # which are no lengths
+    part = recipes.Part("part", recipes.given(known_capture), 3)
+    scene = part.made(tmp_path / "captures")
+    radius, more, ball = 16.0, 1.5, trimesh.creation.icosphere(subdivisions=4)
+    ring = Ring(CENTER, radius, scale=0.5, subdivisions=2)
+    torch.save(ring_state(ring), tmp_path / "ring.pt")
+    (tmp_path / "log.jsonl").write_text('{"seconds": 7.0}\n')
+    fitted = scenefile.fitted_scene_xml(scene, tmp_path, 2, '<bsdf type="cooktorrance"/>')
+    (tmp_path / "scene.xml").write_bytes(fitted)
+    (tmp_path / "truth").mkdir()
+    for file, r in (("mesh.ply", radius + more), ("truth/mesh.ply", radius)):
+        trimesh.Trimesh(CENTER + r * ball.vertices, ball.faces).export(tmp_path / file)
+    made = Made(tmp_path, scene, tmp_path / "truth", tmp_path / "captures", Asked())
+    (row,) = measures.in_millimetres(Run("ball", part, {}), made)
+    depths = []
+    for sensor in load_capture(scene, images=False).sensors:
+        camera = sensor.camera
+        x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size))
+        rays = np.stack([(camera.centre[0] - x) / camera.focal[0], (camera.centre[1] - y) / camera.focal[1], x**0], -1)
+        rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.to_world[:3, :3].T
+        middle = CENTER - camera.to_world[:3, 3]
+        squared = middle @ middle - (rays @ middle) ** 2
+        squared = squared[squared < radius**2]
+        depths.append(np.sqrt((radius + more) ** 2 - squared) - np.sqrt(radius**2 - squared))
+    assert row["chamfer_mm"] == pytest.approx(more, rel=0.01)
+    assert row["depth_mm"] == pytest.approx(np.concatenate(depths).mean(), rel=0.01)
 
 
 def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp_path):
     file, middle, radius = photographed_ball
-    recipe = recipes.SingleView("single-ball", file)
+    recipe = single_view.SingleView("single-ball", file)
     scene = recipe.made(tmp_path / "captures")
     center, size = load_capture(scene).sphere()
     assert np.linalg.norm(center - middle) < 3 and size == pytest.approx(radius, rel=0.05)
@@ -335,6 +487,17 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     made = Made(folder, scene, tmp_path / "none", tmp_path / "captures", Asked())
     (row,) = measures.normals_from_one_side(Run("ball", recipe, {}), made)
     assert row["normal_mean"] < 0.5 and row["missed"] < 2 and row["seconds"] == 7
+    capture = load_capture(scene)
+    seen, _, normals, _ = hits(load_true_mesh(folder / "mesh.ply")[1], capture.photograph(0))
+    for k, observed in enumerate(capture.observe([0, 1, 2]).rgb.numpy()):
+        light = Lights.of(capture.sensors)[k]
+        brightness = ALBEDO * light.rgb * np.maximum(normals @ -light.vector, 0)[:, None]  # by Lambert
+        there = seen & (observed.reshape(-1, 3) > 0).any(1)
+        assert there.sum() > 0.5 * seen.sum()
+        np.testing.assert_allclose(observed.reshape(-1, 3)[there], brightness[there], atol=0.01)
+    with pytest.raises(InputError, match="pixels_uint16: is of float64, must be of uint16"):
+        np.savez(tmp_path / "float.npz", **{**np.load(file), "pixels_uint16": np.load(file)["pixels_uint16"] / 65535})
+        single_view.SingleView("float", tmp_path / "float.npz").read()
     with pytest.raises(InputError, match=r"light_int: is of shape \(2, 3\), must be \(3, 3\) by mask and"):
         np.savez(file, **{**np.load(file), "light_int": np.ones((2, 3))})
         recipe.read()
@@ -379,19 +542,77 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     said.unlink()
 
 
-def test_captures_are_made_in_turn(tmp_path):
-    """What one experiment makes another waits for."""
-    done = []
+@dataclasses.dataclass(frozen=True)
+class Slow(recipes.Recipe):
+    """A capture that takes a while and comes to nothing."""
 
-    def make(name):
-        with in_turn(tmp_path / "captures"):
-            done.append(name)
+    events: list
+    pause: Callable = lambda: time.sleep(0.3)
 
-    with in_turn(tmp_path / "captures"):
-        other = threading.Thread(target=make, args=["second"])
-        other.start()
-        other.join(0.3)
-        assert other.is_alive() and not done
-        done.append("first")
-    other.join(10)
-    assert done == ["first", "second"]
+    def make(self, captures):
+        self.events.append("begun")
+        self.pause()
+        self.events.append("done")
+        raise InputError("there is\nnone")
+
+
+def both_attempted(first, second, out):
+    """What has become of two runs that are made at the same time."""
+    asked = Asked(preset="fast", quick=True)
+    with ThreadPoolExecutor(2) as pool:
+        return [*pool.map(lambda recipe: engine.attempted(Run("a", recipe, {}), asked, out).failed, [first, second])]
+
+
+def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsys):
+    events = []
+    assert both_attempted(Slow("cup", events), Slow("cup", events), tmp_path / "out") == ["there is none"] * 2
+    assert events == ["begun", "done"] * 2
+    assert "cup, which another process makes" in capsys.readouterr().out
+    barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
+    two = [Slow(name, [], barrier.wait) for name in ("cup", "pot")]
+    assert both_attempted(*two, tmp_path / "out") == ["there is none"] * 2
+    assert "waiting" not in capsys.readouterr().out
+
+
+def test_captures_of_runs_that_are_not_asked_for_are_not_made(tmp_path):
+    asked, events = Asked(preset="fast", quick=True), []
+    nowhere = recipes.Given("cup", tmp_path / "cup.xml")  # has no truth
+    for recipe in (Slow("cup", events), nowhere, recipes.Part("part", nowhere, 3)):
+        outcome = engine.attempted(Run("a", recipe, {}), asked, tmp_path / "out", wanted=False)
+        assert outcome.failed == NOT_RUN and not events
+
+
+def test_a_converted_capture_is_made_again_when_any_of_its_files_changes(tmp_path, monkeypatch):
+    bear = tmp_path / "bearPNG"
+    (bear / "view_01").mkdir(parents=True)
+    names = "001.png", "mask.png", "light_directions.txt", "light_intensities.txt"
+    names = "Calib_Results.mat", "mesh_Gt.ply", *(f"view_01/{name}" for name in names)
+    for name in names:
+        (bear / name).touch()
+    written = []
+    monkeypatch.setattr(recipes, "write_scene", lambda source: written.append(source.scene.write_text("<scene/>")))
+    recipe = recipes.DiligentObject("bear", bear)
+    for count, name in enumerate(names, 1):
+        recipe.made(tmp_path / "captures")
+        recipe.made(tmp_path / "captures")
+        assert len(written) == count
+        os.utime(bear / name, (count, count))
+
+
+def test_captures_are_known_by_the_files_that_theirs_name(tmp_path):
+    (tmp_path / "textures").mkdir()
+    files = {
+        "wood.xml": '<bsdf type="diffuse"><texture type="bitmap"><string name="filename" value="textures/wood.png"/>'
+                    "</texture></bsdf>",
+        "cup.obj": "mtllib cup.mtl\nv 0 0 0\n", "cup.mtl": "newmtl a\nmap_Kd cup.png\n", "cup.png": "", "other.png": "",
+        "textures/wood.png": "",
+    }  # fmt: skip
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    config, found = SynthesizeConfig(tmp_path / "cup.obj", Path(), str(tmp_path / "wood.xml")), []
+    for name in ("other.png", "textures/wood.png", "cup.mtl", "cup.png"):
+        (tmp_path / name).write_text(files[name] + "\n")
+        found.append(settings_of(config)["digests"])
+    mesh, material = ([digests[name] for digests in found] for name in ("mesh", "material"))
+    assert material[0] != material[1] == material[2] and mesh[0] == mesh[1]
+    assert len({*mesh}) == 3

@@ -8,27 +8,12 @@ from typing import Any
 from mi_ring.errors import InputError
 from mi_ring.experiments import figures, measures, published
 from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
-from mi_ring.experiments.recipes import (
-    DiligentObject,
-    Part,
-    Perturbed,
-    Recipe,
-    SingleView,
-    Synthetic,
-    given,
-    own,
-)
-from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.experiments.recipes import DiligentObject, Part, Perturbed, own
+from mi_ring.experiments.single_view import SingleView
+from mi_ring.experiments.sources import captures, one_mesh, require_no_materials, short, traced
 
 DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its photographs are to be had
-MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
 WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
-#: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.
-SIZES: dict[str, dict[str, Any]] = {
-    "full": {},
-    "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
-    "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
-}
 VIEWS = 5, 10, 15, 25, 35, 50
 BANDS = 6  #: of the stripes
 #: Of rising gloss, and those of the stripes, where no others are given.
@@ -45,32 +30,6 @@ SHAPE = {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **FLAWS, **TIME}
 CAPTURES = "folders of captures with scene.xml and truth/mesh.ply"
 
 
-def captures(asked: Asked) -> list[Recipe]:
-    """Those that are given, else the one at hand; a mesh is path traced with a material of its own."""
-    meshes = [path for path in asked.data if path.suffix.lower() in MESHES]
-    if asked.materials and not meshes:
-        raise InputError("--materials: are what meshes are made of; give meshes as DATA")
-    if len(asked.materials) > max(1, len(meshes)):
-        raise InputError(f"--materials: are {len(asked.materials)} for {len(meshes)} meshes; give one each, or fewer, "
-                         "which are taken in turn")  # fmt: skip
-    found: list[Recipe] = []
-    for path in asked.data:
-        if path in meshes:
-            material = asked.materials[meshes.index(path) % len(asked.materials)] if asked.materials else None
-            found.append(traced(asked, path, material))
-        else:
-            found.append(given(path))
-    return found or [own()]
-
-
-def traced(asked: Asked, mesh: Path | None, material: str | None, name: str = "", **options: Any) -> Synthetic:
-    """A capture as the paper's: 50 photographs, 60° wide, flash at the camera, overexposed in parts, of 8 bits."""
-    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[asked.size], **options}
-    return Synthetic(
-        name or (mesh.stem if mesh else "pot"), SynthesizeConfig(Path(), Path(), material, **settings), mesh
-    )
-
-
 def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
     """Each run once for each seed. Its name is the same whatever others there are."""
     many = len(asked.seeds) > 1
@@ -81,6 +40,12 @@ def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
         return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
 
     return [own_seed(run, seed) for run in runs for seed in asked.seeds]
+
+
+def require_one_seed(asked: Asked, name: str) -> None:
+    """Raise InputError for several seeds, where no row could be the mean."""
+    if len(asked.seeds) > 1:
+        raise InputError(f"--seeds: are several; {name} takes one; give one")
 
 
 def varied(asked: Asked, label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> list[Run]:
@@ -140,11 +105,9 @@ def specularity(asked: Asked) -> list[Run]:
     names = [short(material) for material in materials]
     if len({*names}) < len(names):  # what differs is among the parameters that are left out
         names = list(materials)
-    return seeded([
-        Run(f"{k}", traced(asked, mesh, material, f"gloss-{mesh.stem if mesh else 'pot'}-{short(material)}"),
-            {"material": called}, measure=measures.with_slices)
-        for k, (material, called) in enumerate(zip(materials, names))
-    ], asked)  # fmt: skip
+    recipes = [traced(asked, mesh, m, f"gloss-{mesh.stem if mesh else 'pot'}-{short(m)}") for m in materials]
+    return seeded([Run(recipe.folder_in(Path()).name, recipe, {"material": called}, measure=measures.with_slices)
+                   for recipe, called in zip(recipes, names)], asked)  # fmt: skip
 
 
 def stripes(asked: Asked) -> list[Run]:
@@ -156,31 +119,7 @@ def stripes(asked: Asked) -> list[Run]:
     name = f"stripes-{mesh.stem if mesh else 'pot'}-{short(first)}-{short(second)}"
     recipe = traced(asked, mesh, first, name, second=second, bands=BANDS)
     labels = {"materials": f"{short(first)} and {short(second)}"}
-    return seeded([Run("stripes", recipe, labels, measure=measures.with_slices)], asked)
-
-
-def require_no_materials(asked: Asked) -> None:
-    """Raise InputError if materials are given where nothing is made of them."""
-    if asked.materials:
-        raise InputError("--materials: are what meshes are made of, and this experiment takes none; leave them out")
-
-
-def one_mesh(asked: Asked) -> Path | None:
-    """That is given, if one is. Raises InputError if that is not one mesh, or if a material is an empty word."""
-    if not all(material.strip() for material in asked.materials):
-        raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
-    if len(asked.data) > 1 or any(path.suffix.lower() not in MESHES for path in asked.data):
-        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
-    return asked.data[0] if asked.data else None
-
-
-def short(material: str) -> str:
-    """A name for a material that is fit for a file."""
-    if ".npz:" in material:
-        return material.rpartition(":")[2]
-    words = material.split()
-    values = [word.replace("roughness=", "r") for word in words[1:] if word.startswith("roughness=")]
-    return "-".join([Path(words[0]).stem, *values])
+    return seeded([Run(recipe.folder_in(Path()).name, recipe, labels, measure=measures.with_slices)], asked)
 
 
 def views(asked: Asked) -> list[Run]:
@@ -237,8 +176,7 @@ def swap(asked: Asked) -> list[Run]:
     """Two captures or more from a sphere."""
     if not asked.data:
         require_no_materials(asked)
-    if len(asked.seeds) > 1:
-        raise InputError("--seeds: are several; swap takes one, of which it exchanges materials")
+    require_one_seed(asked, "swap")
     recipes = captures(asked) if asked.data else [own(), traced(asked, None, GLOSSY[-1])]
     if len(recipes) < 2:
         raise InputError("DATA: is one capture; swap exchanges the materials of two or more")
@@ -247,11 +185,13 @@ def swap(asked: Asked) -> list[Run]:
 
 def resolution(asked: Asked) -> list[Run]:
     """Each capture, sampled at several levels."""
+    require_one_seed(asked, "resolution")
     return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.by_level) for r in captures(asked)], asked)
 
 
 def timing(asked: Asked) -> list[Run]:
     """Each capture, looked at in the course of its fit."""
+    require_one_seed(asked, "timing")
     return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.course, watched=True)
                    for r in captures(asked)], asked)  # fmt: skip
 
@@ -276,53 +216,52 @@ EXPERIMENTS = {
     "table1": Experiment(
         "The paper's table 1: accuracy on captures with measured materials.", table1, USUAL,
         figures.bars(_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"), ("psnr_novel", "novel [dB]")),
-        published.TABLE1, "seed", data=f"{CAPTURES}, or meshes",
+        published=published.TABLE1, data=f"{CAPTURES}, or meshes",
     ),
     "table2": Experiment(
         "DiLiGenT-MV: normals and depths of pixels that see both surfaces; Chamfer distance of what any photograph "
         "shows, the mean of both directions, to the other surface and not to points of it.",
         table2,
         {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
-        figures.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published.TABLE2, "object",
-        data="the folder of DiLiGenT-MV",
+        figures.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published=published.TABLE2,
+        mean_over="object", data="the folder of DiLiGenT-MV",
     ),
     "table3": Experiment(
         "The paper's table 3: poses wrong by 0.5° and 0.5 % of the distance, and refined; after rigid alignment.",
         table3,
         {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
-        figures.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published.TABLE3, "seed",
+        figures.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published=published.TABLE3,
         data=f"{CAPTURES}, or meshes",
     ),
     "specularity": Experiment(
         "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
-        specularity, {**USUAL, **_MATERIAL}, figures.slices, mean_over="seed", data="one mesh",
+        specularity, {**USUAL, **_MATERIAL}, figures.slices, data="one mesh",
     ),
     "stripes": Experiment(
         "Two materials in stripes: normals, and whether each place has the right one.", stripes,
-        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, figures.pictures, mean_over="seed",
-        data="one mesh",
+        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, figures.pictures, data="one mesh",
     ),
     "views": Experiment(
         "Accuracy by the number of photographs.", views, USUAL,
-        figures.curves(("views", "photographs"), _ERROR, "capture"), mean_over="seed", data=f"{CAPTURES}, or meshes",
+        figures.curves(("views", "photographs"), _ERROR), data=f"{CAPTURES}, or meshes",
     ),
     "ablation": Experiment(
         "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.", ablation,
-        SHAPE, figures.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR), mean_over="seed",
+        SHAPE, figures.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR),
         data=f"{CAPTURES}, or meshes",
     ),
     "encoding": Experiment(
         "Positional encodings: linear frequencies, powers of two, none.", encoding, {**USUAL, **FLAWS},
-        figures.bars(_ERROR, ("psnr_novel", "novel [dB]")), mean_over="seed", data=f"{CAPTURES}, or meshes",
+        figures.bars(_ERROR, ("psnr_novel", "novel [dB]")), data=f"{CAPTURES}, or meshes",
     ),
     "steps": Experiment(
         "Steps of the flow, the paper's T.", steps, {**USUAL, **FLAWS},
-        figures.curves(("T", "T"), _ERROR, "capture", True), mean_over="seed", data=f"{CAPTURES}, or meshes",
+        figures.curves(("T", "T"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
     ),
     "genus": Experiment(
         "An object with a handle, from a sphere and from the masks' visual hull.", genus,
         {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, figures.pictures,
-        mean_over="seed", data=f"{CAPTURES}, or meshes",
+        data=f"{CAPTURES}, or meshes",
     ),
     "swap": Experiment(
         "Materials exchanged between fits from one domain, the sphere.", swap, USUAL, figures.swapped,
@@ -331,16 +270,16 @@ EXPERIMENTS = {
     "resolution": Experiment(
         "One fit, sampled at several levels: the networks are functions.", resolution,
         {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
-        figures.curves(("vertices", "vertices"), _ERROR, "capture", True), data=f"{CAPTURES}, or meshes",
+        figures.curves(("vertices", "vertices"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
     ),
     "timing": Experiment(
         "The error of normals in the course of a fit.", timing,
         {"iteration": Column("iteration", 0), **TIME, **NORMALS, "depth_mean": DEPTHS["depth_mean"]},
-        figures.curves(("seconds", "fit [s]"), _ERROR, "capture"), data=f"{CAPTURES}, or meshes",
+        figures.curves(("seconds", "fit [s]"), _ERROR), data=f"{CAPTURES}, or meshes",
     ),
     "single": Experiment(
         "DiLiGenT's photographs from one side: errors of normals, 90° where the camera misses the surface.", single,
-        {**NORMALS, "missed": Column("missed %"), **TIME}, figures.pictures, mean_over="seed",
+        {**NORMALS, "missed": Column("missed %"), **TIME}, figures.pictures,
         data=".npz files of DiLiGenT's photographs from one side",
     ),
 }  # fmt: skip

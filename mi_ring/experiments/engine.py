@@ -23,8 +23,8 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.metrics.evaluation import rounded
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.rendering.plain_mesh import scene_of
-from mi_ring.system.command import interrupted
-from mi_ring.system.files import in_turn, read_json, write_file
+from mi_ring.system.command import interrupted, one_line
+from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
 from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
@@ -36,8 +36,8 @@ RETRIES = 1  #: of a fit that is killed without getting any further
 def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[str] = (), said: str = "") -> int:
     """Make, measure and show all runs, or `only` some, in out/runs/; returns how many failed.
 
-    A run that fails does not stop the others; table.csv, table.md and figure.png are there after each. What is done
-    already, of the same files and settings, is not made again. `said`: how it was called, for the table.
+    A run that fails does not stop the others; table.csv, table.md and figure.png are there after each that is new. What
+    is done already, of the same files and settings, is not made again. `said`: how it was called, for the table.
 
     Raises InputError for what is wrong with all of it, before any work.
     """
@@ -55,7 +55,7 @@ def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[st
         outcomes[k] = attempted(run, asked, out, wanted)
         if outcomes[k].failed not in ("", NOT_RUN):
             print(f"{run.name}: failed: {outcomes[k].failed}", flush=True)
-        if wanted or k == len(runs) - 1:
+        if (wanted and not outcomes[k].old) or k == len(runs) - 1:
             show(experiment, outcomes, out, said)
     return sum(outcome.failed not in ("", NOT_RUN) for outcome in outcomes)
 
@@ -64,14 +64,12 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
     """Make and measure one run; one that is not `wanted` only if its fit is there. Whatever goes wrong is its own."""
     try:
         captures, folder = out.parent / "captures" / asked.size, out.resolve() / "runs" / run.name
-        if not wanted and not run.recipe.place(captures).is_file():
-            return Outcome(run)
-        with in_turn(captures):  # other experiments may make the same
-            scene = run.recipe.made(captures)
+        scene = run.recipe.made(captures) if wanted else run.recipe.place(captures)
         made = Made(folder, scene, run.recipe.truth(captures), captures, asked)
         job = Job(scene.resolve(), folder, run.options(asked))
         fingerprint = job.fingerprint()
-        if not job.is_done(fingerprint):
+        done = job.is_done(fingerprint)
+        if not done:
             if not wanted:
                 return Outcome(run)
             print(f"fitting: {folder}", flush=True)
@@ -83,13 +81,20 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
             )
             if record.state != "done":
                 return Outcome(run, failed=record.message)
-        return Outcome(run, made, measured(run, made), "")
+        return Outcome(run, made, measured(run, made), "", done)
     except Exception as error:  # of libraries, too: the other runs are worth more
         if interrupted():
             raise
+        if not wanted:
+            return Outcome(run)
         if not isinstance(error, InputError):
             traceback.print_exc(file=sys.stderr)
-        return Outcome(run, failed=str(error) or type(error).__name__)
+        return Outcome(run, failed=reason(error))
+
+
+def reason(error: Exception) -> str:
+    """What has gone wrong, in one line, as tables need it."""
+    return one_line(str(error)) or type(error).__name__
 
 
 def tell(line: str) -> None:
@@ -141,16 +146,23 @@ def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
 
 
 def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) -> None:
-    """Write table.csv, table.md and figure.png of what there is."""
+    """Write table.csv, table.md and, unless it cannot be drawn, figure.png of what there is."""
     rows = table_of(experiment, outcomes)
     names = headings(experiment, outcomes, rows)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "table.csv", csv_text(names, rows))
     write_file(out / "table.md", markdown(experiment, names, rows, said))
-    done = [outcome for outcome in outcomes if not outcome.failed]
-    if not done:
-        (out / "figure.png").unlink(missing_ok=True)  # of other runs
-        return
     buffer = io.BytesIO()
-    experiment.figure(done).savefig(buffer, format="png", dpi=120)
-    write_file(out / "figure.png", buffer.getvalue())
+    try:
+        if any(not outcome.failed for outcome in outcomes):
+            ran = [outcome for outcome in outcomes if outcome.failed != NOT_RUN]
+            experiment.figure(ran).savefig(buffer, format="png", dpi=120)
+    except Exception as error:  # of one run's results, for instance: the other runs are worth more
+        if interrupted():
+            raise
+        buffer = io.BytesIO()
+        print(f"{out / 'figure.png'}: cannot be drawn: {reason(error)}", flush=True)
+    if buffer.getvalue():
+        write_file(out / "figure.png", buffer.getvalue())
+    else:
+        (out / "figure.png").unlink(missing_ok=True)  # of other runs

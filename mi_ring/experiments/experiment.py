@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
+from mi_ring.collection.jobs import RECORDS
 from mi_ring.errors import InputError
 from mi_ring.experiments.recipes import Recipe
 from mi_ring.fitting.config import Config
@@ -92,6 +93,7 @@ class Outcome:
     made: Made | None = None  #: None unless it is done
     rows: Sequence[Row] = ()
     failed: str = NOT_RUN  #: why there are no rows; empty if there are
+    old: bool = False  #: was its fit there already?
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,10 @@ class Experiment:
     about: str  #: one sentence
     runs: Callable[[Asked], list[Run]]
     columns: Mapping[str, Column]  #: by the names of numbers; all else that rows have are labels
-    figure: Callable[[list[Outcome]], Figure]
+    figure: Callable[[list[Outcome]], Figure]  #: of all runs that are done or have failed
+    data: str  #: what DATA must be
     published: Sequence[Row] = ()  #: rows beside ours
-    mean_over: str | None = None  #: label whose different values one more row has the mean of
-    data: str = ""  #: what DATA must be; empty: it takes none
+    mean_over: str = "seed"  #: label over which further rows have means, beside those over seeds
 
 
 def words(settings: Mapping[str, Any]) -> list[str]:
@@ -130,7 +132,10 @@ def words(settings: Mapping[str, Any]) -> list[str]:
 
 
 def require_distinct(runs: Sequence[Run]) -> None:
-    """Raise InputError if two runs would have the same folder: two captures of the same name."""
+    """Raise InputError if two runs would have the same folder, or one that of their records."""
     names = [run.name for run in runs]
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"DATA: two captures of one name would both be {twice}; rename one, or give them one by one")
+        raise InputError(f"DATA: two runs would both be called {twice}; rename a capture, leave out what is given "
+                         "twice, or give them one by one")  # fmt: skip
+    if RECORDS in names:
+        raise InputError(f"DATA: a run would be called {RECORDS}, as the folder of records is; rename the capture")

@@ -1,7 +1,8 @@
 """Figures of experiments, of what their runs have found."""
 
+import functools
+import textwrap
 from collections.abc import Callable, Sequence
-from itertools import groupby
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.experiment import Outcome, Row
 from mi_ring.experiments.measures import errors_from_one_side
-from mi_ring.experiments.recipes import SingleView
+from mi_ring.experiments.single_view import SingleView
 from mi_ring.experiments.slices import ANGLES
 from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.surfaces import hits, load_true_mesh
@@ -25,37 +26,58 @@ WORST = 20.0  #: error of normals that is drawn brightest [deg]
 Drawing = Callable[[list[Outcome]], Figure]
 
 
-def title_of(outcome: Outcome) -> str:
-    """The labels of a run, of those whose words say little by themselves with their names."""
-    return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items())
+def title_of(outcome: Outcome, but: str = "") -> str:
+    """The labels of a run `but` one, of those whose words say little by themselves with their names."""
+    return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
+
+
+def of_done(draw: Drawing) -> Drawing:
+    """A figure of the runs that are done, and a line that names those that have failed."""
+
+    @functools.wraps(draw)
+    def noted(ran: list[Outcome]) -> Figure:
+        figure = draw([outcome for outcome in ran if not outcome.failed])
+        if failed := [title_of(outcome) for outcome in ran if outcome.failed]:
+            figure.supxlabel(textwrap.fill(f"failed: {'; '.join(failed)}", 50), fontsize=8)
+        return figure
+
+    return noted
 
 
 def bars(*columns: tuple[str, str]) -> Drawing:
-    """A diagram for each of some columns, (name, heading) each, a bar for each run."""
+    """A diagram for each of some columns, (name, heading) each, a bar for each run, or a word that it has none."""
 
-    def draw(done: list[Outcome]) -> Figure:
-        figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(done)), layout="constrained")
+    def draw(ran: list[Outcome]) -> Figure:
+        figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(ran)), layout="constrained")
         for axes, (name, heading) in zip(np.ravel(figure.subplots(1, len(columns), sharey=True)), columns):
-            values = [outcome.rows[0].get(name, np.nan) for outcome in done]
-            axes.barh([title_of(outcome) for outcome in done], values, color="steelblue")
-            axes.set_xlabel(heading)
-            axes.invert_yaxis() if axes.get_subplotspec().is_first_col() else None
+            for place, outcome in enumerate(ran):
+                value = outcome.rows[0].get(name, "") if outcome.rows else "failed"
+                if isinstance(value, str) or not np.isfinite(value):
+                    axes.text(0, place, f" {value}".replace("nan", "NaN"), va="center")
+                else:
+                    axes.barh(place, value, color="steelblue")
+            axes.set(xlabel=heading, ylim=(len(ran) - 0.5, -0.5))
+            axes.set_yticks(range(len(ran)), [title_of(outcome) for outcome in ran])
             axes.set_xlim(left=0)
         return figure
 
     return draw
 
 
-def curves(x: tuple[str, str], y: tuple[str, str], by: str, logarithmic: bool = False) -> Drawing:
-    """One number over another, (name, heading) each, a line for each value of a label."""
+def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Drawing:
+    """One number over another, (name, heading) each, a line for those runs whose other labels are the same."""
 
+    @of_done
     def draw(done: list[Outcome]) -> Figure:
         figure = Figure(figsize=(6, 4), layout="constrained")
         axes = figure.subplots()
-        points = [(str(o.run.labels.get(by, "")), {**o.run.labels, **row}) for o in done for row in o.rows]
-        for label, group in groupby(sorted(points, key=lambda point: point[0]), key=lambda point: point[0]):
-            rows: list[Row] = sorted((row for _, row in group), key=lambda row: row[x[0]])
-            axes.plot([row[x[0]] for row in rows], [row[y[0]] for row in rows], "o-", label=label)
+        lines = dict[str, list[Row]]()
+        for outcome in done:
+            lines.setdefault(title_of(outcome, x[0]), []).extend({**outcome.run.labels, **r} for r in outcome.rows)
+        for title, rows in lines.items():
+            points = sorted((row[x[0]], row[y[0]]) for row in rows)
+            gaps = ", ".join(f"{a:g}" for a, b in points if not np.isfinite(b))
+            axes.plot(*zip(*points), "o-", label=title + f"; NaN at {gaps}" * bool(gaps))
         axes.set(xlabel=x[1], ylabel=y[1], ylim=(0, None), **({"xscale": "log"} if logarithmic else {}))
         axes.legend()
         return figure
@@ -63,6 +85,7 @@ def curves(x: tuple[str, str], y: tuple[str, str], by: str, logarithmic: bool = 
     return draw
 
 
+@of_done
 def slices(done: list[Outcome]) -> Figure:
     """BRDFs by the angle from the normal, found and true, light and camera at one place: of each run the median."""
     figure = Figure(figsize=(4 * len(done), 3.6), layout="constrained")
@@ -77,12 +100,14 @@ def slices(done: list[Outcome]) -> Figure:
     return figure
 
 
+@of_done
 def pictures(done: list[Outcome]) -> Figure:
     """Of each run a photograph, what the fit predicts for it, and the error of its normals."""
     heads = "photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"
     return grid([(title_of(outcome), three_pictures(outcome)) for outcome in done], heads)
 
 
+@of_done
 def swapped(done: list[Outcome]) -> Figure:
     """Every shape with every material, each shape in a row."""
     rows = []

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.experiment import Made, Row, Run
-from mi_ring.experiments.recipes import AXES, Perturbed, SingleView, Synthetic
+from mi_ring.experiments.recipes import Perturbed, Synthetic
+from mi_ring.experiments.single_view import AXES, SingleView
 from mi_ring.experiments.slices import bsdf_of, second_at, slices
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.metrics.evaluation import evaluate_fit
@@ -63,7 +63,7 @@ def aligned(run: Run, made: Made) -> list[Row]:
     """As `evaluated` after rigid alignment, and the root mean square of what is left of cameras' turns [°]."""
     (row,) = evaluated(run, made, align="rigid")
     exact = run.recipe.source if isinstance(run.recipe, Perturbed) else run.recipe
-    return [row | {"turned": turns(exact.made(made.captures), made.folder / "scene.xml")}]
+    return [row | {"turned": turns(exact.place(made.captures), made.folder / "scene.xml")}]
 
 
 def turns(a: Path, b: Path) -> float:
@@ -123,11 +123,12 @@ def errors_from_one_side(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray]:
 def with_slices(run: Run, made: Made) -> list[Row]:
     """As `evaluated`, and how near the material is: `slice_error`, `right_material` as `compare_slices` has them.
 
-    The slices themselves are written beside the fit, for the figure: slices.npz.
+    The slices themselves of one material are written beside the fit, for the figure: slices.npz.
     """
     (row,) = evaluated(run, made)
     found, truth, other = slices_of(run, made)
-    np.savez(made.folder / "slices.npz", found=np.median(found, 0), truth=np.median(truth, 0))
+    if other is None:
+        np.savez(made.folder / "slices.npz", found=np.median(found, 0), truth=np.median(truth, 0))
     return [row | compare_slices(found, truth, other)]
 
 
@@ -151,8 +152,7 @@ def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | Non
 def slices_of(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """BRDFs (V, angles, 3) [1/sr] by θh, light and camera at one place, at points of the surface.
 
-    That of the fit, the true one, and that of the other material where there are two. Which is the true
-    one the nearest vertex of the true mesh says.
+    That of the fit, the true one, and that of the other material where there are two.
     """
     assert isinstance(run.recipe, Synthetic)
     config = run.recipe.complete(made.captures)
@@ -161,10 +161,9 @@ def slices_of(run: Run, made: Made) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     with torch.no_grad():
         vertices, material = ring(s)
     mesh, _ = load_true_mesh(made.truth / "mesh.ply")
-    near = cKDTree(mesh.vertices).query(vertices.numpy())[1]
-    found = slices(bsdf_of(ring, {name: value.numpy() for name, value in material.items()}), len(s))
+    found = slices(bsdf_of({name: value.numpy() for name, value in material.items()}), len(s))
     true = [slices(load_material(str(m), "--materials", False), 1) for m in (config.material, config.second) if m]
     if len(true) == 1:
         return found, true[0], None
-    second = second_at(config, np.asarray(mesh.vertices))[near][:, None, None]
+    second = second_at(config, mesh.bounds, vertices.numpy())[:, None, None]
     return found, np.where(second, true[1], true[0]), np.where(second, true[0], true[1])

@@ -14,35 +14,23 @@ import numpy as np
 
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import (
-    Element,
-    move_names,
-    photograph_element,
-    recalibrated_xml,
-    scene_bytes,
-    scene_element,
-)
+from mi_ring.capture.scenefile import move_names, recalibrated_xml, scene_bytes
 from mi_ring.collection.jobs import written
 from mi_ring.errors import InputError, require_file
-from mi_ring.foreign import load_npz, reading
-from mi_ring.geometry.camera import Camera
-from mi_ring.images import write_image
+from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
-from mi_ring.rendering.lights import Light, Lights
+from mi_ring.rendering.lights import Lights
 from mi_ring.rendering.plain_mesh import mesh_of
 from mi_ring.synthesis.capture import SETTINGS, claim, write_capture
 from mi_ring.synthesis.config import SynthesizeConfig, require_options
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example import VIEWS, pot, write_example
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, partial_path, read_json, write_file, writing
+from mi_ring.system.files import in_turn, partial_path, read_json, write_file, writing
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: of a checkout
-DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
 ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made of
-AXES = np.array([-1.0, 1.0, -1.0])  #: from x right, y up, z back to Mitsuba's camera
-SINGLE = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: arrays, dimensions
 
 
 @dataclass(frozen=True)
@@ -60,7 +48,15 @@ class Recipe:
         return self.folder_in(captures) / "scene.xml"
 
     def made(self, captures: Path) -> Path:
-        """The scene file, which is written if it is not there. Raises InputError if there can be none."""
+        """The scene file, which is written if it is not there, but by one process at a time.
+
+        Raises InputError if there can be none.
+        """
+        with in_turn(self.folder_in(captures)):  # other experiments may make the same
+            return self.make(captures)
+
+    def make(self, captures: Path) -> Path:
+        """The same, while no other process does."""
         raise NotImplementedError
 
     def truth(self, captures: Path) -> Path:
@@ -88,7 +84,7 @@ class Given(Recipe):
         return self.scene
 
     def made(self, captures: Path) -> Path:
-        return self.scene
+        return self.scene  # nobody makes it
 
     def truth(self, captures: Path) -> Path:
         return truth_of(self.scene)
@@ -146,7 +142,7 @@ def filled(folder: Path, write: Callable[[Path], object], of: dict) -> Path:
 class Example(Recipe):
     """The small capture of a pot that `mi-ring example` writes."""
 
-    def made(self, captures: Path) -> Path:
+    def make(self, captures: Path) -> Path:
         return filled(self.folder_in(captures), write_example, {"views": VIEWS})
 
     @property
@@ -180,7 +176,7 @@ class Synthetic(Recipe):
         mesh = (self.mesh or captures / "pot.ply").resolve()
         return replace(self.config, mesh=mesh, out=self.folder_in(captures))
 
-    def made(self, captures: Path) -> Path:
+    def make(self, captures: Path) -> Path:
         config = self.complete(captures)
         require_options(config)
         if not self.mesh and not config.mesh.is_file():
@@ -196,8 +192,7 @@ class Synthetic(Recipe):
                 raise
             shutil.rmtree(config.out)
         if not (config.out / "scene.xml").is_file():  # which is written last
-            with locked(config.out, "OUT"):
-                write_capture(config)
+            write_capture(config)
         return config.out / "scene.xml"
 
 
@@ -207,7 +202,7 @@ class Derived(Recipe):
 
     source: Recipe
 
-    def made(self, captures: Path) -> Path:
+    def make(self, captures: Path) -> Path:
         scene = self.source.made(captures)
         changes = {k: v for k, v in vars(self).items() if k not in ("name", "source")}
         of = {"scene": str(scene.resolve()), "written": written(scene), **changes}
@@ -271,70 +266,12 @@ class DiligentObject(Recipe):
     folder: Path
     fill_holes: bool = False
 
-    def made(self, captures: Path) -> Path:
+    def make(self, captures: Path) -> Path:
         source = DiligentMV(self.folder, self.place(captures), fill_holes=self.fill_holes)
         if source.truth is None:
             raise InputError(f"{self.folder}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
-        of = {"folder": str(self.folder.resolve()), "fill_holes": self.fill_holes, "written": written(source.truth)}
+        files = [source.truth, self.folder / "Calib_Results.mat"]  # all that are read
+        files += [file for kind in ("*.png", "light_*.txt") for file in self.folder.glob(f"view_*/{kind}")]
+        of = {"folder": str(self.folder.resolve()), "fill_holes": self.fill_holes,
+              "written": {file.relative_to(self.folder).as_posix(): written(file) for file in files}}  # fmt: skip
         return filled(self.folder_in(captures), lambda out: write_scene(replace(source, scene=out / "scene.xml")), of)
-
-
-@dataclass(frozen=True)
-class SingleView(Recipe):
-    """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
-
-    It has `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z to
-    the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes, 0 where none is known) and `K` (3, 3).
-    """
-
-    file: Path
-
-    def read(self) -> dict[str, np.ndarray]:
-        """The arrays. Raises InputError if one is missing."""
-        require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
-        arrays = load_npz(self.file)
-        for name, dimensions in SINGLE.items():
-            if name not in arrays or arrays[name].ndim != dimensions:
-                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
-        mask, lights = arrays["mask"], len(arrays["pixels_uint16"])
-        shapes = {"pixels_uint16": (lights, int((mask > 0).sum()), 3), "light_dir": (lights, 3),
-                  "light_int": (lights, 3), "normal_gt": (*mask.shape, 3), "K": (3, 3)}  # fmt: skip
-        for name, shape in shapes.items():
-            if arrays[name].shape != shape:
-                raise InputError(f"{self.file}: {name}: is of shape {arrays[name].shape}, must be {shape} by mask and "
-                                 "number of photographs; see docs/paper.md")  # fmt: skip
-        return arrays
-
-    def compared(self, captures: Path) -> list[Path]:
-        return [self.file]
-
-    def made(self, captures: Path) -> Path:
-        of = {"file": str(self.file.resolve()), "written": written(self.file)}
-        return filled(self.folder_in(captures), self.write, of)
-
-    def write(self, folder: Path) -> None:
-        """As a scene with 16-bit photographs, the camera at the origin looking along z, 1.5 m from the object."""
-        data = self.read()
-        mask, K = data["mask"] > 0, data["K"]
-        height, width = mask.shape
-        focal, centre = np.array([K[0, 0], K[1, 1]]), np.array([K[0, 2], K[1, 2]])
-        camera = Camera(np.eye(4), focal, centre + 0.5, (width, height))
-        (folder / "images").mkdir(parents=True)
-        write_image(mask[..., None].astype(np.uint8) * 255, folder / "mask.png")
-        elements: list[Element] = []
-        lights = zip(data["pixels_uint16"], data["light_dir"], data["light_int"], strict=True)
-        for k, (pixels, to_light, rgb) in enumerate(lights):
-            image = np.zeros((height, width, 3), np.uint16)
-            image[mask] = pixels
-            file = f"images/{k:03}.png"
-            write_image(image, folder / file)
-            light = Light("directional", -AXES * to_light, np.asarray(rgb, float))
-            elements.append(photograph_element(f"{k:03}", file, camera, light, "mask.png"))
-        root = scene_element(elements)
-        place = DISTANCE * (centre - np.argwhere(mask).mean(0)[::-1]) / focal
-        shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
-        x, y = map(str, place)
-        ElementTree.SubElement(shape, "point", name="center", x=x, y=y, z=str(DISTANCE))
-        radius = np.sqrt(mask.sum() / np.pi) * DISTANCE / focal[0]
-        ElementTree.SubElement(shape, "float", name="radius", value=str(radius))
-        write_file(folder / "scene.xml", scene_bytes(root))

@@ -1,24 +1,17 @@
 """Slices of BRDFs, for light and camera at one place, as Mitsuba evaluates them."""
 
-import xml.etree.ElementTree as ElementTree
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.errors import InputError
-from mi_ring.ring.ring import Ring
 from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import pattern_of
 
 ANGLES = np.radians(np.arange(0, 76, 5))  #: θh of slices, light and camera at one place
 
 
-def bsdf_of(ring: Ring, material: dict[str, np.ndarray]) -> mi.BSDF:
-    """A material (V, 3) or (V,) by name as the BSDF of a strip of V pixels."""
-    snippet = ElementTree.fromstring(ring.bsdf)
-    if snippet.get("type") != "cooktorrance":
-        raise InputError(f"BSDF: is {snippet.get('type')}, slices are of cooktorrance; leave out --parameters")
+def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
+    """A material (V, 3) or (V,) by name, of `cooktorrance`, as the BSDF of a strip of V pixels."""
     strips = {name: mi.Bitmap(np.ascontiguousarray(value.reshape(1, len(value), -1), np.float32))
               for name, value in material.items()}  # fmt: skip
     return mi.load_dict({"type": "cooktorrance", **{
@@ -38,10 +31,12 @@ def slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
     return np.moveaxis(value, 0, -1) / np.cos(ANGLES)[:, None]
 
 
-def second_at(config: SynthesizeConfig, vertices: np.ndarray) -> np.ndarray:
-    """Which vertices (V,) of the true mesh are of the second material."""
-    pattern = pattern_of(config.pattern, vertices, config.bands, "xyz".index(config.up), "--pattern")
+def second_at(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """At which points (P, 3) the true object, of these bounds (2, 3), is of the second material."""
+    edge = 1e-4 * (bounds[1] - bounds[0])  # beyond it the pattern would begin anew
+    inside = np.clip(points, bounds[0] + edge, bounds[1] - edge)
+    pattern = pattern_of(config.pattern, np.concatenate([bounds, inside]), config.bands, "xyz".index(config.up), "")
     black, white = (mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": v}}) for v in (0.0, 1.0))
-    si = dr.zeros(mi.SurfaceInteraction3f, len(vertices))
-    si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv.T)), mi.Vector3f(0, 0, 1)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(points))
+    si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv[2:].T)), mi.Vector3f(0, 0, 1)
     return np.array(pattern.of(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mi_ring.experiments.experiment import NOT_RUN, Experiment, Outcome, Row
-from mi_ring.system.machine import processor
+from mi_ring.system.machine import computer
 
 OURS = "ours"  #: who says so
 
@@ -30,23 +30,28 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Of runs that differ in one label alone, a row with the mean of each number, over those that are done.
+    """Of runs that differ in their seed alone, a row with the mean of each number, over those that are done.
+
+    And of those that differ in seed and `mean_over`, where that is another label.
 
     A number that only some of them have is left out: its mean would be of others than the row says.
     """
-    over, groups = experiment.mean_over, dict[tuple, list[Outcome]]()
-    for outcome in outcomes:
-        if over in outcome.run.labels:
-            key = tuple((label, value) for label, value in outcome.run.labels.items() if label != over)
-            groups.setdefault(key, []).append(outcome)
     result = []
-    for key, group in groups.items():
-        rows = [row for outcome in group for row in outcome.rows]
-        if len(group) > 1 and rows:
-            count = f"mean of {len(rows)}" + f" of {len(group)}" * (len(rows) < len(group))
-            shared = [name for name in experiment.columns if all(name in row for row in rows)]
-            mean = {name: sum(row[name] for row in rows) / len(rows) for name in shared}
-            result.append({**dict(key), str(over): count, "by": OURS, "state": "", **mean})
+    for over in dict.fromkeys(("seed", experiment.mean_over)):
+        groups = dict[tuple, list[Outcome]]()
+        for outcome in outcomes:
+            if over in outcome.run.labels:
+                key = tuple(
+                    (label, value) for label, value in outcome.run.labels.items() if label not in (over, "seed")
+                )
+                groups.setdefault(key, []).append(outcome)
+        for key, group in groups.items():
+            rows = [row for outcome in group for row in outcome.rows]
+            if len(group) > 1 and rows:
+                count = f"mean of {len(rows)}" + f" of {len(group)}" * (len(rows) < len(group))
+                shared = [name for name in experiment.columns if all(name in row for row in rows)]
+                mean = {name: sum(row[name] for row in rows) / len(rows) for name in shared}
+                result.append({**dict(key), over: count, "by": OURS, "state": "", **mean})
     return result
 
 
@@ -79,4 +84,4 @@ def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Ro
     lines = [list(names.values()), ["---"] * len(names)]
     lines += [[cell(experiment, name, row.get(name, "")) for name in names] for row in rows]
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{experiment.about}\n\n{table}\n\n{said}; {processor()}; {datetime.date.today()}\n"
+    return f"{experiment.about}\n\n{table}\n\n{said}; {computer()}; {datetime.date.today()}\n"

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import xml.etree.ElementTree as ElementTree
 from copy import deepcopy
 from dataclasses import asdict, replace
@@ -43,6 +44,12 @@ from mi_ring.system.progress import progress
 BETWEEN = 100_003  #: seeds of pictures of one photograph by different lamps
 TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
 SETTINGS = "truth/settings.json"  #: by which an interrupted capture is known
+#: How files of a material or of a mesh name others that are read with them.
+NAMED = {
+    ".xml": rb"[\"']([^\"'<>\0\n]{1,500})[\"']",
+    ".obj": rb"^mtllib\s+(.+?)\s*$", ".mtl": rb"^\s*(?i:map_kd)\s+(.+?)\s*$",
+    ".gltf": rb"\"uri\"\s*:\s*\"([^\"]{1,500})\"", ".ply": rb"^comment (?i:texturefile) (.+?)\s*$",
+}  # fmt: skip
 
 
 class View(NamedTuple):
@@ -271,6 +278,19 @@ def photograph_name(config: SynthesizeConfig, view: View) -> str:
     return f"{view.name}.{'exr' if config.format == 'exr' else 'png'}"
 
 
+def digest(file: Path) -> str:
+    """Of a file and of those that it names, which are beside it: pictures of a material or of a mesh."""
+    result, files = hashlib.blake2b(digest_size=16), [file]
+    for each in files:  # which grow meanwhile
+        content = each.read_bytes()
+        result.update(content)
+        for name in re.findall(NAMED.get(each.suffix.lower(), b"(?!)"), content, re.M):
+            named = each.parent / name.decode(errors="replace")
+            if os.path.isfile(named) and named.resolve() not in files:
+                files.append(named.resolve())
+    return result.hexdigest()
+
+
 def settings_of(config: SynthesizeConfig) -> dict:
     """The options that a capture depends on, and what their files hold, as JSON has them."""
     values = asdict(replace(config, out=Path())) | {"digests": {}}
@@ -279,7 +299,7 @@ def settings_of(config: SynthesizeConfig) -> dict:
         text = str(getattr(config, name)).partition(".npz:")[0]  # which may be longer than names of files are
         file = next((file for file in (text, f"{text}.npz") if os.path.isfile(file)), None)
         if file:
-            values["digests"][name] = hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+            values["digests"][name] = digest(Path(file))
     return json.loads(json.dumps(values, default=str))
 
 

@@ -125,11 +125,22 @@ def read_json(path: Path) -> Any:
 
 @contextlib.contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
-    """Make something in a folder, which is made if it is not there, after other processes that do so have done it."""
+    """Make a folder after another process that does so has done it; says so if there is one.
+
+    The lock is beside the folder and stays there: of one that is removed, who waits for it would hold another.
+    """
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    with filelock.FileLock(folder / ".lock"):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder.with_name(f".{folder.name}.lock"))
+        try:
+            lock.acquire(timeout=0)
+        except filelock.Timeout:
+            print(f"waiting for {folder}, which another process makes", flush=True)
+            lock.acquire()
+    try:
         yield
+    finally:
+        lock.release()
 
 
 @contextlib.contextmanager

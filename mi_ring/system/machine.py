@@ -172,6 +172,12 @@ def processor() -> str:
     return f"{model}, {cores()} core{'s' * (cores() > 1)}"
 
 
+def computer() -> str:
+    """What the current variant computes on: the GPU, and the processor."""
+    gpu = f"{torch.cuda.get_device_name()}, " if device().type == "cuda" else ""
+    return gpu + processor()
+
+
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
     """So many threads of torch and Dr.Jit, by default all `cores`, and those of before at the end.

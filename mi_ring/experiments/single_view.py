@@ -1,0 +1,84 @@
+"""DiLiGenT's photographs from one side as a capture."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
+from mi_ring.collection.jobs import written
+from mi_ring.errors import InputError, require_file
+from mi_ring.experiments.recipes import Recipe, filled
+from mi_ring.foreign import load_npz
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import write_image
+from mi_ring.rendering.lights import Light
+from mi_ring.system.files import write_file
+
+DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
+AXES = np.array([-1.0, 1.0, -1.0])  #: from x right, y up, z back to Mitsuba's camera
+SINGLE = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: arrays, dimensions
+
+
+@dataclass(frozen=True)
+class SingleView(Recipe):
+    """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
+
+    It has `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z to
+    the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes, 0 where none is known) and `K` (3, 3).
+    """
+
+    file: Path
+
+    def read(self) -> dict[str, np.ndarray]:
+        """The arrays. Raises InputError if one is missing."""
+        require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
+        arrays = load_npz(self.file)
+        for name, dimensions in SINGLE.items():
+            if name not in arrays or arrays[name].ndim != dimensions:
+                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
+        if (kind := arrays["pixels_uint16"].dtype) != np.uint16:
+            raise InputError(f"{self.file}: pixels_uint16: is of {kind}, must be of uint16, linear; see docs/paper.md")
+        mask, lights = arrays["mask"], len(arrays["pixels_uint16"])
+        shapes = {"pixels_uint16": (lights, int((mask > 0).sum()), 3), "light_dir": (lights, 3),
+                  "light_int": (lights, 3), "normal_gt": (*mask.shape, 3), "K": (3, 3)}  # fmt: skip
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise InputError(f"{self.file}: {name}: is of shape {arrays[name].shape}, must be {shape} by mask and "
+                                 "number of photographs; see docs/paper.md")  # fmt: skip
+        return arrays
+
+    def compared(self, captures: Path) -> list[Path]:
+        return [self.file]
+
+    def make(self, captures: Path) -> Path:
+        of = {"file": str(self.file.resolve()), "written": written(self.file)}
+        return filled(self.folder_in(captures), self.write, of)
+
+    def write(self, folder: Path) -> None:
+        """As a scene with 16-bit photographs, the camera at the origin looking along z, 1.5 m from the object."""
+        data = self.read()
+        mask, K = data["mask"] > 0, data["K"]
+        height, width = mask.shape
+        focal, centre = np.array([K[0, 0], K[1, 1]]), np.array([K[0, 2], K[1, 2]])
+        camera = Camera(np.eye(4), focal, centre + 0.5, (width, height))
+        (folder / "images").mkdir(parents=True)
+        write_image(mask[..., None].astype(np.uint8) * 255, folder / "mask.png")
+        elements: list[Element] = []
+        lights = zip(data["pixels_uint16"], data["light_dir"], data["light_int"], strict=True)
+        for k, (pixels, to_light, rgb) in enumerate(lights):
+            image = np.zeros((height, width, 3), np.uint16)
+            image[mask] = pixels
+            file = f"images/{k:03}.png"
+            write_image(image, folder / file)
+            light = Light("directional", -AXES * to_light, np.asarray(rgb, float))
+            elements.append(photograph_element(f"{k:03}", file, camera, light, "mask.png"))
+        root = scene_element(elements)
+        place = DISTANCE * (centre - np.argwhere(mask).mean(0)[::-1]) / focal
+        shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
+        x, y = map(str, place)
+        ElementTree.SubElement(shape, "point", name="center", x=x, y=y, z=str(DISTANCE))
+        radius = np.sqrt(mask.sum() / np.pi) * DISTANCE / focal[0]
+        ElementTree.SubElement(shape, "float", name="radius", value=str(radius))
+        write_file(folder / "scene.xml", scene_bytes(root))
