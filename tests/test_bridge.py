@@ -320,13 +320,10 @@ def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
     assert np.abs(ours - theirs).max() > 0.1 and ours.max() > 0.1  # another ball, lit by the same light
 
 
-@pytest.mark.parametrize("light", ["directional", "constant", "envmap"])
+@pytest.mark.parametrize("light", ["directional", "constant"])
 def test_distant_emitters_of_a_surface_are_beyond_all_of_it(light):
     """Also of one that is far from the origin and large, in its first picture: what is in the way casts shadows."""
-    emitter = mi.load_dict({
-        "directional": {"type": "directional", "direction": [0.48, 0.6, -0.64]}, "constant": {"type": "constant"},
-        "envmap": {"type": "envmap", "bitmap": mi.Bitmap(np.ones((5, 7, 3), np.float32))},
-    }[light])  # fmt: skip
+    emitter = mi.load_dict({"type": light} | ({"direction": [0.48, 0.6, -0.64]} if light == "directional" else {}))
     shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     center, radius = np.array([400.0, -150.0, 90.0]), 700.0  # the origin is within
     ring = Ring(center, radius)

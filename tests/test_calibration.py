@@ -350,9 +350,9 @@ def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_ca
 def test_a_flash_that_is_found_by_default_stays_beside_the_lens(small_capture):
     """How far ahead it is photographs hardly tell from how dark the surface is; `light` by name asks for that, too."""
     capture = mi_ring.load_capture(small_capture)
+    by_default = Fit(capture, Config(domain="sphere")).calibration
     moves = []
-    for refine in ("auto", "light"):
-        calibration = Fit(capture, Config(refine=(refine,), domain="sphere")).calibration
+    for calibration in (by_default, Calibration(capture, ("light",), CENTER, 0.3)):
         before = calibration().places
         with torch.no_grad():
             calibration.light[0] = tensor([0.5, -0.3, 0.2])
