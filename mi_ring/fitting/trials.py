@@ -35,8 +35,7 @@ MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.1  #: Fewer lamps are believed that leave no more of the error of the best than this.
 PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
-#: Progress at which the material may vary, where it has been taken to be one.
-LOOSE = {"environment": 0.35, "turntable": 0.35, "lamps": 0.6}
+LOOSE = 0.35  #: progress at which the material may vary, where it has been taken to be one
 FAINT = 0.1  #: the least strength of a lamp to begin with, by the first
 ROWS = 16  #: of a map of the directions in which lamps are sought
 
@@ -152,7 +151,7 @@ class Trials:
         one = lighting._replace(plain=1.0)
         if self.left(one) >= PLAIN * self.left(lighting) or not self.apart(one):
             return self.found[lighting]
-        return self.found[one]._replace(plain=LOOSE[lighting.kind])
+        return self.found[one]._replace(plain=LOOSE)
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
