@@ -30,6 +30,12 @@ def pytest_configure(config):
         mi.set_variant(variant)
 
 
+def pytest_collection_finish():
+    """What is there by now stays: to look through it would take half a second after each of thousands of tests."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def no_scenes_of_other_tests():
     """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others."""
