@@ -38,10 +38,6 @@ def under_two_lamps(tmp_path_factory):
     return photographed_ellipsoid(folder, *lamps)
 
 
-def lamps_in(capture):
-    return lamp_lights(capture.scene)
-
-
 @pytest.mark.parametrize("light", LAMPS)
 def test_an_emitter_is_what_its_numbers_say(light):
     """Also after it was put elsewhere, with the gradient of its place."""
@@ -117,7 +113,7 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
     for distant in (False, True):
         lighting = Lighting("lamps", said, distant)
         under = lit(capture, lighting)
-        (lamp,) = lamps_in(under)
+        (lamp,) = lamp_lights(under.scene)
         own = under.photographs.lights[3]
         assert own.kind == lamp.kind == ("directional" if distant else "point")
         for light, (vector, rgb) in zip((own, lamp), said):
@@ -173,7 +169,7 @@ def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path
     """Moved by a tenth of its distance and a quarter less bright, a lamp comes back; it is written, how surely, too."""
     exact = under_two_lamps.parent / "truth/exact.xml"
     true = mi_ring.load_capture(exact, images=False)
-    (lamp,) = lamps_in(true)
+    (lamp,) = lamp_lights(true.scene)
     center = true.sphere()[0]
     wrong = lamp._replace(vector=lamp.vector + 0.1 * np.linalg.norm(lamp.vector - center) * np.array([0.6, 0, -0.8]))
     text = re.sub(r"</sensor>\s*<emitter.*</emitter>", "</sensor>{}", exact.read_text(), flags=re.DOTALL)
@@ -186,30 +182,32 @@ def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path
     assert fit.calibration.refined == ("lamps",)
     list(fit)
     refined = fit.calibrated()
-    (found,) = lamps_in(refined)
+    (found,) = lamp_lights(refined.scene)
     off = [np.linalg.norm(side.vector - lamp.vector) for side in (found, wrong)]
     assert off[0] < 0.6 * off[1]  # how far it is, few photographs of a ball hardly tell from how strong it is
     assert (found.rgb / lamp.rgb).mean() == pytest.approx(1, abs=0.15)
-    np.testing.assert_allclose(lamps_in(capture)[0].vector, wrong.vector, rtol=1e-5)  # the capture is left as it was
+    np.testing.assert_allclose(
+        lamp_lights(capture.scene)[0].vector, wrong.vector, rtol=1e-5
+    )  # the capture is left as it was
 
     state, config = fit.state(), fit.config
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
-    (written,) = lamps_in(again)
+    (written,) = lamp_lights(again.scene)
     np.testing.assert_allclose(written.vector, found.vector, rtol=1e-5)
     unknowns = json.loads((tmp_path / "calibration.json").read_text())["unknowns"]
     np.testing.assert_allclose(unknowns["lamp"]["after"], [found.vector], rtol=1e-5)
     np.testing.assert_allclose(unknowns["lamp"]["before"], [wrong.vector], rtol=1e-5)
     assert np.shape(unknowns["strength"]["std"]) == (1, 3) and (np.array(unknowns["lamp"]["std"]) > 0).all()
     resumed = mi_ring.Fit(capture, config, state=state)
-    np.testing.assert_allclose(lamps_in(resumed.calibrated())[0].vector, found.vector, rtol=1e-6)
+    np.testing.assert_allclose(lamp_lights(resumed.calibrated().scene)[0].vector, found.vector, rtol=1e-6)
 
 
 def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     """It begins with two where it is told so, refines both, and writes the second as the scene's."""
     capture = mi_ring.load_capture(under_two_lamps)
     true = mi_ring.load_capture(under_two_lamps.parent / "truth/exact.xml", images=False)
-    said = [true.photographs.lights[0], *lamps_in(true)]
+    said = [true.photographs.lights[0], *lamp_lights(true.scene)]
     begun = tuple((tuple(light.vector), tuple(said[0].rgb)) for light in said)
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 12}, light="lamps", holdout=5)
     fit = mi_ring.Fit(capture, config, lighting=Lighting("lamps", begun))
@@ -219,7 +217,7 @@ def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     errors = [it.terms["rgb"] for it in fit]
     assert np.mean(errors[-4:]) < 0.8 * errors[0]
     assert fit.confirmed["unexplained"] > 0 and fit.confirmed["before"] > 0  # of those that are kept out
-    (before,) = lamps_in(fit.calibrated())
+    (before,) = lamp_lights(fit.calibrated().scene)
     deviations(fit)
     after = light_of(lamps_of(fit.surface.scene)[0])
     np.testing.assert_allclose(after.rgb, before.rgb, rtol=1e-6)

@@ -11,7 +11,7 @@ from pathlib import Path
 from mi_ring.errors import InputError, require_file
 from mi_ring.output.results import read_log
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import read_json, write_file
+from mi_ring.system.files import quoted, read_json, write_file
 
 RECORDS = "batch"  #: folder beside the results with a record of each fit and with what it has printed
 CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
@@ -70,8 +70,7 @@ class Job:
         with contextlib.suppress(OSError):  # the fit says what is wrong with it
             text = self.scene.read_bytes()
             result.update(text)
-            words = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", text)
-            named = {self.scene.parent / (a or b).decode(errors="replace") for a, b in words}
+            named = {self.scene.parent / word for word in quoted(text)}
             given = (self.place / (option.partition("=")[2] or option) for option in self.options)
             for file in sorted({*named, *given}):
                 with contextlib.suppress(OSError):

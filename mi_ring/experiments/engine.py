@@ -152,17 +152,22 @@ def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) 
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "table.csv", csv_text(names, rows))
     write_file(out / "table.md", markdown(experiment, names, rows, said))
-    buffer = io.BytesIO()
+    if picture := drawn(experiment, outcomes, out / "figure.png"):
+        write_file(out / "figure.png", picture)
+    else:
+        (out / "figure.png").unlink(missing_ok=True)  # of other runs
+
+
+def drawn(experiment: Experiment, outcomes: list[Outcome], file: Path) -> bytes:
+    """The figure as a PNG; nothing if no run is done, or if it cannot be drawn, which is said."""
+    if all(outcome.failed for outcome in outcomes):
+        return b""
+    ran, buffer = [outcome for outcome in outcomes if outcome.failed != NOT_RUN], io.BytesIO()
     try:
-        if any(not outcome.failed for outcome in outcomes):
-            ran = [outcome for outcome in outcomes if outcome.failed != NOT_RUN]
-            experiment.figure(ran).savefig(buffer, format="png", dpi=120)
+        experiment.figure(ran).savefig(buffer, format="png", dpi=120)
     except Exception as error:  # of one run's results, for instance: the other runs are worth more
         if interrupted():
             raise
-        buffer = io.BytesIO()
-        print(f"{out / 'figure.png'}: cannot be drawn: {reason(error)}", flush=True)
-    if buffer.getvalue():
-        write_file(out / "figure.png", buffer.getvalue())
-    else:
-        (out / "figure.png").unlink(missing_ok=True)  # of other runs
+        print(f"{file}: cannot be drawn: {reason(error)}", flush=True)
+        return b""
+    return buffer.getvalue()

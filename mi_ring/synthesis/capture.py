@@ -38,15 +38,14 @@ from mi_ring.synthesis.degradation import HIGHEST, encoded, exposures, miscalibr
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
 from mi_ring.synthesis.tracing import Shot
-from mi_ring.system.files import read_json, write_file, writing
+from mi_ring.system.files import quoted, read_json, write_file, writing
 from mi_ring.system.progress import progress
 
 BETWEEN = 100_003  #: seeds of pictures of one photograph by different lamps
 TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
 SETTINGS = "truth/settings.json"  #: by which an interrupted capture is known
-#: How files of a material or of a mesh name others that are read with them.
+#: How files of a material or of a mesh, other than XML, name others that are read with them.
 NAMED = {
-    ".xml": rb"[\"']([^\"'<>\0\n]{1,500})[\"']",
     ".obj": rb"^mtllib\s+(.+?)\s*$", ".mtl": rb"^\s*(?i:map_kd)\s+(.+?)\s*$",
     ".gltf": rb"\"uri\"\s*:\s*\"([^\"]{1,500})\"", ".ply": rb"^comment (?i:texturefile) (.+?)\s*$",
 }  # fmt: skip
@@ -284,11 +283,18 @@ def digest(file: Path) -> str:
     for each in files:  # which grow meanwhile
         content = each.read_bytes()
         result.update(content)
-        for name in re.findall(NAMED.get(each.suffix.lower(), b"(?!)"), content, re.M):
-            named = each.parent / name.decode(errors="replace")
+        for name in named_in(content, each.suffix.lower()):
+            named = each.parent / name
             if os.path.isfile(named) and named.resolve() not in files:
                 files.append(named.resolve())
     return result.hexdigest()
+
+
+def named_in(content: bytes, kind: str) -> list[str]:
+    """What a file of this kind, a suffix, says where names of other files stand."""
+    if kind == ".xml":
+        return quoted(content)
+    return [name.decode(errors="replace") for name in re.findall(NAMED.get(kind, b"(?!)"), content, re.M)]
 
 
 def settings_of(config: SynthesizeConfig) -> dict:

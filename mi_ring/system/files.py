@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import secrets
 import tempfile
 from collections.abc import Iterator
@@ -121,6 +122,12 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
         return None
+
+
+def quoted(content: bytes) -> list[str]:
+    """The words in quotes of an XML file, some of which are names of files."""
+    words = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
+    return [(double or single).decode(errors="replace") for double, single in words]
 
 
 @contextlib.contextmanager
