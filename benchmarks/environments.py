@@ -32,7 +32,8 @@ from mi_ring.rendering.rooms import BASIS, COUNT, directions_of, harmonics_in, s
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
-RELIT, SMOOTH = 4, 256  #: photographs under another light, and paths per pixel, lest noise be all that they show
+#: Photographs under another light, half as wide, and paths per pixel: of the sun's light noise would be all they show.
+RELIT, SMOOTH = 4, 512
 
 
 def directions(rows: int = ROWS) -> np.ndarray:
@@ -125,11 +126,12 @@ def main() -> None:
     rows = []
     for mesh in args.meshes:
         name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
-        usual = ["--size", args.width, args.width, "--material", PLASTIC, "--novel", 0]
+        usual = ["--material", PLASTIC, "--novel", 0]
         for light in [*args.maps, *(["flash"] if args.flash else [])]:
             capture, fit = args.out / f"{name}-{light}", args.out / f"{name}-{light}-fit"
             lit = [] if light == "flash" else ["--environment", args.out / f"{light}.exr", "--wrong-room"]
-            run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--spp", args.spp, *usual, *lit)
+            run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--spp", args.spp,
+                "--size", args.width, args.width, *usual, *lit)  # fmt: skip
             found = [] if light == "flash" else ["--light", "environment"]
             run("mi_ring.fit", capture / "scene.xml", "--out", fit, *found, *options)
             truth = capture / "truth/mesh.ply"
@@ -143,7 +145,7 @@ def main() -> None:
                 other = list(own)[(list(own).index(light) + 1) % len(own)]
                 relit = args.out / f"{name}-in-{other}"
                 run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--seed", 7, *usual, "--spp", SMOOTH,
-                    "--environment", args.out / f"{other}.exr")  # fmt: skip
+                    "--size", args.width // 2, args.width // 2, "--environment", args.out / f"{other}.exr")  # fmt: skip
                 calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
                 rooms = as_harmonics(own[light]), calibrated.photographs.room
                 off = [

@@ -101,10 +101,10 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
         raise InputError(f"--minutes: is {minutes:g}, but the start alone has taken {spent:.0f} s; give more")
     costs = measure(fit, all_stages(fit, choice))
     spent = fit.processes.told(time.monotonic() - started)
-    if (needed := spent + fewest_seconds(choice, fit.near, costs)) > 60 * minutes:
+    if (needed := spent + fewest_seconds(choice, fit.stages_by, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
                          f"{math.ceil(MARGIN * needed / 6) / 10:g} or more")  # fmt: skip
-    chosen = fitting_into(60 * minutes - spent, choice, fit.near, costs)
+    chosen = fitting_into(60 * minutes - spent, choice, fit.stages_by, costs)
     print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
     return chosen, costs
 

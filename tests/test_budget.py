@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting import budget
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.schedule import Stage
+from mi_ring.fitting.schedule import Stage, stages_of
 from mi_ring.output.results import read_log
 from mi_ring.system.machine import threads_of
 
@@ -25,17 +26,18 @@ CHOICE = [Config.preset(name) for name in ("fast", "default", "fine")]
 def test_seconds_are_those_of_the_stages():
     """Of 100 iterations from a sphere 60 are at level 4 and 40 at level 5; what is around them takes 40 of these."""
     config = Config(iterations=100, levels=(4, 5), widths=(128, 256), shares=(0.6, 0.4))
-    assert budget.seconds_of(config, False, COSTS) == pytest.approx(60 * 0.25 + 80 * 1.0)
+    assert budget.seconds_of(config, stages_of, COSTS) == pytest.approx(60 * 0.25 + 80 * 1.0)
     # From a hull two thirds of the first 60 are exchanged for 40 % as many of the second: 20 and 56.
-    assert budget.seconds_of(config, True, COSTS) == pytest.approx(20 * 0.25 + 96 * 1.0)
+    assert budget.seconds_of(config, partial(stages_of, near=True), COSTS) == pytest.approx(20 * 0.25 + 96 * 1.0)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near):
+@pytest.mark.parametrize("near, settling", [(False, False), (True, False), (True, True)])
+def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near, settling):
+    stages_by = partial(stages_of, near=near, settling=settling)
     subdivisions, iterations = [], []
     for seconds in (60, 100, 150, 300, 900, 3000, 9000):
-        config = budget.fitting_into(seconds, CHOICE, near, COSTS)
-        taken = budget.seconds_of(config, near, COSTS)
+        config = budget.fitting_into(seconds, CHOICE, stages_by, COSTS)
+        taken = budget.seconds_of(config, stages_by, COSTS)
         assert taken <= 1.05 * seconds and taken > 0.9 * seconds
         subdivisions.append(len(config.levels))
         iterations.append((config.levels[-1], config.shares[-1], config.iterations))
@@ -44,7 +46,7 @@ def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near):
 
 
 def test_there_is_a_least_number_of_iterations():
-    assert budget.fitting_into(0.1, CHOICE, False, COSTS).iterations == budget.FEWEST
+    assert budget.fitting_into(0.1, CHOICE, stages_of, COSTS).iterations == budget.FEWEST
 
 
 def test_measuring_changes_nothing_of_the_fit(small_capture):

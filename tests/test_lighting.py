@@ -14,9 +14,10 @@ from conftest import photographed_ellipsoid
 import mi_ring
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
-from mi_ring.fitting import trials
+from mi_ring.fitting import terms, trials
 from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
+from mi_ring.fitting.schedule import Stage
 from mi_ring.images import read_image, write_image
 from mi_ring.rendering import bridge
 from mi_ring.rendering.elements import load_element
@@ -342,3 +343,52 @@ def test_a_map_shows_the_radiance_of_harmonics():
     v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
     z = -np.sin(np.pi * v) * np.cos(2 * np.pi * u)
     np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)
+
+
+def test_light_and_material_settle_where_the_surface_is(in_an_environment):
+    """At the end under an unknown environment: the surface, which is of one material, stays as it is; the light is what
+    photographs say from then on, and the material varies less than it did when it made up for errors of the surface."""
+
+    def variation():
+        with torch.no_grad():
+            vertices, material = fit.ring(fit.ring.domain.sample(3)[0])
+        return vertices, float((material["diffuse"].std(0) / material["diffuse"].mean(0)).mean())
+
+    capture = mi_ring.load_capture(in_an_environment)
+    config = mi_ring.Config.preset("fast", **TINY, light="environment")
+    fit = mi_ring.Fit(capture, config)
+    *_, shaping, settling = fit.stages
+    assert settling.settles and not shaping.settles and settling.last == fit.iterations
+    while fit.iteration < settling.first:
+        fit.step()
+    (surface, varied), told = variation(), fit.calibration.room.matrix.sum()
+    it = fit.step()
+    assert 0 < fit.calibration.room.matrix.sum() < 0.5 * told
+    assert "velocity" not in it.terms and it.terms["settling"] > 0
+    while fit.iteration < fit.iterations:
+        fit.step()
+    after, varies = variation()
+    torch.testing.assert_close(after, surface, rtol=0, atol=0)
+    assert varies < 0.5 * varied
+    for known in (Lighting("environment"), Lighting("capture")):
+        assert not any(stage.settles for stage in mi_ring.Fit(capture, config, lighting=known).stages)
+
+
+def test_what_settles_does_not_get_darker_for_it(small_capture):
+    """The prior is of how much the material varies by its mean: a step of a quarter, however bright."""
+    fit = mi_ring.Fit(mi_ring.load_capture(small_capture), mi_ring.Config.preset("fast", **TINY))
+    stage = Stage(3, 32, 0, 1, settles=True)
+    s, faces = fit.ring.domain.sample(3)
+    values = []
+    for brightness in (0.02, 0.5):
+        steps = brightness * (1 + 0.25 * (s[:, :1] > 0).float())
+        material = {"diffuse": steps.expand(-1, 3).requires_grad_(), "specular": steps[:, 0], "roughness": steps[:, 0]}
+        it = SimpleNamespace(stage=stage, fit=fit, vertices=s, faces=faces, material=material)
+        values.append(terms.settling(it))
+        (gradient,) = torch.autograd.grad(values[-1], material["diffuse"])
+        pull = gradient * material["diffuse"].detach()
+        assert abs(float(pull.sum())) < 1e-4 * float(pull.abs().sum())
+    torch.testing.assert_close(*values)
+    assert float(values[0].detach()) > 0
+    it.stage = stage._replace(settles=False)
+    assert terms.settling(it) is None

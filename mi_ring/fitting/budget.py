@@ -8,13 +8,14 @@ from typing import TypeVar
 
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.schedule import Stage, stages_of
+from mi_ring.fitting.schedule import Stage
 from mi_ring.system.machine import release_memory
 
 FEWEST = 40  #: iterations: with fewer nothing is to be expected
 AROUND = 40  #: iterations of the last stage that take as long as pictures before a fit and its results after it
 
 Settings = TypeVar("Settings", bound=Config)
+Planner = Callable[[Config], list[Stage]]
 Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and width of its stage
 
 
@@ -45,40 +46,40 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
     """The stages of fits with these settings, from where this one starts, each level and width once."""
-    stages = [stage for config in configs for stage in stages_of(config, fit.near)]
+    stages = [stage for config in configs for stage in fit.stages_by(config)]
     return list({(stage.level, stage.width): stage for stage in stages}.values())
 
 
-def fitting_into(seconds: float, configs: Sequence[Settings], near: bool, costs: Costs) -> Settings:
+def fitting_into(seconds: float, configs: Sequence[Settings], stages_by: Planner, costs: Costs) -> Settings:
     """Of some settings those whose own fit takes the most like so many seconds, with as many iterations as they allow.
 
-    `near`: is the start near the object?
+    `stages_by`: the stages that settings make, as `Fit.stages_by` has them.
     """
-    config = min(configs, key=lambda config: abs(math.log(seconds_of(config, near, costs) / seconds)))
-    around = seconds_around(config, near, costs)
-    share = (seconds - around) / (seconds_of(config, near, costs) - around)
+    config = min(configs, key=lambda config: abs(math.log(seconds_of(config, stages_by, costs) / seconds)))
+    around = seconds_around(config, stages_by, costs)
+    share = (seconds - around) / (seconds_of(config, stages_by, costs) - around)
     return dataclasses.replace(config, iterations=max(FEWEST, int(config.iterations * share)))
 
 
-def fewest_seconds(configs: Sequence[Config], near: bool, costs: Costs) -> float:
+def fewest_seconds(configs: Sequence[Config], stages_by: Planner, costs: Costs) -> float:
     """What the shortest of fits with these settings takes."""
-    return min(seconds_of(dataclasses.replace(config, iterations=FEWEST), near, costs) for config in configs)
+    return min(seconds_of(dataclasses.replace(config, iterations=FEWEST), stages_by, costs) for config in configs)
 
 
-def seconds_of(config: Config, near: bool, costs: Costs) -> float:
+def seconds_of(config: Config, stages_by: Planner, costs: Costs) -> float:
     """What a fit takes, with pictures before it and results after it."""
-    iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in stages_of(config, near))
-    return iterations + seconds_around(config, near, costs)
+    iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in stages_by(config))
+    return iterations + seconds_around(config, stages_by, costs)
 
 
-def seconds_around(config: Config, near: bool, costs: Costs) -> float:
+def seconds_around(config: Config, stages_by: Planner, costs: Costs) -> float:
     """What pictures before a fit and its results after it take, which are as large as photographs of the last stage."""
-    last = stages_of(config, near)[-1]
+    last = stages_by(config)[-1]
     return AROUND * costs[last.level, last.width]
 
 
 def replan(fit: Fit, config: Config) -> None:
     """Have a fit that has not begun take settings that differ in stages, iterations, level or regulariser alone."""
     fit.config, fit.ring.subdivisions = config, config.subdivisions
-    fit.stages = stages_of(config, fit.near)
+    fit.stages = fit.stages_by(config)
     fit.iterations = fit.stages[-1].last

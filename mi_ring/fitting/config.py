@@ -11,7 +11,7 @@ from mi_ring.errors import InputError
 
 #: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
 WEIGHTS = {
-    "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3,
+    "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03,
     "normal_variation": 0.0, "material_variation": 0.0, "material_rank": 0.0,
 }  # fmt: skip
 
@@ -85,9 +85,10 @@ class Config:
     """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
     """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
-    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says. Priors, off by
-    default: normal_variation: edges rather than curves; material_variation: patches of one material each;
-    material_rank: mixtures of few basis materials."""
+    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says; settling: how
+    much the material varies, at the end under an unknown environment. Priors, off by default: normal_variation: edges
+    rather than curves; material_variation: patches of one material each; material_rank: mixtures of few basis
+    materials."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
     while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while

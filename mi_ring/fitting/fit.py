@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -96,8 +97,8 @@ class Fit:
         self.lighting = lighting or self.processes.told(lighting_of(capture.part(self.fitted), self.config, Fit))
         self.seconds = time.perf_counter() - began  #: that iterations, and coarse fits before them, have taken
         #: `environment`: harmonics of what the scene says of one, if it says so.
-        self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
-        capture = self.capture
+        capture, scene, self.environment = smoothed(lit(capture, self.lighting))
+        self.capture = capture
         chosen = replace(self.config, light=self.lighting.kind)
         self.random = torch.Generator().manual_seed(self.config.seed)
         torch.manual_seed(self.config.seed)
@@ -118,26 +119,26 @@ class Fit:
         self.calibration: Calibration | None = None
         self.lookers: list[Looker] = []  #: optimisers that see iterations
         if refined := refined_of(seen, chosen, self.albedo):
-            power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
-            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
-                                           frames(capture, self.lighting), bool(self.lighting.lamps),
-                                           ahead="light" in self.config.refine)  # fmt: skip
+            self.calibration = Calibration(
+                capture, refined, self.ring.center.cpu().numpy(), self.exposure, overall(refined, self.albedo),
+                self.fitted, frames(capture, self.lighting), bool(self.lighting.lamps),
+                ahead="light" in self.config.refine)  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
-        self.stages = stages_of(self.config, self.near)
+        self.stages_by = partial(stages_of, near=self.near, settling=self.lighting.settles)  #: of settings
+        self.stages = self.stages_by(self.config)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
         #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.
         self.outlines: dict[int, Tensor] = {}
         self.iteration = 0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.restraint, self.averages = Restraint(), Averages()
-        self.rounds = Rounds(capture, self.fitted)
+        self.restraint, self.averages, self.rounds = Restraint(), Averages(), Rounds(capture, self.fitted)
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         if state:
             self.restore(state)
-        fitted = [self.ring, self.calibration] if self.calibration else [self.ring]
+        fitted = [module for module in (self.ring, self.calibration) if module]
         self.caution = Caution(fitted, self.optimizers, state and state["caution"])
 
     def __iter__(self) -> Iterator[Iteration]:
@@ -184,7 +185,7 @@ class Fit:
         points = self.processes.share(len(s))
         with self.autocast():
             vertices, material = self.ring(s[points.part])
-        vertices, *parameters = points.joined([vertices, *material.values()])
+        vertices, *parameters = points.joined([vertices.detach() if stage.settles else vertices, *material.values()])
         material = self.lighting.shared(dict(zip(material, parameters)), number / self.iterations)
 
         everything, size = self.rounds.draw(config.batch, self.random)
@@ -342,8 +343,7 @@ class Fit:
         self.random.set_state(state["random"])
         self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
         vars(self.restraint).update(state["restraint"])
-        self.averages.pictures = state["averages"]
-        self.confirmed = state["confirmed"]
+        self.averages.pictures, self.confirmed = state["averages"], state["confirmed"]
         self.rounds.restore(state.get("waiting", {}))
         self.take_outlines(state["outlines"])
         if self.calibration:

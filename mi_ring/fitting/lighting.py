@@ -33,6 +33,7 @@ class Lighting(NamedTuple):
     lamps: tuple[Lamp, ...] = ()
     distant: bool = False  #: Are they infinitely far away?
     plain: float = 0.0  #: progress of the fit until which the object is taken to be of one material
+    settles: bool = False  #: Are light and material found anew in the end, for the surface that was found?
 
     def __str__(self) -> str:
         """For people: environment, 1 lamp, 2 distant lamps."""

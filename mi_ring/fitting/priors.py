@@ -69,8 +69,12 @@ def normal_variation(it: Iteration) -> Tensor:
 
 
 def material_variation(it: Iteration) -> Tensor:
-    """Per radius of the object. The shape does not follow it."""
-    values = columns_of(it.material, it.fit.ring.brdf_net)
+    """Of the parameters in their units."""
+    return per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
+
+
+def per_radius(it: Iteration, values: Tensor) -> Tensor:
+    """Total variation of values (V, n) at the vertices per radius of the object. The shape does not follow it."""
     return it.fit.ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
 
 

@@ -45,6 +45,11 @@ class Room(nn.Module):
         self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
+    def forget(self) -> None:
+        """What was seen, but not what was made of it."""
+        self.matrix.zero_()
+        self.vector.zero_()
+
     @torch.no_grad()
     def see(
         self, around: Surroundings, predicted: Tensor, observed: Tensor, telling: Tensor, share: Share = WHOLE,

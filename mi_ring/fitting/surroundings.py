@@ -40,6 +40,8 @@ def with_surroundings(
     if photographs.harmonics:
         predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
     if calibration and looking:
+        if fit.stages[-1].settles and fit.iteration == fit.stages[-1].first:
+            calibration.room.forget()  # the light that made up for a material that varied
         telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
         observed = calibration.linear(seen.rgb, index[share.part], scale)
         calibration.room.see(around, before, observed, telling, share, fit.iteration / fit.iterations)

@@ -16,6 +16,8 @@ from mi_ring.images import blur
 from mi_ring.nets.shapenet import Flow
 
 DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
+LEAST = 1e-3  #: mean of a parameter, in its unit, for it to be compared with it
+MANY = 0.1  #: weight of the prior of a material that settles, by that of one that looks like one all over
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
@@ -129,8 +131,10 @@ def mask(it: Iteration) -> Tensor | None:
     return loss * (int(it.masked.sum()) / masked / it.share.weight) if it.share.weight else loss
 
 
-def velocity(it: Iteration) -> Tensor:
-    """L_reg at random points of the paths of the domain points, random in time."""
+def velocity(it: Iteration) -> Tensor | None:
+    """L_reg at random points of the paths of the domain points, random in time, as long as they move."""
+    if it.stage.settles:
+        return None
     fit, net = it.fit, it.fit.ring.shape_net
     chosen = torch.randperm(len(it.s), generator=fit.random)[:REGULARISED_POINTS]
     steps = int(torch.randint(net.steps, (), generator=fit.random))
@@ -146,6 +150,23 @@ def calibration(it: Iteration) -> Tensor | None:
     return it.fit.calibration.prior() if it.fit.calibration else None
 
 
+def settling(it: Iteration) -> Tensor | None:
+    """How much the material varies over the surface, by its mean, while it settles.
+
+    What varies slowly is more likely light, an edge is not. By the mean, for a darker material under a stronger light
+    looks the same.
+    """
+    if not it.stage.settles:
+        return None
+    values = priors.columns_of(it.material, it.fit.ring.brdf_net)
+    return priors.per_radius(it, values / values.mean(0).clamp(min=LEAST))
+
+
+def likely(it: Iteration) -> float:
+    """That what varies is light: where coarse fits had many materials explain more than one, less so."""
+    return 1.0 if it.fit.lighting.plain else MANY
+
+
 def strength(it: Iteration) -> float:
     """Of the regulariser, as `mi_ring.fitting.restraint` has it."""
     return it.fit.restraint.strength(it.fit.config.velocity_decay)
@@ -157,6 +178,7 @@ default_terms: dict[str, Term] = {
     "mask": Term(mask),
     "velocity": Term(velocity, schedule=strength),
     "calibration": Term(calibration),
+    "settling": Term(settling, schedule=likely),
     "normal_variation": Term(priors.normal_variation),
     "material_variation": Term(priors.material_variation),
     "material_rank": Term(priors.material_rank),

@@ -68,7 +68,7 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     if math.isinf(trials.left(found)):
         raise trials.failures[-1]
     if found.kind != "capture":
-        found = trials.plain(found)
+        found = trials.plain(found)._replace(settles=found.kind in ("environment", "turntable"))
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
