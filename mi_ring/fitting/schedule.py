@@ -5,7 +5,7 @@ from typing import NamedTuple
 from mi_ring.fitting.config import Config
 
 HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
-SETTLING, FEWEST = 0.1, 24  #: iterations in which light and material settle, by those before them, and at least
+SETTLING = 0.15  #: iterations in which light and material settle, by those before them
 EXCHANGE = 0.4  #: iterations of the second stage that it gets for each; by the presets they take about as long
 
 
@@ -35,6 +35,6 @@ def stages_of(config: Config, near: bool = False, settling: bool = False) -> lis
         stages.append(Stage(level, width, first, last))
         first = last
     if settling:
-        more = max(FEWEST, round(SETTLING * first))
+        more = max(1, round(SETTLING * first))
         stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
     return [stage for stage in stages if stage.last > stage.first]
