@@ -177,6 +177,16 @@ def test_gradients_of_the_material_equal_finite_differences(name, which):
     assert abs(difference) > 1  # of a loss of some hundreds
 
 
+def test_gradients_of_the_material_are_the_same_if_nothing_else_has_one():
+    setting, gradients = Setting(**SETTINGS["light off the camera"]), []
+    for vertices in (setting.vertices, setting.vertices.clone().requires_grad_()):
+        material = {key: m.clone().requires_grad_() for key, m in setting.material.items()}
+        setting.losses(vertices, material, 4, 5)[0].backward()
+        gradients.append(torch.cat([m.grad.ravel() for m in material.values()]))
+    assert setting.vertices.grad is None
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6 * float(gradients[0].abs().max()))
+
+
 def test_coverage_does_not_depend_on_the_material():
     setting = Setting(**SETTINGS["light off the camera"])
     material = {key: m.clone().requires_grad_() for key, m in setting.material.items()}

@@ -15,6 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting import budget
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.schedule import Stage, stages_of
 from mi_ring.output.results import read_log
 from mi_ring.system.machine import threads_of
@@ -65,6 +66,17 @@ def test_measuring_changes_nothing_of_the_fit(small_capture):
         assert fit.iteration == 3 and fit.log == []
         weights.append(list(fit.ring.parameters()))
     assert all(map(torch.equal, *weights))
+
+
+def test_what_settles_is_timed_like_what_shapes(small_capture, monkeypatch):
+    """Both have the same level and width; the former takes less."""
+    config = Config(iterations=4, levels=(2,), widths=(28,), shares=(1,), domain="sphere")
+    fit, timed = Fit(load_capture(small_capture), config, lighting=Lighting("environment")), []
+    step = Fit.step
+    monkeypatch.setattr(Fit, "step", lambda trial: timed.append(step(trial).stage.settles))
+    assert fit.stages[-1].settles
+    budget.measure(fit, budget.all_stages(fit, [config]))
+    assert timed and not any(timed)
 
 
 def test_an_iteration_is_timed_twice_on_the_same_photographs(small_capture, monkeypatch):

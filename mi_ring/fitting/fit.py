@@ -1,6 +1,5 @@
 """The loop of a fit: sample the domain, deform, render, weigh, step."""
 
-import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.holdout import confirm, kept_out
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.lighting import Lighting, frames, lit, smoothed
+from mi_ring.fitting.lighting import AMBIGUOUS, Lighting, frames, lit, smoothed
 from mi_ring.fitting.optimizers import optimizers_of
 from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
 from mi_ring.fitting.powers import Looker, lookers_of
@@ -31,6 +30,7 @@ from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import require_settings, starting_ring
+from mi_ring.fitting.state import restore, state_of
 from mi_ring.fitting.summary import summary
 from mi_ring.fitting.surroundings import with_surroundings
 from mi_ring.fitting.terms import Term, default_terms
@@ -40,7 +40,7 @@ from mi_ring.nets.brdfnet import ReflectanceMap
 from mi_ring.nets.shapenet import Flow
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.ring.saved import ring_of, ring_state
+from mi_ring.ring.saved import ring_of
 from mi_ring.system.machine import autocast, device, release_memory
 
 LOG_EVERY = 5  #: iterations between entries of the log
@@ -81,7 +81,11 @@ class Fit:
         self.processes = current()  #: that share out the photographs of each iteration
         if reserved := self.terms.keys() & RESERVED:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
-        if not any(self.config.weights.get(name, term.weight) for name, term in self.terms.items()):
+
+        def weight_of(name: str) -> float:
+            return self.config.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
+
+        if not any(weight_of(name) for name in self.terms.keys() - {"settling"}):  # which no surface comes of
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
         require_settings(capture, self.config)
         if state and networks:
@@ -97,8 +101,8 @@ class Fit:
         self.lighting = lighting or self.processes.told(lighting_of(capture.part(self.fitted), self.config, Fit))
         self.seconds = time.perf_counter() - began  #: that iterations, and coarse fits before them, have taken
         #: `environment`: harmonics of what the scene says of one, if it says so.
-        capture, scene, self.environment = smoothed(lit(capture, self.lighting))
-        self.capture = capture
+        self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
+        capture = self.capture
         chosen = replace(self.config, light=self.lighting.kind)
         self.random = torch.Generator().manual_seed(self.config.seed)
         torch.manual_seed(self.config.seed)
@@ -119,14 +123,16 @@ class Fit:
         self.calibration: Calibration | None = None
         self.lookers: list[Looker] = []  #: optimisers that see iterations
         if refined := refined_of(seen, chosen, self.albedo):
-            self.calibration = Calibration(
-                capture, refined, self.ring.center.cpu().numpy(), self.exposure, overall(refined, self.albedo),
-                self.fitted, frames(capture, self.lighting), bool(self.lighting.lamps),
-                ahead="light" in self.config.refine)  # fmt: skip
+            power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
+            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
+                                           frames(capture, self.lighting), bool(self.lighting.lamps),
+                                           ahead="light" in self.config.refine)  # fmt: skip
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
-        self.stages_by = partial(stages_of, near=self.near, settling=self.lighting.settles)  #: of settings
+        #: Does the surface stand still in the end, while light and material settle?
+        self.settling = self.lighting.kind in AMBIGUOUS and weight_of("settling") > 0
+        self.stages_by = partial(stages_of, near=self.near, settling=self.settling)  #: of settings
         self.stages = self.stages_by(self.config)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
@@ -134,11 +140,12 @@ class Fit:
         self.outlines: dict[int, Tensor] = {}
         self.iteration = 0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.restraint, self.averages, self.rounds = Restraint(), Averages(), Rounds(capture, self.fitted)
+        self.restraint, self.averages = Restraint(), Averages()
+        self.rounds = Rounds(capture, self.fitted)
         self.confirmed: dict = {}  #: what `confirm` found when the fit was done
         if state:
-            self.restore(state)
-        fitted = [module for module in (self.ring, self.calibration) if module]
+            restore(self, state)
+        fitted = [self.ring, self.calibration] if self.calibration else [self.ring]
         self.caution = Caution(fitted, self.optimizers, state and state["caution"])
 
     def __iter__(self) -> Iterator[Iteration]:
@@ -154,8 +161,9 @@ class Fit:
         if self.iteration >= self.iterations:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
-        if "masks" in self.config.refine and self.iteration in [int(p * self.iterations) for p in REDRAWN]:
+        if "masks" in self.config.refine and self.iteration in [int(p * self.shaping) for p in REDRAWN]:
             self.take_outlines(self.processes.by_first(lambda: find_outlines(self)))
+        self.settle()
         it = self.predict()
         loss = self.weigh(it)
         for optimizer in self.lookers:
@@ -163,7 +171,7 @@ class Fit:
         self.descend(it, loss)
         self.follow_power()
         it.detach()
-        self.restraint.note(it, self.iterations)
+        self.restraint.note(it, self.shaping)
         self.iteration += 1
         if self.iteration == it.stage.last:
             release_memory()  # what comes next has other sizes
@@ -176,6 +184,24 @@ class Fit:
             callback(it)
         return it
 
+    @property
+    def shaping(self) -> int:
+        """How many iterations shape the surface, before it stands still."""
+        return self.stages[-1].first if self.stages[-1].settles else self.iterations
+
+    @property
+    def progress(self) -> float:
+        """Share of these that are done."""
+        return min(1.0, self.iteration / self.shaping)
+
+    def settle(self) -> None:
+        """Have the surface stand still if that is due, and the light be what photographs say from then on."""
+        last = self.stages[-1]
+        self.ring.shape_net.requires_grad_(not (last.settles and self.iteration >= last.first))
+        if last.settles and self.iteration == last.first and self.calibration:
+            self.calibration.room.forget()
+            self.caution.keep()  # not to go back to what is forgotten
+
     def predict(self) -> Iteration:
         """Sample the domain, deform it, choose photographs and render them."""
         config, number = self.config, self.iteration
@@ -185,8 +211,8 @@ class Fit:
         points = self.processes.share(len(s))
         with self.autocast():
             vertices, material = self.ring(s[points.part])
-        vertices, *parameters = points.joined([vertices.detach() if stage.settles else vertices, *material.values()])
-        material = self.lighting.shared(dict(zip(material, parameters)), number / self.iterations)
+        vertices, *parameters = points.joined([vertices, *material.values()])
+        material = self.lighting.shared(dict(zip(material, parameters)), self.progress)
 
         everything, size = self.rounds.draw(config.batch, self.random)
         share = self.processes.share(len(everything))
@@ -206,7 +232,7 @@ class Fit:
         if self.calibration:
             predicted = self.calibration.recorded(predicted, index, scale)
         return Iteration(
-            self, number + 1, number / self.iterations, stage, s, faces, vertices, material, index, scale, photographs,
+            self, number + 1, self.progress, stage, s, faces, vertices, material, index, scale, photographs,
             *seen, predicted, coverage, everything, share,
         )  # fmt: skip
 
@@ -317,34 +343,4 @@ class Fit:
 
     def state(self) -> dict:
         """What another `Fit` of the same capture needs to go on from here, for `torch.save`."""
-        state = {
-            "ring": ring_state(self.ring, self.config.settings()),
-            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
-            "random": self.random.get_state(),
-            "iteration": self.iteration,
-            "seconds": self.seconds,
-            "log": self.log,
-            "restraint": vars(self.restraint),
-            "caution": self.caution.state(),
-            "calibration": self.calibration and self.calibration.state_dict(),
-            "averages": self.averages.pictures,
-            "confirmed": self.confirmed,
-            "outlines": self.outlines,
-            "waiting": self.rounds.waiting,
-            "lighting": tuple(self.lighting),
-        }
-        return copy.deepcopy(state)  # which the next iteration would change
-
-    def restore(self, state: dict) -> None:
-        """Take up what a `state` says besides the ring."""
-        state = copy.deepcopy(state)  # which the next iteration would change
-        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(saved)
-        self.random.set_state(state["random"])
-        self.iteration, self.seconds, self.log = state["iteration"], state["seconds"], state["log"]
-        vars(self.restraint).update(state["restraint"])
-        self.averages.pictures, self.confirmed = state["averages"], state["confirmed"]
-        self.rounds.restore(state.get("waiting", {}))
-        self.take_outlines(state["outlines"])
-        if self.calibration:
-            self.calibration.load_state_dict(state["calibration"])
+        return state_of(self)

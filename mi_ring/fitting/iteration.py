@@ -26,7 +26,7 @@ class Iteration:
 
     fit: "Fit"
     number: int  #: from 1
-    progress: float  #: share of the iterations that came before it, in [0, 1)
+    progress: float  #: share of the iterations that shape the surface before it, in [0, 1]; 1: it stands still
     stage: Stage
     s: Tensor  #: (V, 3) domain points
     faces: np.ndarray  #: (F, 3)

@@ -23,6 +23,7 @@ from mi_ring.rendering.scenes import lamp_lights
 from mi_ring.rendering.shading import shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
+AMBIGUOUS: set[Kind] = {"environment", "turntable"}  #: light that can hardly be told from what the material is
 Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `rgb` of a `Light`, that can be saved
 
 
@@ -33,7 +34,6 @@ class Lighting(NamedTuple):
     lamps: tuple[Lamp, ...] = ()
     distant: bool = False  #: Are they infinitely far away?
     plain: float = 0.0  #: progress of the fit until which the object is taken to be of one material
-    settles: bool = False  #: Are light and material found anew in the end, for the surface that was found?
 
     def __str__(self) -> str:
         """For people: environment, 1 lamp, 2 distant lamps."""

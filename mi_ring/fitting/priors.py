@@ -15,6 +15,8 @@ from torch.nn import functional as F
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.nets.brdfnet import ReflectanceMap
 
+FAINT = 1e-3  #: mean of what is reflected, by the net's `scale`, which nothing is divided by less than
+
 
 def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
     """Total variation of the normals of a closed mesh, vertices (V, 3) and faces (F, 3): a length.
@@ -69,12 +71,23 @@ def normal_variation(it: Iteration) -> Tensor:
 
 
 def material_variation(it: Iteration) -> Tensor:
-    """Of the parameters in their units."""
-    return per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
+    """Per radius of the object. The shape does not follow it."""
+    return variation_per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
 
 
-def per_radius(it: Iteration, values: Tensor) -> Tensor:
-    """Total variation of values (V, n) at the vertices per radius of the object. The shape does not follow it."""
+def albedo_variation(it: Iteration) -> Tensor:
+    """The same of a material in the light that is found for it: one as dark again in twice the light is the same.
+
+    So parameters without an upper end, how much is reflected, are compared with their mean.
+    """
+    net = it.fit.ring.brdf_net
+    values = columns_of(it.material, net)
+    free = torch.tensor([math.isinf(p.high) for p in net.bsdf_parameters for _ in range(p.channels)]).to(values.device)
+    return variation_per_radius(it, values / torch.where(free, values.mean(0).clamp(min=FAINT), 1.0))
+
+
+def variation_per_radius(it: Iteration, values: Tensor) -> Tensor:
+    """How fast values (V, n) at the vertices change over the surface, in the mean, times the object's radius."""
     return it.fit.ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
 
 

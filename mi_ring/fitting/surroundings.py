@@ -25,7 +25,7 @@ def with_surroundings(
     `index`: of all photographs of the iteration, of which these are the `share`.
     """
     calibration = fit.calibration if fit.calibration and "ambient" in fit.calibration.refined else None
-    looking = calibration is not None and (photographs.dark or fit.iteration / fit.iterations >= LIT)
+    looking = calibration is not None and (photographs.dark or fit.progress >= LIT)
     which = calibration.room.which if calibration and looking else photographs.harmonics
     if not (fit.ring.indirect or which):
         return predicted
@@ -40,9 +40,7 @@ def with_surroundings(
     if photographs.harmonics:
         predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
     if calibration and looking:
-        if fit.stages[-1].settles and fit.iteration == fit.stages[-1].first:
-            calibration.room.forget()  # the light that made up for a material that varied
         telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
         observed = calibration.linear(seen.rgb, index[share.part], scale)
-        calibration.room.see(around, before, observed, telling, share, fit.iteration / fit.iterations)
+        calibration.room.see(around, before, observed, telling, share, fit.progress)
     return predicted

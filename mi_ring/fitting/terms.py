@@ -16,8 +16,7 @@ from mi_ring.images import blur
 from mi_ring.nets.shapenet import Flow
 
 DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
-LEAST = 1e-3  #: mean of a parameter, in its unit, for it to be compared with it
-MANY = 0.1  #: weight of the prior of a material that settles, by that of one that looks like one all over
+PATTERNED = 0.1  #: weight of the variation of a material that varies, by that of one that hardly does
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
@@ -151,20 +150,13 @@ def calibration(it: Iteration) -> Tensor | None:
 
 
 def settling(it: Iteration) -> Tensor | None:
-    """How much the material varies over the surface, by its mean, while it settles.
-
-    What varies slowly is more likely light, an edge is not. By the mean, for a darker material under a stronger light
-    looks the same.
-    """
-    if not it.stage.settles:
-        return None
-    values = priors.columns_of(it.material, it.fit.ring.brdf_net)
-    return priors.per_radius(it, values / values.mean(0).clamp(min=LEAST))
+    """Variation of the material once the surface stands still: what varies slowly is more likely light."""
+    return priors.albedo_variation(it) if it.stage.settles else None
 
 
-def likely(it: Iteration) -> float:
-    """That what varies is light: where coarse fits had many materials explain more than one, less so."""
-    return 1.0 if it.fit.lighting.plain else MANY
+def plainness(it: Iteration) -> float:
+    """How much is to be said for one material: less where a coarse fit was better off with many."""
+    return 1.0 if it.fit.lighting.plain else PATTERNED
 
 
 def strength(it: Iteration) -> float:
@@ -178,7 +170,7 @@ default_terms: dict[str, Term] = {
     "mask": Term(mask),
     "velocity": Term(velocity, schedule=strength),
     "calibration": Term(calibration),
-    "settling": Term(settling, schedule=likely),
+    "settling": Term(settling, schedule=plainness),
     "normal_variation": Term(priors.normal_variation),
     "material_variation": Term(priors.material_variation),
     "material_rank": Term(priors.material_rank),

@@ -68,7 +68,7 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     if math.isinf(trials.left(found)):
         raise trials.failures[-1]
     if found.kind != "capture":
-        found = trials.plain(found)._replace(settles=found.kind in ("environment", "turntable"))
+        found = trials.plain(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
@@ -93,7 +93,7 @@ class Trials:
         if lighting in self.errors:
             return self.errors[lighting]
         refine = refined_under(lighting, self.config)
-        weights = {"mask": self.config.weights["mask"]}
+        weights = {"mask": self.config.weights["mask"], "settling": 0.0}
         config = replace(self.config, **COARSE, weights=weights, light=lighting.kind, refine=refine)
         try:
             fit = self.trial(self.capture, config, lighting=lighting)
@@ -108,7 +108,10 @@ class Trials:
             room = fit.calibration.room
             told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
             self.environment = room.harmonics.numpy(force=True)[:COUNT], told.numpy(force=True)[:COUNT]
-        self.errors[lighting] = float(np.nan_to_num(np.mean(errors), nan=np.inf))
+        finite = [error for error in errors if math.isfinite(error)]  # a renderer has one now and then that is not
+        self.errors[lighting] = float(np.mean(finite)) if finite else math.inf
+        if not finite:
+            self.failures.append(InputError(f"{self.capture.path}: a coarse fit ({lighting}) has no finite error"))
         return self.errors[lighting]
 
     def best(self, *lightings: Lighting) -> Lighting:

@@ -90,11 +90,11 @@ class Surface:
                     f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)"
                 )
         tensors = {POSITIONS: vertices} | {f"vertex_{name}": value for name, value in attributes.items()}
+        attached = [name for name, tensor in tensors.items() if gradients and tensor.requires_grad]
         if self.unit != 1:
             tensors[POSITIONS] = vertices.detach() / self.unit
         arrays = {name: to_drjit(t) for name, t in tensors.items()}
-        if gradients:
-            dr.enable_grad(*arrays.values())
+        dr.enable_grad([arrays[name] for name in attached])
         if self.faces_changed:
             self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
             self.faces_changed = False
@@ -159,9 +159,10 @@ class _Render(torch.autograd.Function):
         if calibration := buffers[: len(buffers) - lamps]:
             photographs = photographs.moved(*calibration)
         photographs = photographs.in_units(surface.unit)
-        if gradients:
+        moving = any(t.requires_grad for t in (vertices, *others))  # or is it but the material?
+        if moving:
             surface.edges = Edges.of(surface.scene, surface.edges)
-        edges = surface.edges if gradients else None
+        edges = surface.edges if moving else None
         channels = render_photographs(surface.scene, photographs, spp, seed, shadows, edges)
         dr.eval(channels)
         ctx.save = (surface, surface.written, arrays, channels, [t.shape for t in (vertices, *tensors)])
@@ -185,11 +186,14 @@ class _Render(torch.autograd.Function):
                 dr.enqueue(dr.ADMode.Backward, channel)
         dr.traverse(dr.ADMode.Backward)
         # Copied: torch may add to a gradient in place.
-        grads = [to_torch(dr.grad(a)).clone().reshape(shape) for a, shape in zip(arrays, shapes)]
-        if not grads[0].isfinite().all():
-            own = degenerate(to_torch(arrays[0]).reshape(-1, 3), surface.faces)
-            grads[0] = torch.where(own[:, None], grads[0].nan_to_num(0, 0, 0), grads[0])
-        if surface.unit != 1:
+        grads = [
+            to_torch(dr.grad(a)).clone().reshape(shape) if dr.grad_enabled(a) else None
+            for a, shape in zip(arrays, shapes)
+        ]
+        if grads[0] is not None:
+            if not grads[0].isfinite().all():
+                own = degenerate(to_torch(arrays[0]).reshape(-1, 3), surface.faces)
+                grads[0] = torch.where(own[:, None], grads[0].nan_to_num(0, 0, 0), grads[0])
             grads[0] = grads[0] / surface.unit
         return None, None, None, None, None, None, None, *grads
 
