@@ -32,7 +32,8 @@ from mi_ring.rendering.rooms import BASIS, COUNT, directions_of, harmonics_in, s
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
-#: Photographs under another light, half as wide, and paths per pixel: of the sun's light noise would be all they show.
+#: Photographs under another light, and paths per pixel. They are half as wide as others, so that so many are not too
+#: slow: with fewer the noise of the sun's light would be larger than the error.
 RELIT, SMOOTH = 4, 512
 
 
