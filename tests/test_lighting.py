@@ -393,14 +393,14 @@ def test_what_settles(lighting, settling, weight, small_capture):
 
 
 def test_what_settles_does_not_get_darker_for_it(small_capture):
-    """What is reflected is compared with its mean: a step of a quarter, however bright. Roughness is not."""
+    """What is reflected is compared with its mean: a step of a quarter, however bright. Roughness is a logit."""
     fit = mi_ring.Fit(mi_ring.load_capture(small_capture), mi_ring.Config.preset("fast", **TINY))
     s, faces = fit.ring.domain.sample(3)
     one = torch.ones(len(s))
     step, values = 0.25 * (s[:, 0] > 0).float(), {}
-    for name, brightness in (("diffuse", 0.02), ("diffuse", 0.5), ("roughness", 0.2), ("roughness", 0.6)):
-        material = {"diffuse": brightness * one[:, None].expand(-1, 3), "specular": one, "roughness": brightness * one}
-        varying = brightness * (1 + step) if name == "diffuse" else brightness + step
+    for name, brightness in (("diffuse", 0.02), ("diffuse", 0.5), ("roughness", -3.0), ("roughness", 0.5)):
+        material = {"diffuse": brightness * one[:, None].expand(-1, 3), "specular": one, "roughness": 0.5 * one}
+        varying = brightness * (1 + step) if name == "diffuse" else torch.sigmoid(brightness + step)
         material[name] = (varying[:, None].expand(-1, 3) if name == "diffuse" else varying).requires_grad_()
         it = SimpleNamespace(fit=fit, vertices=s, faces=faces, material=material)
         value = priors.albedo_variation(it)

@@ -64,8 +64,9 @@ def require_unknown(capture: Capture, config: Config) -> None:
     if not hasattr(capture.shape.bsdf(), "lobes"):
         raise InputError(f"{capture.path}: bsdf: --light {config.light} is for cooktorrance alone; give that")
     if others:
-        raise InputError(f"{capture.path}: emitter: --light {config.light} finds all the light there is; take the "
-                         "lamps of the scene out, or leave --light out")  # fmt: skip
+        names = ", ".join(f'"{emitter.id()}"' for emitter in others)
+        raise InputError(f"{capture.path}: emitter {names}: --light {config.light} finds all the light there is; take "
+                         "the lamps of the scene out, or leave --light out")  # fmt: skip
     if any(sensor.ambient for sensor in capture.sensors):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip

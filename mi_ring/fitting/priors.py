@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.nets.brdfnet import ReflectanceMap
 
-FAINT = 1e-3  #: mean of what is reflected, by the net's `scale`, which nothing is divided by less than
+FAINT = 1e-3  #: means that nothing is divided by less than, and how far from its ends a parameter's logit stays
 
 
 def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
@@ -76,14 +76,16 @@ def material_variation(it: Iteration) -> Tensor:
 
 
 def albedo_variation(it: Iteration) -> Tensor:
-    """The same of a material in the light that is found for it: one as dark again in twice the light is the same.
+    """The same, but for what is had for nothing where the light is found for the material.
 
-    So parameters without an upper end, how much is reflected, are compared with their mean.
+    Of how much is reflected by its mean: half as much in twice the light is the same. Of what has an upper end (a
+    roughness) the logits: as shares they would vary less near its ends.
     """
     net = it.fit.ring.brdf_net
     values = columns_of(it.material, net)
-    free = torch.tensor([math.isinf(p.high) for p in net.bsdf_parameters for _ in range(p.channels)]).to(values.device)
-    return variation_per_radius(it, values / torch.where(free, values.mean(0).clamp(min=FAINT), 1.0))
+    ends = torch.tensor([math.isfinite(p.high) for p in net.bsdf_parameters for _ in range(p.channels)])
+    values = torch.where(ends.to(values.device), values.logit(FAINT), values / values.mean(0).clamp(min=FAINT))
+    return variation_per_radius(it, values)
 
 
 def variation_per_radius(it: Iteration, values: Tensor) -> Tensor:

@@ -145,7 +145,8 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
                 bar.write(f"Iteration {it.number}: loss, gradient or weights were not finite; going on from the last "
                           "ones that were, by smaller steps")  # fmt: skip
             stage = fit.stages.index(it.stage) + 1
-            where = f"stage {stage}/{len(fit.stages)}, iteration {it.number}/{fit.iterations}"
+            doing = ", light and material settle" * it.stage.settles
+            where = f"stage {stage}/{len(fit.stages)}{doing}, iteration {it.number}/{fit.iterations}"
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])

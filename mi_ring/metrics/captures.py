@@ -172,7 +172,8 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         found.append(f"{odd}: so strong is the light that the fit has found, by the others': did the flash fire?")
     found += filter(None, [units(capture, center)])
     received = received_by(capture, center)
-    lit = [row for row in rows if row.angle < 60 and row.brightness > 0]  # not from behind
+    # Not from behind; and where photographs have lights of their own: else some show the side that is not lit.
+    lit = [row for row in rows if row.angle < 60 and row.brightness > 0 and not capture.photographs.dark]
     typical = np.median([row.brightness for row in lit]) if lit else 1.0
     for row in lit:
         if not typical / 4 < row.brightness < 4 * typical:

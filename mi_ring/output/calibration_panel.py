@@ -124,7 +124,7 @@ def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, labe
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
     axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)
     lights = capture.photographs.lights
-    x, y = (lights.positions()[lights.is_finite()] @ plane.T).T
+    x, y = (lights.positions()[lights.is_finite() & lights.rgb().any(1)] @ plane.T).T
     axes.scatter(x, y, s=8, c=colour)
     lamps = [lamp.vector for lamp in lamp_lights(capture.scene) if lamp.kind == "point"]
     x, y = plane @ np.reshape(lamps, (-1, 3)).T

@@ -222,10 +222,12 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
     found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
+    telling = comparable(capture, seen)
+    compared = telling if telling.any() else valid
     pictures = {
         "photograph": photo,
         "prediction": guess,
-        "4 × difference": 4 * np.abs(photo - guess),
+        "4 × difference": 4 * np.abs(photo - guess) * compared[..., None],
         "normals": normal,
     }
     for p in fit.ring.brdf_net.bsdf_parameters:
@@ -234,8 +236,7 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
-    telling = comparable(capture, seen)
-    error = float(np.mean((photo - guess)[telling if telling.any() else valid] ** 2))
+    error = float(np.mean((photo - guess)[compared] ** 2))
     by = shift(photo * inside[..., None] if masked else photo, guess, inside | found)
     row = PhotographPanel(
         name=capture.names[k],
