@@ -228,3 +228,12 @@ def test_mistakes_of_the_user(tmp_path, small_capture, capsys):
             command.run("mi_ring.check", check.main, [str(a) for a in arguments])
         message = capsys.readouterr().err
         assert stop.value.code == 2 and message.count("\n") == 1 and words in message
+
+
+def test_exposures_are_not_judged_where_photographs_have_no_lights(broken_capture, tmp_path, capsys):
+    """A camera may look at the side that the room's light does not reach."""
+    path, _ = broken_capture
+    edit_images(path, lambda image: image // 5, which="007")
+    path.write_text(re.sub('(name="intensity" value=)"[^"]*"', r'\1"0"', path.read_text()))
+    _, text = run(path, tmp_path, capsys)
+    assert "007.png" in text and "times as bright as the others" not in text, text
