@@ -21,6 +21,7 @@ from mi_ring.fit import parse_options
 from mi_ring.fitting import checkpoint, terms
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.domain import Sphere
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.nets import registry, solvers
@@ -217,7 +218,7 @@ def test_a_wide_resnet_of_equal_blocks_is_the_ring():
 
 def test_the_regulariser_of_a_plain_resnet_sees_all_blocks():
     class Iteration:
-        s = torch.randn(20, 3)
+        s, stage = torch.randn(20, 3), Stage(3, 32, 0, 1)
         fit = type("Fit", (), {"config": Config(laplacian_scale=0.0), "autocast": torch.no_grad})()
 
     fit = Iteration.fit

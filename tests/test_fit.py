@@ -112,7 +112,7 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
     def value(precision):
         running = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--precision", precision]))
         running.ring.shape_net.output.weight.data.mul_(30)
-        return terms.velocity(SimpleNamespace(fit=running, s=s)).item()
+        return terms.velocity(SimpleNamespace(fit=running, s=s, stage=running.stages[0])).item()
 
     assert value("bfloat16") == pytest.approx(value("float32"), rel=0.01)
 
