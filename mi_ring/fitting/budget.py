@@ -20,7 +20,7 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """What an iteration of each stage takes: the second of two, for the first has to warm up.
+    """What an iteration takes at each level and width of the stages: the second of two, for the first has to warm up.
 
     They are those of another fit, which goes on from the state of this one and is dropped. Nothing of it, once it was
     `interrupted`.
@@ -29,7 +29,7 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
     trial = Fit(fit.capture, fit.config, terms=fit.terms, state=fit.state())
     trial.ring.domain = fit.ring.domain  # with the samplings, which the fit needs in any case
     random, costs = trial.random.get_state(), {}
-    for stage in stages:
+    for stage in {(stage.level, stage.width): stage for stage in stages}.values():
         # As one that shapes the surface: those in which it stands still, of the same sizes, take less.
         trial.stages = [stage._replace(first=0, last=trial.iterations, settles=False)]
         for _ in range(2):
@@ -46,9 +46,8 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
-    """The stages of fits with these settings, from where this one starts, each level and width once."""
-    stages = [stage for config in configs for stage in fit.stages_by(config)]
-    return list({(stage.level, stage.width): stage for stage in stages}.values())
+    """The stages of fits with these settings, from where this one starts."""
+    return [stage for config in configs for stage in fit.stages_by(config)]
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], stages_by: Planner, costs: Costs) -> Settings:

@@ -81,11 +81,7 @@ class Fit:
         self.processes = current()  #: that share out the photographs of each iteration
         if reserved := self.terms.keys() & RESERVED:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
-
-        def weight_of(name: str) -> float:
-            return self.config.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
-
-        if not any(weight_of(name) for name in self.terms.keys() - {"settling"}):  # which no surface comes of
+        if not any(self.weight_of(name) for name in self.terms.keys() - {"settling"}):  # which no surface comes of
             raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
         require_settings(capture, self.config)
         if state and networks:
@@ -130,9 +126,8 @@ class Fit:
             self.lookers = lookers_of(self.calibration, self.near, self.terms)
             self.optimizers += [*self.calibration.optimizers(), *self.lookers]
             self.calibration.room.to(self.device)
-        #: Does the surface stand still in the end, while light and material settle?
-        self.settling = self.lighting.kind in AMBIGUOUS and weight_of("settling") > 0
-        self.stages_by = partial(stages_of, near=self.near, settling=self.settling)  #: of settings
+        settling = self.lighting.kind in AMBIGUOUS and self.weight_of("settling") > 0
+        self.stages_by = partial(stages_of, near=self.near, settling=settling)  #: of settings
         self.stages = self.stages_by(self.config)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
@@ -252,6 +247,10 @@ class Fit:
         """For the renderer."""
         return int(torch.randint(2**31, (), generator=self.random))
 
+    def weight_of(self, name: str) -> float:
+        """Of a term, before its schedule; 0 if there is none of that name."""
+        return self.config.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
+
     def weigh(self, it: Iteration) -> Tensor:
         """This process's share of the weighted sum of the terms; the iteration gets that and each term of all.
 
@@ -259,7 +258,7 @@ class Fit:
         """
         loss, values = torch.zeros((), device=self.device), dict.fromkeys(self.terms, (0.0, 0.0))
         for name, term in self.terms.items():
-            weight = self.config.weights.get(name, term.weight)
+            weight = self.weight_of(name)
             value = term.function(it) if weight else None
             if value is None:
                 continue

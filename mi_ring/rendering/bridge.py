@@ -146,9 +146,8 @@ def unit_for(radius: float) -> float:
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, surface, photographs, spp, seed, shadows, names, lamps, vertices, *tensors):
-        gradients = any(t.requires_grad for t in (vertices, *tensors))
         attributes, others = tensors[: len(names)], tensors[len(names) :]
-        arrays = surface.write(vertices, dict(zip(names, attributes)), gradients)
+        arrays = surface.write(vertices, dict(zip(names, attributes)), gradients=True)
         buffers = [to_drjit(t) for t in others]
         for buffer, tensor in zip(buffers, others):
             if tensor.requires_grad:
