@@ -12,8 +12,9 @@ from tyro.conf import Positional, arg
 from mi_ring.errors import InputError
 from mi_ring.metrics.evaluation import evaluate_fit, evaluation_table, rounded
 from mi_ring.metrics.predictions import SPP
+from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
-from mi_ring.system.files import read_json, require_place, write_file
+from mi_ring.system.files import require_place, write_file
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,8 @@ def main(arguments: Sequence[str]) -> None:
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
-    options = read_json(config.run / "config.json")
-    if config.novel and isinstance(options, dict) and options.get("light", "capture") != "capture":
-        print("The light was unknown to this fit. How bright it is, and of which colour, cannot be told from the "
-              "object's: novel views in a known light may be too bright or too dark", file=sys.stderr)  # fmt: skip
+    if config.novel and (untold := ambiguity_of(config.run)):
+        print(f"{untold} Novel views in a known light may be too bright or too dark", file=sys.stderr)
     print(json.dumps(totals))
 
 

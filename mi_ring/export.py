@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from mi_ring.capture.loading import load_views
 from mi_ring.errors import InputError
 from mi_ring.output import gltf
+from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
@@ -125,6 +126,8 @@ def main(arguments: Sequence[str]) -> None:
             files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
         else:
             files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph, room)
+    if untold := ambiguity_of(config.run):
+        print(untold, file=sys.stderr)
     print("\n".join(map(str, files)))
 
 

@@ -1,5 +1,6 @@
 """Render a fitted object, photographs or films of it: `python -m mi_ring.render RUN SCENE.xml OUT`."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
+from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.output.film import write_film, write_picture
 from mi_ring.output.views import RenderConfig, View, integrator_of, lit_surface, render_views, views_of
 from mi_ring.ring.material import dress
@@ -38,6 +40,8 @@ def main(arguments: Sequence[str]) -> None:
         for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
             write_picture(recorded(picture, view.sensor), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
+    if untold := ambiguity_of(config.run):
+        print(f"{untold} In a known light pictures may be too bright or too dark", file=sys.stderr)
 
 
 def require_options(config: RenderConfig) -> None:

@@ -1,5 +1,6 @@
 """Unknown light: what a fit takes it to be, finds, and writes."""
 
+import html
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
@@ -12,12 +13,14 @@ import torch
 from conftest import photographed_ellipsoid
 
 import mi_ring
+from mi_ring import export
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import priors, trials
 from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
+from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import bridge
 from mi_ring.rendering.elements import load_element
 from mi_ring.rendering.lights import Lights
@@ -108,7 +111,8 @@ def test_coarse_fits_find_that_it_is_an_environment(in_an_environment, monkeypat
     assert mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="auto")).lighting.kind == "environment"
 
 
-def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_path):
+def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_path, capsys):
+    """And the report and what is made of the fit say what cannot be known of such light."""
     capture = mi_ring.load_capture(in_an_environment)
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="turntable")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("turntable"))
@@ -116,6 +120,9 @@ def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_p
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert frames_of(again.scene) == {"camera"}
+    assert "cannot be told from the object" in html.unescape((tmp_path / "report.html").read_text())
+    export.main([str(tmp_path / "ring.pt"), str(tmp_path / "object.ply")])
+    assert "slow changes of light and of reflectance can hardly be told apart" in capsys.readouterr().err
     np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
 
     # Found anew as fixed in the world, nothing is left in the camera's axes.
@@ -434,3 +441,8 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture):
             trials.lighting_of(capture, config, Trial)
     else:
         assert trials.lighting_of(capture, config, Trial).plain > 0
+
+
+def test_only_light_that_was_unknown_is_said_to_be(tmp_path):
+    assert not ambiguity("capture") and not ambiguity_of(tmp_path)  # and where there is no record
+    assert "slow" in ambiguity("environment on one material") and "slow" not in ambiguity("2 distant lamps")

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
+from mi_ring.output.ambiguity import ambiguity
 from mi_ring.output.figures import svg_uri
 from mi_ring.rendering.rooms import COUNT, seen_from_within
 from mi_ring.rendering.scenes import lamp_lights
@@ -21,6 +22,7 @@ class Panel(NamedTuple):
 
     rows: list[tuple[str, str, str, str]]  #: what, before, after, standard deviation
     chart: str  #: a data URI
+    untold: str  #: what the photographs do not tell
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
@@ -29,7 +31,8 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     if refined.get("light", "capture") != "capture":
         rows.insert(0, ("what lights the object, by coarse fits", "", refined["light"], ""))
     rows += [row(entry) for entry in of_photographs(refined["photographs"])]
-    return Panel(rows, chart(before, after, refined["photographs"]))
+    untold = ambiguity(refined.get("light", "capture"))
+    return Panel(rows, chart(before, after, refined["photographs"]), untold)
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
