@@ -107,6 +107,8 @@ def main(arguments: Sequence[str]) -> None:
     photograph, room = first_photograph(config.run) if kind == ".xml" else (None, None)
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
     require_place(config.file)
+    if kind != ".ply":
+        print("Cutting the surface open and baking its material", flush=True)
     if kind == ".ply":
         write_mesh(ring, level, config.file, config.time, views)
         files = [config.file]
@@ -118,7 +120,6 @@ def main(arguments: Sequence[str]) -> None:
             print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
                   file=sys.stderr)  # fmt: skip
     else:
-        print("Cutting the surface open and baking its material", flush=True)
         atlas = unwrap(ring, level, config.resolution, config.time)
         texels = rasterise(ring, atlas, config.resolution, config.time)
         values = reflectances(ring, texels.s)
