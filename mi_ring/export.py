@@ -127,7 +127,7 @@ def main(arguments: Sequence[str]) -> None:
             files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
         else:
             files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph, room)
-    if untold := ambiguity_of(config.run):
+    if untold := ambiguity_of(config.material or config.run):
         print(untold, file=sys.stderr)
     print("\n".join(map(str, files)))
 

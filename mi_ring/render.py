@@ -34,13 +34,14 @@ def main(arguments: Sequence[str]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
     pictures = render_views(surface, ring, views, integrator, capture.shadows, config, capture.photographs.room)
     if config.film:
-        write_film(pictures, config.out, views[0].sensor.size, config.fps)
+        frames = (recorded(picture, view.sensor) for picture, view in zip(pictures, views))
+        write_film(frames, config.out, views[0].sensor.size, config.fps)
         print(config.out)
     else:
         for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
             write_picture(recorded(picture, view.sensor), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
-    if untold := ambiguity_of(config.run):
+    if untold := ambiguity_of(config.material or config.run):
         print(f"{untold} In a known light pictures may be too bright or too dark", file=sys.stderr)
 
 

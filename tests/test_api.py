@@ -260,3 +260,21 @@ def test_a_fit_goes_on_from_its_state(capture):
     rest = [it.loss for it in first]
     again = mi_ring.Fit(capture, config(domain="hull"), state=state)
     assert again.iteration == 2 and [it.loss for it in again] == pytest.approx(rest, rel=1e-4)
+
+
+def test_what_was_frozen_stays_so(capture):
+    """Parameters of networks of one's own that are not to be trained."""
+    shape_net, brdf_net = Siren(), Grey()
+    frozen = next(shape_net.parameters()).requires_grad_(False)
+    before = [p.detach().clone() for p in shape_net.parameters()]
+    fit = mi_ring.Fit(capture, config(), networks=(shape_net, brdf_net))
+    list(fit)
+    assert fit.given is capture and not frozen.requires_grad
+    moved = [not torch.equal(p, q) for p, q in zip(shape_net.parameters(), before)]
+    assert not moved[0] and any(moved[1:])
+
+
+def test_a_fit_that_looks_at_no_photograph_is_refused(capture):
+    for weights in ({"rgb": 0.0, "mask": 0.0}, {"rgb": 0.0, "mask": 0.0, "velocity": 0.0, "normal_variation": 1.0}):
+        with pytest.raises(mi_ring.InputError, match="no term compares the surface with the photographs"):
+            mi_ring.Fit(capture, config(weights=weights))

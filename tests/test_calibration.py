@@ -25,6 +25,7 @@ from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotat
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.images import linear_to_srgb
+from mi_ring.output.calibration_panel import held_out_text
 from mi_ring.rendering import bridge
 from mi_ring.rendering.rooms import BASIS
 
@@ -587,6 +588,10 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
     monkeypatch.setattr(holdout, "unexplained", unexplained)
     assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": ["curve"]}
     assert state() == (1.0, 0.0)
+    # Nothing is where they show nothing of the object, and that is said in words.
+    monkeypatch.setattr(holdout, "unexplained", lambda fit, capture: float("nan"))
+    assert "nothing that is surely the object" in held_out_text(holdout.confirm(running))
+    monkeypatch.setattr(holdout, "unexplained", unexplained)
     # What was not found is not put back.
     assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": []}
 

@@ -15,6 +15,7 @@ from mi_ring import evaluate, render
 from mi_ring.capture import calibrated, loading, scenefile
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import predictions, surfaces
+from mi_ring.metrics.evaluation import evaluate_fit
 from mi_ring.output import ply
 from mi_ring.rendering import crossings, plain_mesh
 from mi_ring.rendering.lights import Light, Lights
@@ -67,6 +68,18 @@ def test_spheres_of_two_radii():
     assert numbers["chamfer"] == pytest.approx(100 * 0.004 / (2 * np.sqrt(3)), rel=0.01)
     numbers = surfaces.compare_shapes(icosphere(5, 1.004), icosphere(5))
     assert numbers["f_score_0.1"] == 0 and numbers["f_score_0.5"] == 1  # 0.115 %
+
+
+def test_distances_are_by_the_diagonal_of_the_truth_before_it_is_moved():
+    """However a frame is turned, in which the box about the same surface is another."""
+    long, chamfer = trimesh.creation.capsule(height=60, radius=20), []
+    diagonal = float(np.linalg.norm(long.extents))
+    for angle in (0.0, 0.7):
+        turned = long.copy().apply_transform(trimesh.transformations.rotation_matrix(angle, [0.48, 0.6, -0.64]))
+        larger = turned.copy().apply_transform(trimesh.transformations.scale_matrix(1.02))
+        chamfer.append(surfaces.compare_shapes(larger, turned, diagonal=diagonal)["chamfer"])
+    assert chamfer[1] == pytest.approx(chamfer[0], rel=0.01)
+    assert surfaces.compare_shapes(larger, turned)["chamfer"] != pytest.approx(chamfer[0], rel=0.05)
 
 
 # Triangles that cross.
@@ -279,6 +292,16 @@ def test_the_command_agrees_with_the_pictures_that_render_writes(sphere_run, sma
         assert view["psnr"] == pytest.approx(-10 * np.log10(squares[-1]), abs=1e-4)
     assert totals["psnr_input"] == pytest.approx(-10 * np.log10(np.mean(squares)), abs=1e-4)
     assert totals["ssim_input"] == pytest.approx(np.mean([view["ssim"] for view in views]), abs=1e-4)
+
+    # What the fit has not seen is no input, though its scene has it.
+    kept_out, record = [1, 4], sphere_run / "calibration.json"
+    record.write_text(json.dumps({"held_out": {"photographs": [views[k]["name"] for k in kept_out]}}))
+    parted = evaluate_fit(sphere_run, sphere_run / "truth.ply", spp=4)
+    record.unlink()
+    assert [view["name"] for view in parted["views"]] == [view["name"] for view in views]
+    for name, index in (("held_out", kept_out), ("input", np.setdiff1d(np.arange(len(views)), kept_out))):
+        expected = -10 * np.log10(np.mean([squares[k] for k in index]))
+        assert parted[f"psnr_{name}"] == pytest.approx(expected, abs=1e-4)
 
 
 def test_what_cannot_be_done_is_one_line(sphere_run, tmp_path, capsys):

@@ -491,6 +491,20 @@ def test_a_film_plays_in_browsers_and_shows_the_pictures(tmp_path, run):
         np.testing.assert_allclose(picture[41, :57], picture[40, :57], atol=16)
 
 
+def test_a_film_of_photographs_shows_them_as_their_camera_records_them(tmp_path, run):
+    def darker(text):
+        return text.replace("</sensor>", '<string name="gain" value="0.4"/></sensor>')
+
+    path = write_scene(tmp_path, (64, 48), (120.0, 120.0), edit=darker, aim=(0.0, 0.0, 0.0))
+    render.main([str(run), str(path), str(tmp_path / "film.mp4"), "--spp", "4"])
+    render.main([str(run), str(path), str(tmp_path / "pictures"), "--spp", "4", "--format", "png"])
+    film = imageio.get_reader(tmp_path / "film.mp4", format="FFMPEG")
+    for k, picture in enumerate(film):
+        expected = read(tmp_path / "pictures" / f"{k:03}.png")
+        assert expected.mean() > 10 and abs(picture.mean() - expected.mean()) < 1
+    film.close()
+
+
 def test_an_interrupted_film_leaves_the_old_one(tmp_path, run):
     film = tmp_path / "film.mp4"
     film.write_bytes(b"before")

@@ -420,6 +420,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--pairs", "--room", "0.1", "--wrong-room"], "--pairs: need a room"),
     (["--lamps", "2"], "--lamps: is 2, which is for --light lamp"),
     (["--light", "lamp", "--lamps", "9"], "--lamps: is 9, must be 1 to 8"),
+    (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable, beside which"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

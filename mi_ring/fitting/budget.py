@@ -26,7 +26,7 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
     `interrupted`.
     """
     print("Measuring what iterations take on this machine", flush=True)
-    trial = Fit(fit.capture, fit.config, terms=fit.terms, state=fit.state())
+    trial = Fit(fit.given, fit.config, terms=fit.terms, state=fit.state())
     trial.ring.domain = fit.ring.domain  # with the samplings, which the fit needs in any case
     random, costs = trial.random.get_state(), {}
     for stage in {(stage.level, stage.width): stage for stage in stages}.values():

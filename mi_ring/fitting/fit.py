@@ -46,6 +46,7 @@ from mi_ring.system.machine import autocast, device, release_memory
 LOG_EVERY = 5  #: iterations between entries of the log
 #: Names that `Iteration.entry` has.
 RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
+UNSEEING = set(default_terms) - {"rgb", "mask"}  #: terms that look at no photograph
 RAMP = 0.05  #: over how much of a fit refinement sets in
 
 TermLike = Term | Callable[[Iteration], Tensor | None]
@@ -73,7 +74,7 @@ class Fit:
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
         state: dict | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
-        self.capture = capture
+        self.given = capture  #: as it was handed in, for another fit: `capture` is lit as this one takes it to be
         self.config: Config = config or Config()
         given = default_terms if terms is None else terms
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
@@ -81,8 +82,8 @@ class Fit:
         self.processes = current()  #: that share out the photographs of each iteration
         if reserved := self.terms.keys() & RESERVED:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
-        if not any(self.weight_of(name) for name in self.terms.keys() - {"settling"}):  # which no surface comes of
-            raise InputError("weights: all terms of the loss are switched off; give one of them a weight above 0")
+        if not any(self.weight_of(name) for name in self.terms.keys() - UNSEEING):
+            raise InputError("weights: no term compares the surface with the photographs; give rgb or mask one above 0")
         require_settings(capture, self.config)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
@@ -113,6 +114,7 @@ class Fit:
         self.albedo = math.pi * seen.reflectance(self.ring.center.cpu().numpy(), self.exposure)
         self.device = device()
         self.ring.to(self.device)
+        self.shaping_parameters = [p for p in self.ring.shape_net.parameters() if p.requires_grad]
         self.surface = bridge.Surface(scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
@@ -142,6 +144,7 @@ class Fit:
             restore(self, state)
         fitted = [self.ring, self.calibration] if self.calibration else [self.ring]
         self.caution = Caution(fitted, self.optimizers, state and state["caution"])
+        self.settle()
 
     def __iter__(self) -> Iterator[Iteration]:
         """The iterations that are left, each as it is done."""
@@ -158,7 +161,6 @@ class Fit:
         started = time.perf_counter()
         if "masks" in self.config.refine and self.iteration in [int(p * self.shaping) for p in REDRAWN]:
             self.take_outlines(self.processes.by_first(lambda: find_outlines(self)))
-        self.settle()
         it = self.predict()
         loss = self.weigh(it)
         for optimizer in self.lookers:
@@ -168,6 +170,7 @@ class Fit:
         it.detach()
         self.restraint.note(it, self.shaping)
         self.iteration += 1
+        self.settle()
         if self.iteration == it.stage.last:
             release_memory()  # what comes next has other sizes
         self.seconds += time.perf_counter() - started
@@ -192,7 +195,8 @@ class Fit:
     def settle(self) -> None:
         """Have the surface stand still if that is due, and the light be what photographs say from then on."""
         last = self.stages[-1]
-        self.ring.shape_net.requires_grad_(not (last.settles and self.iteration >= last.first))
+        for parameter in self.shaping_parameters:  # which in the end may learn again, in another fit
+            parameter.requires_grad_(not (last.settles and last.first <= self.iteration < last.last))
         if last.settles and self.iteration == last.first and self.calibration:
             self.calibration.room.forget()
             self.caution.keep()  # not to go back to what is forgotten

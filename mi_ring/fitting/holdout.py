@@ -5,6 +5,7 @@ is put back is not made up for.
 """
 
 import copy
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,7 +63,7 @@ def confirm(fit: "Fit") -> dict:
     """Put back what was refined for all photographs and explains those that were kept out no better than before.
 
     Returns what is unexplained of them (`unexplained`; `before`: with all unknowns as they began, but this surface) and
-    what was `put_back`.
+    what was `put_back`; nothing is unexplained nor put back where they show nothing that is surely the object.
     """
     calibration = fit.calibration
 
@@ -72,6 +73,8 @@ def confirm(fit: "Fit") -> dict:
         return unexplained(fit, fit.calibrated())
 
     now = unexplained_now()
+    if math.isnan(now):
+        return {"put_back": []}
     back: list[str] = []
     if calibration is None:
         return {"unexplained": now, "put_back": back}

@@ -58,7 +58,9 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
     elif config.light == "lamps":
         found = trials.lamps()
     else:
-        likely = [Lighting("environment"), trials.brightest(1), Lighting("turntable")]
+        likely = [Lighting("environment"), Lighting("turntable")]
+        if math.isfinite(trials.left(likely[0])):  # by which lamps are sought
+            likely.insert(1, trials.brightest(1))
         if not unlit(capture):
             own = trials.left(Lighting("capture"))
             likely = [one for one in likely if trials.left(one) < BETTER[one.kind] * own] or [Lighting("capture")]

@@ -15,6 +15,7 @@ from mi_ring.metrics.surfaces import THRESHOLDS, alignment, compare_shapes, comp
 from mi_ring.rendering.crossings import crossing_triangles
 from mi_ring.rendering.plain_mesh import scene_of
 from mi_ring.ring.saved import load_fit
+from mi_ring.system.files import read_json
 
 LINES = {  # of the table
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
@@ -33,7 +34,8 @@ def evaluate_fit(
     """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
 
     `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
-    genus of a surface that is not closed, for instance. `align`: move the truth, and the cameras and lights of `novel`,
+    genus of a surface that is not closed, for instance. Photographs that the fit kept out are no `_input`, but
+    `_held_out`. `align`: move the truth, and the cameras and lights of `novel`,
     onto the result first, "rigid" or also scaled ("similarity"); by how much is under `aligned_*`.
     """
     ring = load_fit(run)
@@ -56,15 +58,21 @@ def evaluate_fit(
         unseen = unseen and moved(unseen, scale, rotation, matrix[:3, 3])
     numbers, views = compare_surfaces(capture, guess, truth, diagonal)
     numbers |= motion
-    numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None)
+    numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None, diagonal)
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:
             numbers[key] = genus(surface)
     numbers["self_intersections"] = int(crossing_triangles(guess_mesh.vertices, guess_mesh.faces).sum())
     numbers["inside_out"] = int(inside_out(ring, *ring.domain.sample(ring.subdivisions)).sum())
-    predicted, photographs = compare_photographs(capture, ring, spp)
-    numbers |= {f"{key}_input": value for key, value in predicted.items()}
-    lists = {"views": [view | photograph for view, photograph in zip(views, photographs)]}
+    record = read_json(run / "calibration.json")
+    out = record["held_out"]["photographs"] if isinstance(record, dict) and "held_out" in record else []
+    for kind, kept_out in (("input", False), ("held_out", True)):
+        index = [k for k, name in enumerate(capture.names) if (name in out) == kept_out]
+        predicted, photographs = compare_photographs(capture, ring, spp, index)
+        numbers |= {f"{key}_{kind}": value for key, value in predicted.items()}
+        for k, photograph in zip(index, photographs):
+            views[k] |= photograph
+    lists = {"views": views}
     if unseen:
         predicted, lists["novel_views"] = compare_photographs(unseen, ring, spp)
         numbers |= {f"{key}_novel": value for key, value in predicted.items()}

@@ -1,5 +1,7 @@
 """How near predicted photographs are to the files: PSNR and SSIM."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from skimage.metrics import structural_similarity
 
@@ -13,18 +15,21 @@ SPP = 64  #: samples per pixel of predicted photographs, by default
 WINDOW = 11  #: of SSIM [px]
 
 
-def compare_photographs(capture: Capture, ring: Ring, spp: int) -> tuple[dict[str, float], list[dict]]:
+def compare_photographs(
+    capture: Capture, ring: Ring, spp: int, index: Sequence[int] | None = None
+) -> tuple[dict[str, float], list[dict]]:
     """`psnr` [dB] and `ssim` of predictions as 8-bit sRGB against the files, sRGB in [0, 1].
 
-    Of all photographs, from the mean of their squared errors and as the mean of their SSIM, and of each. What is
-    predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR. In a room that was not
-    black only what is wholly object by its mask counts: nobody predicts the rest.
+    Of the photographs `index`, by default all, from the mean of their squared errors and as the mean of their SSIM, and
+    of each. What is predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR. In a room
+    that was not black only what is wholly object by its mask counts: nobody predicts the rest.
     """
     surface = bridge.Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     views: list[dict] = []
-    for k, name in enumerate(capture.names):
+    for k in range(len(capture)) if index is None else index:
+        name = capture.names[k]
         rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
         predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
         seen = capture.observe([k])

@@ -110,18 +110,18 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
 
 
 def compare_shapes(
-    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[View] | None = None
+    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[View] | None = None, diagonal: float | None = None
 ) -> dict[str, float]:
-    """Chamfer distance [% of the diagonal of the true bounding box] and F-scores of two whole surfaces.
+    """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two whole surfaces.
 
     100,000 points of each, drawn evenly by area with a fixed seed, and their exact distances from the other surface:
     not from points of it, so that equal surfaces have distance 0. `chamfer` is the mean of the two mean distances, from
     the fit to the truth and back; `f_score_t` is the harmonic mean of precision, the share of the fit's points within t
-    % of the diagonal of the truth, and recall, the share of the truth's within t of the fit (Knapitsch et al., Tanks
+    % of the diagonal, and recall, the share of the truth's within t of the fit (Knapitsch et al., Tanks
     and Temples, ACM TOG 2017). Parts that no camera sees count, too, unless `views` are given: then the points are
     those that one of them shows, and `unseen` and `unseen_true` are the shares of the two surfaces that none does.
     """
-    diagonal, middle = np.linalg.norm(truth.extents), truth.bounds.mean(0)
+    diagonal, middle = diagonal or float(np.linalg.norm(truth.extents)), truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
     numbers = {"chamfer": float(there.mean() + back.mean()) / 2}
     if views is not None:

@@ -76,6 +76,8 @@ def held_out_text(held_out: dict[str, Any]) -> str:
     """How well photographs that were kept out are explained, as `mi_ring.fitting.holdout` has it."""
     if not held_out:
         return "not asked, for the fit ended early"
+    if "unexplained" not in held_out:
+        return "nothing that is surely the object shows in them; nothing was asked"
     text = f"{held_out['unexplained']:.1%} of the object's light in them is unexplained"
     if "before" in held_out:
         text += f", {held_out['before']:.1%} by this surface with calibration as it was"

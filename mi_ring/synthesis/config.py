@@ -56,7 +56,7 @@ class SynthesizeConfig:
     """Horizontal field of view [degrees]."""
     cameras: CameraKind = "around"
     """around: evenly, all looking at the middle; free: as if by hand, leaning, and nearer or farther; turntable: the
-    object turns, camera and room stand."""
+    object turns, camera and --room stand."""
     elevations: tuple[float, ...] = (20.0, 55.0)
     """Of the rings of a turntable [degrees]."""
     distance: float | None = None
@@ -153,6 +153,9 @@ def require_options(config: SynthesizeConfig) -> None:
         raise InputError(f"--elevations: is {config.elevations}, must be angles of -89 to 89 degrees")
     if config.table != "none" and config.cameras == "turntable" and min(config.elevations) < 1:
         raise InputError("--elevations: has cameras below the table; give 1 degree or more, or leave out --table")
+    if config.cameras == "turntable" and (config.environment or config.light == "lamp"):
+        raise InputError("--cameras: is turntable, beside which an --environment or a --light lamp would turn with the "
+                         "object; give --room 0.2 --room-kind harmonics, which stands with the camera")  # fmt: skip
     if config.distance is not None and not 1.05 <= config.distance <= 1000:
         raise InputError(f"--distance: is {config.distance}, must be 1.05 to 1000 radii of the object")
     if config.pattern != "stripes" and not config.second:
