@@ -16,6 +16,8 @@ from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
+ELSEWHERE = 0.3  #: silhouettes that overlap less are hardly of one object in one frame
+
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -24,8 +26,9 @@ class EvaluateConfig:
     In it: errors of normals [deg] and depths [% of the diagonal of the true bounding box] where both surfaces are seen;
     overlap of silhouettes; share of what is seen whose faces point away from the camera; Chamfer distance [% of the
     diagonal] and F-score of whole surfaces, unseen parts included unless --seen; genus; triangles that cross another,
-    and those that Shape-Net turned inside out; PSNR [dB] and SSIM of the photographs that mi_ring.render predicts. A
-    file has the same for every photograph.
+    and those that Shape-Net turned inside out; PSNR [dB] and SSIM of the photographs that mi_ring.render predicts, over
+    all pixels, or where a background is seen the object's alone, of photographs that have masks. A file has the same
+    for every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -62,8 +65,11 @@ def main(arguments: Sequence[str]) -> None:
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
+    if totals["iou"] < ELSEWHERE:
+        print(f"{config.mesh}: hardly lies where the fit is: is it in the frame of the scene? That of mi-ring "
+              "synthesize is truth/mesh.ply of its folder", file=sys.stderr)  # fmt: skip
     if config.novel and (untold := ambiguity_of(config.run)):
-        print(f"{untold} Novel views in a known light may be too bright or too dark", file=sys.stderr)
+        print(f"{untold} Novel views in a known light may be too bright, or of another colour", file=sys.stderr)
     print(json.dumps(totals))
 
 

@@ -41,8 +41,10 @@ def main(arguments: Sequence[str]) -> None:
         for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
             write_picture(recorded(picture, view.sensor), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
-    if untold := ambiguity_of(config.material or config.run):
-        print(f"{untold} In a known light pictures may be too bright or too dark", file=sys.stderr)
+    run = config.run if config.run.is_dir() else config.run.parent
+    own = config.scene.resolve().parent == run.resolve()  # in the light that was found with the material
+    if (untold := ambiguity_of(config.material or config.run)) and (config.material or config.envmap or not own):
+        print(f"{untold} In a known light pictures may be too bright, or of another colour", file=sys.stderr)
 
 
 def require_options(config: RenderConfig) -> None:

@@ -20,6 +20,7 @@ from mi_ring.fitting import priors, trials
 from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
+from mi_ring.metrics.captures import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import bridge
 from mi_ring.rendering.elements import load_element
@@ -450,3 +451,18 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture):
 def test_only_light_that_was_unknown_is_said_to_be(tmp_path):
     assert not ambiguity("capture") and not ambiguity_of(tmp_path)  # and where there is no record
     assert "slow" in ambiguity("environment on one material") and "slow" not in ambiguity("2 distant lamps")
+
+
+def test_a_background_that_is_seen_needs_masks(in_an_environment):
+    scene = in_an_environment.with_name("unmasked.xml")
+    scene.write_text(re.sub(r'<string name="mask"[^>]*>', "", in_an_environment.read_text()))
+    capture = mi_ring.load_capture(scene)
+    with pytest.raises(InputError, match="unmasked.xml: mask: no photograph has one"):
+        mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
+
+
+def test_photographs_without_lights_of_their_own_have_none_in_the_table(in_an_environment):
+    capture = mi_ring.load_capture(in_an_environment)
+    rows = measure(capture, *capture.sphere(), {})
+    assert {(row.light, row.angle) for row in rows} == {(None, None)}
+    assert quality_table(rows).splitlines()[1].split()[2:4] == ["-", "-"]

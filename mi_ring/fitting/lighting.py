@@ -70,6 +70,10 @@ def require_unknown(capture: Capture, config: Config) -> None:
     if any(sensor.ambient for sensor in capture.sensors):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
+    if not any(capture.masks.given):
+        raise InputError(f"{capture.path}: mask: no photograph has one, and by --light {config.light} the "
+                         "background would be taken for the object; give masks, or have mi-ring photos "
+                         "find them")  # fmt: skip
     wrong = own & {"falloff"} if config.light == "lamps" else own
     if wrong:
         raise InputError(f"--refine {min(wrong)}: is of the photographs' own lights, in the place of which --light "

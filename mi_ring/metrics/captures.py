@@ -48,8 +48,8 @@ class PhotographQuality:
 
     name: str
     distance: float  #: from the camera to the object
-    light: float  #: from the light to the object; infinite if it is distant
-    angle: float  #: between light and camera, seen from the object [deg]
+    light: float | None  #: from the light to the object; infinite if it is distant, None if there is none
+    angle: float | None  #: between light and camera, seen from the object [deg]
     object: float | None  #: share of the photograph that is object
     clipped: float  #: share of the object that is clipped
     dark: float  #: share of the object that is black, or nearly
@@ -81,6 +81,7 @@ def measure(
 ) -> list[PhotographQuality]:
     """The rows of all photographs."""
     lights, rows = capture.photographs.lights, []
+    lit = np.any(lights.rgb() > 0, axis=1)
     of_each = zip(capture.sensors, capture.names, lights.toward(center), lights.distances(center),
                   received_by(capture, center))  # fmt: skip
     for k, (sensor, name, to_light, away, received) in enumerate(of_each):
@@ -94,8 +95,8 @@ def measure(
         around = None if outside is None or not outside.any() else float(np.median(image[outside]))
         rows.append(PhotographQuality(
             name=name, distance=float(np.linalg.norm(to_camera) / radius),
-            light=float(away / radius),
-            angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            light=float(away / radius) if lit[k] else None,
+            angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) if lit[k] else None,
             object=float(inside.mean()) if masked else None,
             clipped=float(np.any(saturated, -1)[inside].mean()) if inside.any() else 0.0,
             dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
@@ -173,7 +174,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     found += filter(None, [units(capture, center)])
     received = received_by(capture, center)
     # Not from behind; and where photographs have lights of their own: else some show the side that is not lit.
-    lit = [row for row in rows if row.angle < 60 and row.brightness > 0 and not capture.photographs.dark]
+    lit = [row for row in rows if row.angle is not None and row.angle < 60 and row.brightness > 0]
     typical = np.median([row.brightness for row in lit]) if lit else 1.0
     for row in lit:
         if not typical / 4 < row.brightness < 4 * typical:
@@ -206,8 +207,8 @@ def quality_table(rows: list[PhotographQuality]) -> str:
     def cells(row: PhotographQuality) -> Iterator[str]:
         yield row.name
         yield f"{row.distance:.2f}"
-        yield "distant" if np.isinf(row.light) else f"{row.light:.2f}"
-        yield f"{row.angle:.0f}"
+        yield "-" if row.light is None else "distant" if np.isinf(row.light) else f"{row.light:.2f}"
+        yield "-" if row.angle is None else f"{row.angle:.0f}"
         for share in (row.object, row.clipped, row.dark, row.background):
             yield "-" if share is None else f"{share:.1%}"
         yield f"{row.brightness / typical:.2f}" if typical else "-"

@@ -29,6 +29,7 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
     cameras, lights = np.stack([sensor.camera.to_world for sensor in capture.sensors]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())
+    away = away[lights.rgb().any(1)]
     figure = Figure(figsize=(12, 4), dpi=100)
     canvas, panels = FigureCanvasAgg(figure), figure.subplots(1, 3)
     for panel, (a, b) in zip(panels, ((0, 1), (0, 2), (1, 2))):

@@ -123,6 +123,8 @@ def fit_findings(
     if iteration == iterations >= TELLING and unexplained > UNTRUE:
         found.append(f"{unexplained:.0%} of the object's light is not as predicted: this surface is not to be trusted. "
                      "Cameras, masks or lights are wrong; look at the contact sheet of mi-ring check.")  # fmt: skip
+    if iteration == iterations < TELLING:
+        found.append(f"The fit had {iterations} iterations, too few for a surface that is to be trusted.")
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
 

@@ -119,7 +119,7 @@ class Production:
         upright = np.eye(4)
         upright[:3, :3] = Rotation.align_vectors([self.config.axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
         add_pose(element, upright)
-        with reading(f"{file}: --environment", "a picture of latitude and longitude"):
+        with reading(f"{file}: --environment", "an EXR or HDR file of latitude and longitude"):
             if file.suffix.lower() == ".exr":
                 read_image(file)  # which bounds its memory
             load_element(element)
@@ -192,7 +192,7 @@ def write_capture(config: SynthesizeConfig) -> None:
     """
     out, production = config.out, Production(config)
     claim(out, config)
-    for name in ("truth/images", "images", "masks", *["ambient"] * config.pairs):
+    for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):
         with writing(out):
             (out / name).mkdir(parents=True, exist_ok=True)
     write_file(out / SETTINGS, json.dumps(settings_of(config), indent=1))  # by which the same command goes on
@@ -203,13 +203,15 @@ def write_capture(config: SynthesizeConfig) -> None:
     found = {"full_scale": 1 / exposure, "placed": production.placed.tolist()}
     write_file(out / SETTINGS, json.dumps(settings_of(config) | {"found": found}, indent=1))
     todo = [(view, out, True) for view in seen] + [(view, out / "truth", False) for view in novel]
-    todo = [job for job in todo if not (job[1] / "images" / photograph_name(config, job[0])).is_file()]
-    for view, folder, masked in progress(todo, "photographing", unit="photograph", leave=True):
+    todo = [(view, folder, fitted) for view, folder, fitted in todo
+            if not (folder / "images" / photograph_name(config, view)).is_file()
+            or not (folder / "masks" / f"{view.name}.png").is_file()]  # fmt: skip
+    for view, folder, fitted in progress(todo, "photographing", unit="photograph", leave=True):
         own, ambient = production.radiance(stage, view, view.camera, production.spp)
         pictures = {"images": exposure * (own + ambient)}
-        if masked:
-            coverage = stage.coverage(Shot(view.camera))
-            write_image(to_bytes(coverage[..., None] >= 0.5), out / "masks" / f"{view.name}.png")
+        coverage = stage.coverage(Shot(view.camera))
+        write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{view.name}.png")
+        if fitted:
             if config.pairs:
                 pictures = {"ambient": exposure * ambient} | pictures  # by the last it is known what there is
             for purpose, place in ((5, "images"), (7, "ambient")):
@@ -252,7 +254,7 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
         elements = [
             photograph_element(
                 view.name, f"{images}/{photograph_name(config, view)}", camera,
-                light._replace(rgb=strength * light.rgb), masks and f"{masks}/{view.name}.png",
+                light._replace(rgb=strength * light.rgb), f"{masks}/{view.name}.png",
                 saturation=HIGHEST if config.format == "exr" else None, calibrated=exact, gain=gain,
                 ambient=f"ambient/{photograph_name(config, view)}" if paired else None,
             )
@@ -266,7 +268,7 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
         return scene_bytes(root)
 
     if novel:
-        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/images", "", True))
+        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/images", "truth/masks", True))
     if not config.exact:
         write_file(out / "truth/exact.xml", scene(out / "truth", seen, "images", "masks", True))
     write_file(out / "scene.xml", scene(out, seen, "images", "masks", config.exact))
