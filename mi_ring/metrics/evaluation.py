@@ -35,8 +35,8 @@ def evaluate_fit(
 
     `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
     genus of a surface that is not closed, for instance. Photographs that the fit kept out are no `_input`, but
-    `_held_out`. `align`: move the truth, and the cameras and lights of `novel`,
-    onto the result first, "rigid" or also scaled ("similarity"); by how much is under `aligned_*`.
+    `_held_out`. `align`: move the truth, and the cameras and lights of `novel`, onto the result first, "rigid" or also
+    scaled ("similarity"); by how much is under `aligned_*`.
     """
     ring = load_fit(run)
     capture = load_capture(run / "scene.xml")
@@ -68,6 +68,8 @@ def evaluate_fit(
     out = record["held_out"]["photographs"] if isinstance(record, dict) and "held_out" in record else []
     for kind, kept_out in (("input", False), ("held_out", True)):
         index = [k for k, name in enumerate(capture.names) if (name in out) == kept_out]
+        if not index:  # no surface is drawn for nothing
+            continue
         predicted, photographs = compare_photographs(capture, ring, spp, index)
         numbers |= {f"{key}_{kind}": value for key, value in predicted.items()}
         for k, photograph in zip(index, photographs):

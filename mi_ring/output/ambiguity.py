@@ -7,7 +7,7 @@ from mi_ring.system.files import read_json
 
 def ambiguity(light: str) -> str:
     """Of a light as a fit's `summary` names it; empty where the scene says what it is."""
-    if light.startswith("capture"):
+    if light == "capture":
         return ""
     text = ("The light was unknown: how bright it is, and of which colour, cannot be told from the object's. "
             "The object is taken to reflect half of it, in each colour")  # fmt: skip

@@ -28,11 +28,11 @@ class Panel(NamedTuple):
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     """`refined`: a fit's `summary`, of what has made the one capture the other."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
-    if refined.get("light", "capture") != "capture":
-        rows.insert(0, ("what lights the object, by coarse fits", "", refined["light"], ""))
+    light = refined.get("light", "capture")
+    if light != "capture":
+        rows.insert(0, ("what lights the object, by coarse fits", "", light, ""))
     rows += [row(entry) for entry in of_photographs(refined["photographs"])]
-    untold = ambiguity(refined.get("light", "capture"))
-    return Panel(rows, chart(before, after, refined["photographs"]), untold)
+    return Panel(rows, chart(before, after, refined["photographs"]), ambiguity(light))
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
