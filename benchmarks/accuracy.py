@@ -58,7 +58,7 @@ def processor() -> str:
 def watch() -> dict[str, float]:
     """Seconds by part of all fits of this process, from now on."""
     from mi_ring.fitting.muon import Muon  # here, not in the parent: a process begins with its parent's peak memory
-    from mi_ring.nets import shapenet
+    from mi_ring.nets import shape_net
     from mi_ring.rendering import bridge
 
     # isort: split
@@ -77,7 +77,7 @@ def watch() -> dict[str, float]:
 
         return run
 
-    for part, cls in (("flow", shapenet._Flow), ("rendering", bridge._Render)):
+    for part, cls in (("flow", shape_net._Flow), ("rendering", bridge._Render)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
     bridge.surroundings = timed("rendering", bridge.surroundings)
     for cls in (torch.optim.Adam, Muon):
@@ -131,7 +131,7 @@ def watched_fit(arguments: list[str], truth: Path, points: int) -> dict:
     seconds, parts = watch(), collections.Counter()
     from mi_ring import fit
     from mi_ring.metrics import surfaces
-    from mi_ring.rendering import plain_mesh
+    from mi_ring.scene import plain_mesh
     from mi_ring.system import machine
 
     # isort: split

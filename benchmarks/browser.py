@@ -23,9 +23,9 @@ from playwright.sync_api import sync_playwright
 
 from mi_ring.capture import loading
 from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import Lights
-from mi_ring.ring.saved import load_fit
+from mi_ring.rendering.photograph_lights import Lights
 
 
 def photograph(sensor) -> dict:

@@ -28,7 +28,7 @@ import torch
 from accuracy import processor, product_speed, table
 
 from mi_ring.images import read_image, write_image
-from mi_ring.rendering.rooms import BASIS, COUNT, directions_of, harmonics_in, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, directions_of, harmonics_in, seen_from_within
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"

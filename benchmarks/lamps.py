@@ -24,8 +24,8 @@ import torch
 from accuracy import processor, product_speed, table
 from environments import PLASTIC, run
 
-from mi_ring.rendering.lights import Light
-from mi_ring.rendering.scenes import lamp_lights
+from mi_ring.scene.assembly import lamp_lights
+from mi_ring.scene.lights import Light
 
 LIGHTS = "lamps", "environment", "capture"
 

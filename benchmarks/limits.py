@@ -19,7 +19,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.mlp import SLOPE
-from mi_ring.nets.shapenet import ShapeNet
+from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import pixel_rays
 from mi_ring.system import machine

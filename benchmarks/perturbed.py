@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 import mi_ring
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
-from mi_ring.rendering.lights import Lights
+from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.degradation import miscalibrated
 
 WRONG = "cameras", "light", "power", "curve", "contrast"

@@ -45,8 +45,8 @@ from tqdm import tqdm
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.photogrammetry.scene import windows
-from mi_ring.rendering.lights import Light
+from mi_ring.photogrammetry.capture_files import windows
+from mi_ring.scene.lights import Light
 
 DISTURBANCES = (
     "sheet", "ambient", "offset", "cone", "lens", "principal", "exposure", "jpeg", "noise", "blur", "failures"

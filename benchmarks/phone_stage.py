@@ -22,7 +22,7 @@ import numpy as np
 import trimesh
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
-from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.tracing import (
     Shot,
     Traced,

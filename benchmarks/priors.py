@@ -25,9 +25,9 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import carried, gpytoolbox
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
-from mi_ring.rendering.lights import Light
-from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.synthesis import example
+from mi_ring.scene.lights import Light
+from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.synthesis import example_pot
 from mi_ring.synthesis.stage import Stage
 from mi_ring.synthesis.tracing import Shot
 
@@ -55,7 +55,7 @@ def body(name: str) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
         wave = np.sin(3 * x + 2 * y) + np.sin(4 * z - x)
         share = (wave > 0).astype(float) if name == "material_variation" else 0.5 + 0.25 * wave
     mesh.apply_scale(32)
-    mesh.apply_translation(example.CENTER)
+    mesh.apply_translation(example_pot.CENTER)
     one, other = np.array([0.45, 0.12, 0.06]), np.array([0.1, 0.25, 0.4])
     colour = share[:, None] * one + (1 - share[:, None]) * other
     return mesh, {"diffuse": colour, "specular": 0.02 + 0.1 * share, "roughness": 0.45 - 0.2 * share}
@@ -74,9 +74,9 @@ def write_capture(name: str, folder: Path) -> None:
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     stage, random, elements = Stage(mesh, truth.vertices), np.random.default_rng(0), []
-    for k, camera in enumerate(example.cameras()[::EVERY]):
-        position = camera.position + camera.to_world[:3, :3] @ example.FLASH
-        light = Light("point", position, np.full(3, 2 * example.DISTANCE**2))
+    for k, camera in enumerate(example_pot.cameras()[::EVERY]):
+        position = camera.position + camera.to_world[:3, :3] @ example_pot.FLASH
+        light = Light("point", position, np.full(3, 2 * example_pot.DISTANCE**2))
         picture = stage.radiance(Shot(camera), light, 36, k, 2)
         noisy = picture + random.normal(0, NOISE, picture.shape)
         files = f"images/{k:03}.png", f"masks/{k:03}.png"

@@ -25,9 +25,9 @@ import mitsuba as mi
 import numpy as np
 from accuracy import processor
 
-from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.edge_selection import Edges
+from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_photographs
 
 SIZE, SPP, VIEWS, FOV = 128, 4, 8, 40.0
 INTENSITY = 12.0

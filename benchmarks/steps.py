@@ -19,7 +19,7 @@ CASES = [(1, "euler"), (3, "euler"), (10, "euler"), (20, "euler"), (40, "euler")
 def cost(level: int, steps: int, solver: str) -> tuple[int, float, float]:
     """Vertices, seconds and GiB."""
     from mi_ring.geometry.domain import Sphere
-    from mi_ring.nets.shapenet import ShapeNet
+    from mi_ring.nets.shape_net import ShapeNet
 
     # isort: split
     import torch

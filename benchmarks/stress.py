@@ -35,7 +35,7 @@ import trimesh
 from accuracy import processor
 from PIL import Image
 
-from mi_ring.ring.saved import load_fit, read_state
+from mi_ring.objects.ring_file import load_fit, read_state
 
 ROOT = Path(__file__).parents[1]
 TIMES = re.compile(r"(<tr><th>Fit time</th><td>)[^<]*|\"seconds\": [0-9.e+-]+")  #: what differs from run to run

@@ -16,8 +16,8 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.muon import orthogonalised
 from mi_ring.geometry.domain import Sphere
 from mi_ring.images import blur
-from mi_ring.nets import chunks, mlp, shapenet
-from mi_ring.nets.brdfnet import BRDFNet
+from mi_ring.nets import chunks, mlp, shape_net
+from mi_ring.nets.brdf_net import BRDFNet
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.system import machine
 
@@ -49,7 +49,7 @@ def euler_by_autograd(net):
 
     def flow(x):
         for _ in range(net.steps):
-            x = x + shapenet.SPEED / net.steps * torch.tanh(direction(x).to(x.dtype))
+            x = x + shape_net.SPEED / net.steps * torch.tanh(direction(x).to(x.dtype))
         return x
 
     return flow
@@ -58,7 +58,7 @@ def euler_by_autograd(net):
 def flow_memory(by_hand: bool, level: int, steps: int) -> float:
     """GiB that forward and backward pass of the flow take."""
     machine.set_threads()
-    net, (s, _) = shapenet.ShapeNet(steps), Sphere().sample(level)
+    net, (s, _) = shape_net.ShapeNet(steps), Sphere().sample(level)
     there_and_back(net, s[:100], AUTOCAST)()  # what is needed for the first time only
     before = peak_memory()
     there_and_back(net if by_hand else euler_by_autograd(net), s, AUTOCAST)()
@@ -80,7 +80,7 @@ def with_returned_memory(level: int, steps: int) -> float:
     """Seconds of the flow if freed memory goes back to the system, as is glibc's way."""
     machine.set_threads()
     torch.manual_seed(0)
-    return median_seconds(there_and_back(shapenet.ShapeNet(steps), Sphere().sample(level)[0], AUTOCAST))[0]
+    return median_seconds(there_and_back(shape_net.ShapeNet(steps), Sphere().sample(level)[0], AUTOCAST))[0]
 
 
 def doubled(x):
@@ -114,7 +114,7 @@ def main() -> None:
     machine.keep_memory()
     torch.manual_seed(0)
     s = Sphere().sample(arguments.level)[0]
-    net = shapenet.ShapeNet(arguments.steps)
+    net = shape_net.ShapeNet(arguments.steps)
     rows = []
 
     def compare(idea, as_it_is, tried, note=""):

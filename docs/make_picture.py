@@ -20,7 +20,7 @@ TIMES = {"0": 0.0, "¼": 0.25, "½": 0.5, "¾": 0.75, "1": 1.0}  #: of the flow
 LABEL, SIZE = 30, 18  #: height of the labels above the pictures, and of their letters [px]
 
 
-def opened(run: Path) -> tuple[mi_ring.Capture, mi_ring.Ring, bridge.Surface]:
+def opened(run: Path) -> tuple[mi_ring.Capture, mi_ring.FittedObject, bridge.Surface]:
     """A fit: its photographs, its object, and that in the scene of the photographs."""
     capture, ring = mi_ring.load_capture(run / "scene.xml"), mi_ring.load_fit(run)
     return capture, ring, bridge.Surface(capture.scene, capture.shape, ring)

@@ -33,24 +33,40 @@ if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
     from mi_ring.fitting.iteration import Iteration
     from mi_ring.fitting.terms import Term, default_terms
-    from mi_ring.nets.brdfnet import BRDFNet, ReflectanceMap
+    from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
     from mi_ring.nets.mlp import plain_autograd
     from mi_ring.nets.registry import register_network
-    from mi_ring.nets.shapenet import Flow, ShapeNet
-    from mi_ring.ring.ring import Ring
-    from mi_ring.ring.saved import load_fit
+    from mi_ring.nets.shape_net import Flow, ShapeNet
+    from mi_ring.objects.fitted_object import FittedObject
+    from mi_ring.objects.ring_file import load_fit
 
 #: The Python API: names and the modules that they are read from.
 _API = {
     "InputError": "errors", "Capture": "capture.capture", "load_capture": "capture.loading", "Config": "fitting.config",
     "Fit": "fitting.fit", "Iteration": "fitting.iteration", "Term": "fitting.terms", "default_terms": "fitting.terms",
-    "ShapeNet": "nets.shapenet", "Flow": "nets.shapenet", "BRDFNet": "nets.brdfnet", "ReflectanceMap": "nets.brdfnet",
-    "register_network": "nets.registry", "plain_autograd": "nets.mlp", "Ring": "ring.ring", "load_fit": "ring.saved",
+    "ShapeNet": "nets.shape_net", "Flow": "nets.shape_net", "BRDFNet": "nets.brdf_net", "MaterialNet": "nets.brdf_net",
+    "register_network": "nets.registry", "plain_autograd": "nets.mlp",
+    "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
 }  # fmt: skip
 
 __all__ = [
-    "BRDFNet", "Capture", "Config", "Fit", "Flow", "InputError", "Iteration", "ReflectanceMap", "Ring", "ShapeNet",
-    "Term", "__version__", "default_terms", "load_capture", "load_fit", "plain_autograd", "register_network",
+    "BRDFNet",
+    "Capture",
+    "Config",
+    "Fit",
+    "FittedObject",
+    "Flow",
+    "InputError",
+    "Iteration",
+    "MaterialNet",
+    "ShapeNet",
+    "Term",
+    "__version__",
+    "default_terms",
+    "load_capture",
+    "load_fit",
+    "plain_autograd",
+    "register_network",
 ]  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
-from mi_ring.photogrammetry.board import DOTS, page
+from mi_ring.photogrammetry.marker_sheet import DOTS, page
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
 from mi_ring.metrics.evaluation import evaluate_fit, evaluation_table, rounded
-from mi_ring.metrics.predictions import SPP
+from mi_ring.metrics.image_errors import SPP
 from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file

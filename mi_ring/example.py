@@ -11,7 +11,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
-from mi_ring.synthesis.example import write_example
+from mi_ring.synthesis.example_pot import write_example
 from mi_ring.system import command
 from mi_ring.system.files import writing
 

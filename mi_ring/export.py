@@ -11,15 +11,15 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_views
 from mi_ring.errors import InputError
+from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import gltf
 from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
-from mi_ring.rendering.visibility import View
-from mi_ring.ring.material import MaterialOptions, dress
-from mi_ring.ring.saved import load_fit
+from mi_ring.scene.visibility import View
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 

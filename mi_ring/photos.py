@@ -18,13 +18,13 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
-from mi_ring.photogrammetry.board import SQUARE, align
-from mi_ring.photogrammetry.flash import Flash
+from mi_ring.photogrammetry.capture_files import windows, write_shot, write_table
+from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, models, unlit, ups, without_exposure
-from mi_ring.photogrammetry.motion import Motion
-from mi_ring.photogrammetry.object import Hints, Object, find_object, require_half
-from mi_ring.photogrammetry.scene import windows, write_shot, write_table
-from mi_ring.photogrammetry.table import Plane
+from mi_ring.photogrammetry.marker_sheet import SQUARE, align
+from mi_ring.photogrammetry.object_masks import Hints, Object, find_object, require_half
+from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.photogrammetry.workflow import (
     find_cameras,
     find_sheet,
@@ -34,7 +34,7 @@ from mi_ring.photogrammetry.workflow import (
     shots,
     upright,
 )
-from mi_ring.rendering.rooms import COUNT
+from mi_ring.rendering.spherical_harmonics import COUNT
 from mi_ring.system import command
 from mi_ring.system.files import locked, write_file
 from mi_ring.system.machine import in_threads

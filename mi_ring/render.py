@@ -10,11 +10,11 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
+from mi_ring.objects.material_edits import dress
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.ambiguity import ambiguity_of
+from mi_ring.output.camera_paths import RenderConfig, View, integrator_of, lit_surface, render_views, views_of
 from mi_ring.output.film import write_film, write_picture
-from mi_ring.output.views import RenderConfig, View, integrator_of, lit_surface, render_views, views_of
-from mi_ring.ring.material import dress
-from mi_ring.ring.saved import load_fit
 from mi_ring.system import command
 from mi_ring.system.files import writing
 

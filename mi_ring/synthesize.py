@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from mi_ring.synthesis.capture import write_capture
-from mi_ring.synthesis.config import SynthesizeConfig, require_options
+from mi_ring.synthesis.options import SynthesizeConfig, require_options
+from mi_ring.synthesis.path_traced_capture import write_capture
 from mi_ring.system import command
 from mi_ring.system.files import locked
 

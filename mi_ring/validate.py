@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
 from mi_ring.metrics.path_tracing import BATCHES, open_lit_scene, render_both
-from mi_ring.metrics.statistics import all_as_one, compare_renderers, comparison_table, verdict
+from mi_ring.metrics.renderer_agreement import all_as_one, compare_renderers, comparison_table, verdict
 from mi_ring.output.validation_sheet import strip, validation_sheet
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.system import command

@@ -14,6 +14,7 @@ The pot is a signed distance field, meshed by marching cubes and relaxed on its 
 model with what reconstructs it. Everything is deterministic. Needs mitsuba, numpy, trimesh, Pillow and, for
 `marching_cubes`, scikit-image.
 """
+
 import argparse
 from pathlib import Path
 
@@ -131,9 +132,11 @@ def make_mesh():
 
 def write_ply(mesh, path):
     """Binary PLY: float32 positions and triangles, nothing else."""
-    header = (f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mesh.vertices)}\n"
-              "property float x\nproperty float y\nproperty float z\n"
-              f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n")
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mesh.vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
     faces = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     faces["n"], faces["v"] = 3, mesh.faces
     path.write_bytes(header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes())
@@ -209,28 +212,30 @@ def make_cameras(points, count, seed):
 
 def render(shape, to_world, spp, seed):
     """One photograph under a flash of 1 W/sr: linear radiance (SIZE, SIZE, 3) and coverage (SIZE, SIZE)."""
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 6},
-        "shape": shape,
-        "flash": {"type": "point", "position": to_world[:3, 3].tolist(), "intensity": 1.0},
-        "sensor": {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f(to_world),
-            "fov": float(np.degrees(2 * np.arctan(SIZE / 2 / FOCAL))),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1000.0,
-            "sampler": {"type": "independent", "sample_count": spp},
-            "film": {
-                "type": "hdrfilm",
-                "width": SIZE,
-                "height": SIZE,
-                "pixel_format": "rgba",
-                "rfilter": {"type": "box"},  # every pixel by itself
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 6},
+            "shape": shape,
+            "flash": {"type": "point", "position": to_world[:3, 3].tolist(), "intensity": 1.0},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f(to_world),
+                "fov": float(np.degrees(2 * np.arctan(SIZE / 2 / FOCAL))),
+                "fov_axis": "x",
+                "near_clip": 1.0,
+                "far_clip": 1000.0,
+                "sampler": {"type": "independent", "sample_count": spp},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": SIZE,
+                    "height": SIZE,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},  # every pixel by itself
+                },
             },
-        },
-    })
+        }
+    )
     image = np.array(mi.render(scene, spp=spp, seed=seed))
     return image[..., :3], image[..., 3]
 
@@ -271,8 +276,11 @@ def sensor_xml(name, folder, masked, to_world, intensity):
 def write_scene(path, folder, masked, cameras, intensity):
     """A scene file of our format: one `photograph` per camera."""
     sensors = [sensor_xml(f"{k:03d}", folder, masked, to_world, intensity) for k, to_world in enumerate(cameras)]
-    head = ['<scene version="3.0.0">', '  <integrator type="photometric"/>',
-            '  <shape type="shapenet" id="object"><bsdf type="cooktorrance"/></shape>']
+    head = [
+        '<scene version="3.0.0">',
+        '  <integrator type="photometric"/>',
+        '  <shape type="shapenet" id="object"><bsdf type="cooktorrance"/></shape>',
+    ]
     path.write_text("\n".join([*head, *sensors, "</scene>"]) + "\n")
 
 
@@ -291,18 +299,20 @@ def main():
     color, rough = glaze(mesh.vertices)
     mesh.vertices = (mesh.vertices + CENTER - mesh.bounds.mean(0)).astype(np.float32)
     write_ply(mesh, folder / "truth" / "mesh.ply")
-    shape = mi.load_dict({
-        "type": "ply",
-        "filename": str(folder / "truth" / "mesh.ply"),  # without normals: Mitsuba computes smooth ones
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
-            "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
-            "specular": 0.5,
-            "clearcoat": 0.4,
-            "clearcoat_gloss": 0.0,
-        },
-    })
+    shape = mi.load_dict(
+        {
+            "type": "ply",
+            "filename": str(folder / "truth" / "mesh.ply"),  # without normals: Mitsuba computes smooth ones
+            "bsdf": {
+                "type": "principled",
+                "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
+                "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
+                "specular": 0.5,
+                "clearcoat": 0.4,
+                "clearcoat_gloss": 0.0,
+            },
+        }
+    )
     shape.add_attribute("vertex_color", 3, color.astype(np.float32).ravel())
     shape.add_attribute("vertex_roughness", 1, rough.astype(np.float32).ravel())
 

@@ -89,11 +89,11 @@ def small_capture(tmp_path_factory):
 
     from mi_ring.geometry.camera import Camera
     from mi_ring.images import linear_to_srgb, to_bytes
-    from mi_ring.rendering.lights import Light
-    from mi_ring.rendering.plain_mesh import mesh_of
-    from mi_ring.synthesis.cameras import look_at
+    from mi_ring.scene.lights import Light
+    from mi_ring.scene.plain_mesh import mesh_of
     from mi_ring.synthesis.stage import Stage
     from mi_ring.synthesis.tracing import Shot
+    from mi_ring.synthesis.viewpoints import look_at
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "images").mkdir()

@@ -25,15 +25,15 @@ from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.domain import Sphere
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.nets import registry, solvers
-from mi_ring.nets.brdfnet import BRDFNet
+from mi_ring.nets.brdf_net import BRDFNet
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import plain_autograd
 from mi_ring.nets.resnet import ResNet, shape_net_of
-from mi_ring.nets.shapenet import SPEED, Flow, ShapeNet
-from mi_ring.rendering.crossings import crossing_triangles
-from mi_ring.ring.material import MaterialOptions, dress
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit, ring_of, ring_state
+from mi_ring.nets.shape_net import SPEED, Flow, ShapeNet
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.ring_file import load_fit, ring_of, ring_state
+from mi_ring.scene.self_intersections import crossing_triangles
 
 
 def wild(net, seed=0, size=0.1):
@@ -222,7 +222,7 @@ def test_the_regulariser_of_a_plain_resnet_sees_all_blocks():
         fit = type("Fit", (), {"config": Config(laplacian_scale=0.0), "autocast": torch.no_grad})()
 
     fit = Iteration.fit
-    fit.ring, fit.random = type("Ring", (), {"shape_net": ResNet(3)})(), torch.Generator().manual_seed(0)
+    fit.ring, fit.random = type("FittedObject", (), {"shape_net": ResNet(3)})(), torch.Generator().manual_seed(0)
     for k, block in enumerate(fit.ring.shape_net.blocks):
         torch.nn.init.zeros_(block.output.weight)
         block.output.bias.data[:] = torch.tensor([0.1 * (k + 1), 0, 0])
@@ -234,7 +234,7 @@ def test_the_regulariser_of_a_plain_resnet_sees_all_blocks():
 
 
 def test_a_material_on_the_surface_is_that_of_the_deformed_points():
-    ring = Ring([4.0, -3.0, 2.0], 2.5, networks=(wild(ShapeNet(3)), BRDFNet()), material_at="surface")
+    ring = FittedObject([4.0, -3.0, 2.0], 2.5, networks=(wild(ShapeNet(3)), BRDFNet()), material_at="surface")
     s, _ = Sphere().sample(2)
     with torch.no_grad():
         moved = (ring.surface(s) - ring.center) / ring.radius
@@ -248,10 +248,10 @@ def test_a_material_on_the_surface_is_that_of_the_deformed_points():
 
 
 def test_a_material_on_the_surface_moves_to_another_shape_as_it_was(tmp_path):
-    other = Ring([0.0, 0, 0], 1.0, networks=(wild(ShapeNet(3)), BRDFNet()), material_at="surface")
+    other = FittedObject([0.0, 0, 0], 1.0, networks=(wild(ShapeNet(3)), BRDFNet()), material_at="surface")
     torch.save(ring_state(other), tmp_path / "ring.pt")
     for material_at in ("domain", "surface"):
-        ring = Ring([1.0, 2, 3], 5.0, networks=(wild(ShapeNet(3), 7), BRDFNet()), material_at=material_at)
+        ring = FittedObject([1.0, 2, 3], 5.0, networks=(wild(ShapeNet(3), 7), BRDFNet()), material_at=material_at)
         dress(ring, MaterialOptions(material=tmp_path / "ring.pt"))
         s, _ = Sphere().sample(1)
         with torch.no_grad():
@@ -272,7 +272,7 @@ def test_choices_survive_the_file(choice, tmp_path):
     config = Config(**choice)
     net = wild(shape_net_of(config.shape_net, config.steps, config.solver, config.encoding, config.frequencies))
     brdf_net = BRDFNet(3.0, encoding=config.encoding, frequencies=config.frequencies)
-    ring = Ring([1.0, 2, 3], 4.0, networks=(net, brdf_net), material_at=config.material_at)
+    ring = FittedObject([1.0, 2, 3], 4.0, networks=(net, brdf_net), material_at=config.material_at)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
     again, (s, _) = load_fit(tmp_path / "ring.pt"), Sphere().sample(1)
     assert registry.architecture_of(again.shape_net) == registry.architecture_of(net)
@@ -282,7 +282,7 @@ def test_choices_survive_the_file(choice, tmp_path):
 
 def test_files_of_before_are_the_papers_method():
     """They say nothing of encodings, solvers and where the material is."""
-    ring = Ring([1.0, 2, 3], 4.0, networks=(wild(ShapeNet(3)), BRDFNet(3.0)))
+    ring = FittedObject([1.0, 2, 3], 4.0, networks=(wild(ShapeNet(3)), BRDFNet(3.0)))
     state = ring_state(ring)
     state["shape_net"]["arguments"] = {"steps": 3}
     state["brdf_net"]["arguments"].pop("encoding"), state["brdf_net"]["arguments"].pop("frequencies")
@@ -294,7 +294,7 @@ def test_files_of_before_are_the_papers_method():
 
 
 def test_a_file_with_a_material_elsewhere_is_refused(tmp_path):
-    torch.save(ring_state(Ring([0.0, 0, 0], 1.0)) | {"material_at": "moon"}, tmp_path / "ring.pt")
+    torch.save(ring_state(FittedObject([0.0, 0, 0], 1.0)) | {"material_at": "moon"}, tmp_path / "ring.pt")
     with pytest.raises(InputError, match="material at moon"):
         load_fit(tmp_path / "ring.pt")
 
@@ -403,7 +403,7 @@ class Folded(Flow):
 
 
 def test_triangles_turned_inside_out_are_those_of_negative_jacobians():
-    ring = Ring([5.0, 1, 2], 3.0, networks=(Folded(), BRDFNet()))
+    ring = FittedObject([5.0, 1, 2], 3.0, networks=(Folded(), BRDFNet()))
     s, faces = Sphere().sample(4)
     corners = s[torch.as_tensor(faces)]
     slope = 1 - 2 * torch.sin(4 * corners[..., 2])  # of f, at the corners: with one sign on all of most triangles
@@ -411,8 +411,8 @@ def test_triangles_turned_inside_out_are_those_of_negative_jacobians():
     clear = (slope < -0.2).all(1), (slope > 0.2).all(1)
     assert found[clear[0]].all() and not found[clear[1]].any()
     assert clear[0].sum() > 500 and clear[1].sum() > 500
-    assert inside_out(Ring([0.0, 0, 0], 1.0, networks=(Folded(True), BRDFNet())), s, faces).all()
-    assert not inside_out(Ring([0.0, 0, 0], 1.0), s, faces).any()
+    assert inside_out(FittedObject([0.0, 0, 0], 1.0, networks=(Folded(True), BRDFNet())), s, faces).all()
+    assert not inside_out(FittedObject([0.0, 0, 0], 1.0), s, faces).any()
 
 
 def test_a_wild_resnet_turns_triangles_inside_out_and_a_flow_solved_well_does_not():
@@ -420,7 +420,7 @@ def test_a_wild_resnet_turns_triangles_inside_out_and_a_flow_solved_well_does_no
     s, faces = Sphere().sample(3)
     folded, flow = wild(ResNet(3, frequencies=3), 2, 1.0), wild(ShapeNet(6, "rk4", frequencies=3))
     for net, some in ((folded, True), (flow, False)):
-        found = inside_out(Ring([0.0, 0, 0], 1.0, networks=(net, BRDFNet())), s, faces)
+        found = inside_out(FittedObject([0.0, 0, 0], 1.0, networks=(net, BRDFNet())), s, faces)
         centres = s[torch.as_tensor(faces)].mean(1)[::13]
         with plain_autograd():
             determinant = torch.func.vmap(torch.func.jacrev(lambda x, net=net: net(x[None])[0]))(centres).det()

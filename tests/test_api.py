@@ -35,7 +35,7 @@ class Siren(mi_ring.Flow):
 
 
 @mi_ring.register_network("grey of the tests")
-class Grey(mi_ring.ReflectanceMap):
+class Grey(mi_ring.MaterialNet):
     """The same reflectance everywhere."""
 
     def __init__(self):
@@ -229,7 +229,7 @@ def test_networks_of_other_shapes_are_refused_before_any_work(capture):
 def test_jacobians_of_the_networks():
     """By the documented slow path, against finite differences; the fast path gives the same rows, one at a time."""
     torch.manual_seed(2)
-    ring = mi_ring.Ring([0.3, -1.0, 2.0], 1.7, steps=3).double()
+    ring = mi_ring.FittedObject([0.3, -1.0, 2.0], 1.7, steps=3).double()
     ring.shape_net.output.weight.data.mul_(50)
     s = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
     with mi_ring.plain_autograd():

@@ -5,7 +5,7 @@ import pytest
 
 import mi_ring  # noqa: F401  (registers the plugins)
 from mi_ring.errors import SceneError
-from mi_ring.rendering import attributes
+from mi_ring.scene import mesh_attributes
 
 
 def attribute(name):
@@ -18,19 +18,19 @@ def test_attributes_of_nested_bsdfs_are_found():
         "inner": {"type": "bumpmap", "arbitrary": attribute("vertex_bump"),
                   "bsdf": {"type": "principled", "base_color": attribute("vertex_colour"), "roughness": 0.3}},
     })  # fmt: skip
-    assert attributes.attributes_of(bsdf) == {"vertex_bump", "vertex_colour"}
-    names = {name for name, _ in attributes.textures_of(bsdf)}
+    assert mesh_attributes.attributes_of(bsdf) == {"vertex_bump", "vertex_colour"}
+    names = {name for name, _ in mesh_attributes.textures_of(bsdf)}
     assert {"base_color", "roughness", "nested_texture"} <= names
 
 
 def test_attributes_of_our_own_bsdf():
     bsdf = mi.load_dict({"type": "cooktorrance", "specular": 0.1, "diffuse": attribute("vertex_rho")})
-    assert attributes.attributes_of(bsdf) == {"vertex_rho", "vertex_roughness"}
+    assert mesh_attributes.attributes_of(bsdf) == {"vertex_rho", "vertex_roughness"}
 
 
 def test_names_that_look_like_more_than_a_name():
     bsdf = mi.load_dict({"type": "diffuse", "reflectance": attribute("vertex_a = [name = 3]")})
-    assert attributes.attributes_of(bsdf) == {"vertex_a = [name = 3]"}
+    assert mesh_attributes.attributes_of(bsdf) == {"vertex_a = [name = 3]"}
 
 
 def test_what_a_bsdf_does_not_expose_is_refused():
@@ -44,4 +44,4 @@ def test_what_a_bsdf_does_not_expose_is_refused():
 
     mi.register_bsdf("secretive", Secretive)
     with pytest.raises(SceneError, match="reads mesh attributes, but does not expose which"):
-        attributes.attributes_of(mi.load_dict({"type": "secretive"}))
+        mesh_attributes.attributes_of(mi.load_dict({"type": "secretive"}))

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from mi_ring.fitting.averages import LATEST, Averages
+from mi_ring.fitting.indirect_average import LATEST, Averages
 from mi_ring.rendering.bridge import Surroundings
 
 RANDOM = np.random.default_rng(3)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring import board as command
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
-from mi_ring.photogrammetry.board import DOTS, Board, Sighting, align, calibrate, page, white
+from mi_ring.importers.camera_models import Lens
+from mi_ring.photogrammetry.marker_sheet import DOTS, Board, Sighting, align, calibrate, page, white
 
 MIDDLE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 300.0, 210.0, -0.06))
 ASIDE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 313.0, 201.0, -0.06))

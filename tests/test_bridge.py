@@ -12,10 +12,11 @@ import pytest
 import torch
 import trimesh
 
-from mi_ring.rendering import bridge, photographs, scenes
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.rendering import bridge, photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.rooms import BASIS
-from mi_ring.ring.ring import Ring
+from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.scene import assembly
 from mi_ring.system import machine
 
 WIDTH, HEIGHT, COUNT = 35, 25, 2  # [px], photographs
@@ -319,7 +320,7 @@ def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
     setting = Setting(OFF_CAMERA, shadows=True, wall=True)
     shape = setting.surface.shape
     before, bsdf = np.array(shape.vertex_positions_buffer()), shape.bsdf()
-    ring = Ring([0.3, -0.2, 0.15], 0.8, scale=0.2)
+    ring = FittedObject([0.3, -0.2, 0.15], 0.8, scale=0.2)
     surface = bridge.Surface(setting.scene, shape, ring)
     surface.show(ring, *ring.domain.sample(2))
     assert np.array_equal(np.array(shape.vertex_positions_buffer()), before) and shape.bsdf() is bsdf
@@ -336,8 +337,8 @@ def test_distant_emitters_of_a_surface_are_beyond_all_of_it(light):
     emitter = mi.load_dict({"type": light} | ({"direction": [0.48, 0.6, -0.64]} if light == "directional" else {}))
     shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     center, radius = np.array([400.0, -150.0, 90.0]), 700.0  # the origin is within
-    ring = Ring(center, radius)
-    surface = bridge.Surface(scenes.assembled([shape], [emitter]), shape, ring)
+    ring = FittedObject(center, radius)
+    surface = bridge.Surface(assembly.assembled([shape], [emitter]), shape, ring)
     surface.show(ring, *ring.domain.sample(2))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p = mi.Point3f(0.5 / surface.unit)

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import erf
 
 from mi_ring.plugins.cooktorrance import CookTorrance, cosine_shares
-from mi_ring.rendering.attributes import require_attributes
+from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.system import machine
 
 CONTEXT = mi.BSDFContext()

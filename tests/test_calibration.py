@@ -20,14 +20,14 @@ from mi_ring import InputError, fit
 from mi_ring.capture.decoding import decode, recorded
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import recalibrated_xml
-from mi_ring.fitting import holdout
+from mi_ring.fitting import validation
 from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.calibration_panel import held_out_text
 from mi_ring.rendering import bridge
-from mi_ring.rendering.rooms import BASIS
+from mi_ring.rendering.spherical_harmonics import BASIS
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
 FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes
@@ -585,15 +585,15 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
     def unexplained(fit, capture):
         return 0.5 if capture is fit.capture else shares[state()]
 
-    monkeypatch.setattr(holdout, "unexplained", unexplained)
-    assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": ["curve"]}
+    monkeypatch.setattr(validation, "unexplained", unexplained)
+    assert validation.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": ["curve"]}
     assert state() == (1.0, 0.0)
     # Nothing is where they show nothing of the object, and that is said in words.
-    monkeypatch.setattr(holdout, "unexplained", lambda fit, capture: float("nan"))
-    assert "nothing that is surely the object" in held_out_text(holdout.confirm(running))
-    monkeypatch.setattr(holdout, "unexplained", unexplained)
+    monkeypatch.setattr(validation, "unexplained", lambda fit, capture: float("nan"))
+    assert "nothing that is surely the object" in held_out_text(validation.confirm(running))
+    monkeypatch.setattr(validation, "unexplained", unexplained)
     # What was not found is not put back.
-    assert holdout.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": []}
+    assert validation.confirm(running) == {"unexplained": 0.2, "before": 0.5, "put_back": []}
 
 
 def test_a_fit_says_what_photographs_that_are_kept_out_say(small_capture, tmp_path):

@@ -19,8 +19,8 @@ from mi_ring.fitting.checkpoint import digests
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.importers.reading import pixels_of
+from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.rendering import bridge
-from mi_ring.ring.saved import load_fit, ring_state
 from mi_ring.system.files import write_state
 
 

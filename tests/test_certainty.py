@@ -7,10 +7,10 @@ import pytest
 import torch
 
 import mi_ring
-from mi_ring.fitting.certainty import BLOCK, Entries, Equations, deviations
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.covariance import BLOCK, Entries, Equations, deviations
 from mi_ring.fitting.fit import Fit
-from mi_ring.metrics.captures import moved_far
+from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.output.calibration_panel import panel
 
 

@@ -10,7 +10,7 @@ from test_hull import ball, silhouettes
 
 from mi_ring import check
 from mi_ring.geometry import hull
-from mi_ring.metrics import captures, mask_agreement
+from mi_ring.metrics import capture_findings, mask_agreement
 from mi_ring.system import command
 
 
@@ -203,9 +203,9 @@ def test_light_of_the_room_is_told_from_the_falloff():
     received = 1 / random.uniform(0.8, 1.4, 24) ** 2
     albedo = random.normal(0.5, 0.01, 24)
     for room in (0.0, 0.15):
-        share = captures.room_light(albedo * (received + room) / received, received)
+        share = capture_findings.room_light(albedo * (received + room) / received, received)
         assert share == pytest.approx(room / (np.median(received) + room), abs=0.05)
-    assert captures.room_light(albedo * 1.15, np.ones(24)) == 0  # all from one distance
+    assert capture_findings.room_light(albedo * 1.15, np.ones(24)) == 0  # all from one distance
 
 
 def test_without_masks(broken_capture, tmp_path, capsys):

@@ -22,10 +22,10 @@ import trimesh
 
 from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.plugins import cooktorrance, flash, merl, photograph, photometric, room, shapenet, table
-from mi_ring.rendering.measured import LAYERS
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.rendering.measured_brdf import LAYERS
 
 ROOT = Path(__file__).parents[1]
 
@@ -131,7 +131,7 @@ def save_networks(path: Path, material: str) -> None:
 def values(tmp_path):
     """Of each plugin a value for each parameter, none of them the default; what must not be together is apart."""
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
-    ring = Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)
+    ring = FittedObject(torch.tensor([1.0, -2.0, 3.0]), 1.5)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
     networks = tmp_path / "networks.npz"
     save_networks(networks, "one")
@@ -230,7 +230,7 @@ def test_flags_are_those_of_traverse(name, values):
 
 @pytest.mark.parametrize("name", plugins())
 def test_snippets_load_and_say_the_same(name, tmp_path):
-    torch.save(ring_state(Ring(torch.tensor([1.0, -2.0, 3.0]), 1.5)), tmp_path / "ring.pt")
+    torch.save(ring_state(FittedObject(torch.tensor([1.0, -2.0, 3.0]), 1.5)), tmp_path / "ring.pt")
     save_networks(tmp_path / "networks.npz", "gold-paint")
     blocks = {}
     for kind, block in re.findall(r"\.\. code-block:: (\w+)\n\n((?: {8}.*\n?|\n)+)", inspect.getdoc(plugins()[name])):

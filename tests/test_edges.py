@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_ring.rendering.boundaries import cast
-from mi_ring.rendering.curves import outline_of
-from mi_ring.rendering.edges import BORDER, CREASE, SMOOTH, Edges, paired
+from mi_ring.rendering.edge_curves import outline_of
+from mi_ring.rendering.edge_gradients import cast
+from mi_ring.rendering.edge_selection import BORDER, CREASE, SMOOTH, Edges, paired
 
 mi.set_log_level(mi.LogLevel.Error)
 

@@ -14,13 +14,15 @@ from trimesh.creation import box, icosphere, torus
 from mi_ring import evaluate, render
 from mi_ring.capture import calibrated, loading, scenefile
 from mi_ring.geometry.meshes import genus
-from mi_ring.metrics import predictions, surfaces
+from mi_ring.metrics import image_errors, surfaces
 from mi_ring.metrics.evaluation import evaluate_fit
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import ply
-from mi_ring.rendering import crossings, plain_mesh
-from mi_ring.rendering.lights import Light, Lights
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.scene import plain_mesh
+from mi_ring.scene import self_intersections as intersections
+from mi_ring.scene.lights import Light
 from mi_ring.system.command import run
 
 
@@ -125,7 +127,7 @@ def test_photographs_move_with_the_truth(small_capture):
 
 
 def self_intersections(mesh):
-    return int(crossings.crossing_triangles(mesh.vertices, mesh.faces).sum())
+    return int(intersections.crossing_triangles(mesh.vertices, mesh.faces).sum())
 
 
 def crossing_triangles(mesh):
@@ -221,9 +223,9 @@ def test_ssim_is_that_of_the_paper():
             mx, my = (weights * x).sum(), (weights * y).sum()
             vx, vy, vxy = ((weights * p).sum() for p in ((x - mx) ** 2, (y - my) ** 2, (x - mx) * (y - my)))
             values.append((2 * mx * my + 1e-4) * (2 * vxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
-    assert predictions.ssim(a, b)["ssim"] == pytest.approx(np.mean(values), abs=1e-9)
-    assert predictions.ssim(a, a)["ssim"] == pytest.approx(1)
-    assert predictions.ssim(a[:10], b[:10]) == {}  # it does not fit in
+    assert image_errors.ssim(a, b)["ssim"] == pytest.approx(np.mean(values), abs=1e-9)
+    assert image_errors.ssim(a, a)["ssim"] == pytest.approx(1)
+    assert image_errors.ssim(a[:10], b[:10]) == {}  # it does not fit in
 
 
 def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_capture):
@@ -236,13 +238,13 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
         mi.Bitmap(picture).write(str(path.parent / f"images/{k:03}.png"))
     scene = loading.load_capture(path)
     assert scene.lit_room
-    ring = Ring(CENTER, 25.0, scale=0.5)
-    numbers, views = predictions.compare_photographs(scene, ring, 4)
-    surface = predictions.bridge.Surface(scene.scene, scene.shape, ring)
+    ring = FittedObject(CENTER, 25.0, scale=0.5)
+    numbers, views = image_errors.compare_photographs(scene, ring, 4)
+    surface = image_errors.bridge.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     for k in range(12):
-        rgb, _ = predictions.bridge.draw(surface, scene.photograph(k), spp=4)
+        rgb, _ = image_errors.bridge.draw(surface, scene.photograph(k), spp=4)
         guess = np.clip(rgb[0].numpy(), 0, 1)
         guess = np.where(guess <= 0.0031308, 12.92 * guess, 1.055 * guess ** (1 / 2.4) - 0.055)
         inside = scene.masks[k] == 255
@@ -259,7 +261,7 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
 def sphere_run(small_capture, tmp_path_factory):
     """The results folder of a fit that has not begun."""
     folder = tmp_path_factory.mktemp("run")
-    ring = Ring(CENTER, 25.0, scale=0.5)
+    ring = FittedObject(CENTER, 25.0, scale=0.5)
     torch.save(ring_state(ring), folder / "ring.pt")
     ply.write_mesh(ring, 3, folder / "mesh.ply")
     scene = scenefile.fitted_scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')

@@ -20,20 +20,20 @@ from test_bsdf import directions, twin
 from mi_ring import export
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain
-from mi_ring.nets.brdfnet import Parameter
+from mi_ring.nets.brdf_net import Parameter
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import atlas, gltf, mitsuba_scene, results
-from mi_ring.rendering.lights import Lights
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.rendering.photograph_lights import Lights
 
 CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
 RESOLUTION = 256
 
 
-def wild(domain=None, bsdf='<bsdf type="cooktorrance"/>', subdivisions=4, **properties) -> Ring:
+def wild(domain=None, bsdf='<bsdf type="cooktorrance"/>', subdivisions=4, **properties) -> FittedObject:
     """A ring whose surface is no sphere and whose material is not the same everywhere."""
     torch.manual_seed(7)
-    ring = Ring(CENTER, RADIUS, 0.1, domain, bsdf=bsdf, steps=4, subdivisions=subdivisions, **properties)
+    ring = FittedObject(CENTER, RADIUS, 0.1, domain, bsdf=bsdf, steps=4, subdivisions=subdivisions, **properties)
     with torch.no_grad():
         ring.shape_net.output.weight *= 8
         ring.brdf_net.output.weight *= 60

@@ -29,20 +29,20 @@ from mi_ring.capture import capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting import checkpoint, optimizers, session, start, terms
-from mi_ring.fitting.caution import Caution
 from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
+from mi_ring.fitting.nan_guard import Caution
 from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.fitting.restraint import Restraint
 from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit
 from mi_ring.system import files, machine
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
@@ -96,7 +96,7 @@ def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
 
 
 def test_muon_has_the_hidden_weights_and_adam_all_the_others():
-    ring = Ring([0, 0, 0], 1.0)
+    ring = FittedObject([0, 0, 0], 1.0)
     adam, muon = optimizers.optimizers_of(ring, Config(), torch.device("cpu"))
     assert isinstance(adam, torch.optim.Adam) and isinstance(muon, Muon)
     ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mi_ring.photogrammetry.board import White
-from mi_ring.photogrammetry.flash import PAPER, Ball, find_flash
+from mi_ring.photogrammetry.flash_light import PAPER, Ball, find_flash
+from mi_ring.photogrammetry.marker_sheet import White
 
 OFFSET, CONE, POWER = np.array([-20.0, -15.0, 1.0]), 2.0, np.array([1.1e5, 1e5, 0.8e5])
 ROOM = np.array([0.03, 0.025, 0.02]) / 350**2

@@ -21,13 +21,13 @@ from test_photogrammetry import AXES, CENTER, hit_ellipsoid, in_a_dim_room, pose
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
-from mi_ring.photogrammetry.flash import Flash
+from mi_ring.importers.camera_models import Lens
+from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, models, turned_with, unlit, ups
 from mi_ring.photogrammetry.matching import alike
-from mi_ring.photogrammetry.motion import Motion, structure_from_motion
-from mi_ring.photogrammetry.object import Object
-from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.object_masks import Object
+from mi_ring.photogrammetry.reduced_photographs import camera_of
+from mi_ring.photogrammetry.structure_from_motion import Motion, structure_from_motion
 from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs, shots
 from mi_ring.system.progress import progress
 

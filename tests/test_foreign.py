@@ -22,17 +22,17 @@ from mi_ring.fitting.config import Config
 from mi_ring.foreign import EXPANSION, ROOM, load_npy, load_npz, reading, require_room, require_survival
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import Bounded, write_image
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_exposure, exposure_of
 from mi_ring.importers.reading import has_alpha, image_size, load_mat, pixels_of
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.captures import told_before
+from mi_ring.metrics.capture_findings import told_before
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import default_folder, read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured import Network
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.rendering.measured_brdf import Network
 from mi_ring.system.files import write_state
 
 HUGE = 60_000  #: sides of a picture of 10 GB [px]
@@ -246,7 +246,7 @@ def test_each_of_520_changed_bits_is_noticed(tmp_path):
     """Of ring.pt and checkpoint.pt, from the first byte to the last."""
     torch.manual_seed(0)
     ring, config = tmp_path / "ring.pt", Config()
-    write_state(ring_state(Ring([1.0, 2.0, 3.0], 2.5, steps=2)), ring)
+    write_state(ring_state(FittedObject([1.0, 2.0, 3.0], 2.5, steps=2)), ring)
     checkpoint = tmp_path / "checkpoint.pt"
     write_state(
         {"format": FORMAT, "settings": config.settings(), "files": {}, "fit": {"x": torch.ones(99)}}, checkpoint

@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.edge_selection import Edges
+from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_photographs
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from gradients import COVERAGE, HEIGHT, RADIANCE, STEPS, WIDTH, Picture, allowed, compare

@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mi_ring.rendering import bridge, indirect
+from mi_ring.rendering import bridge, indirect_light
+from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_photographs
 from mi_ring.system import machine
 
 WIDTH, HEIGHT = 70, 49  # [px]
@@ -95,7 +95,7 @@ def series(bounces):
 @pytest.mark.parametrize("bounces", [1, 2, 4])
 def test_a_spherical_cup_is_evenly_lit_by_a_geometric_series(bounces, diffuse_cup):
     scene, photographs = diffuse_cup
-    picture = pictures(indirect.render_indirect(scene, photographs, spp=512, seed=bounces, bounces=bounces))
+    picture = pictures(indirect_light.render_indirect(scene, photographs, spp=512, seed=bounces, bounces=bounces))
     inside = picture[..., 3] == 1
     assert 0.3 < inside.mean() < 0.9
     for k, expected in enumerate(series(bounces)):
@@ -107,7 +107,7 @@ def test_a_spherical_cup_is_evenly_lit_by_a_geometric_series(bounces, diffuse_cu
 
 def test_coverage_is_that_of_the_picture_and_the_background_is_black(diffuse_cup):
     scene, photographs = diffuse_cup
-    picture = pictures(indirect.render_indirect(scene, photographs, spp=9, seed=3))
+    picture = pictures(indirect_light.render_indirect(scene, photographs, spp=9, seed=3))
     direct = pictures(render_photographs(scene, photographs, spp=9, seed=3))
     np.testing.assert_array_equal(picture[..., 3], direct[..., 3])
     assert (picture[picture[..., 3] == 0] == 0).all() and (picture[..., 3] == 0).any()
@@ -138,7 +138,9 @@ def test_it_is_what_path_finds_beyond_direct_light(light):
         return np.stack([np.array(mi.render(scene, sensor=k, integrator=integrator, spp=64, seed=seed + k))[..., :3]
                          for k in range(2)])  # fmt: skip
 
-    ours = np.stack([regions(pictures(indirect.render_indirect(scene, photographs, 64, seed))) for seed in range(8)])
+    ours = np.stack(
+        [regions(pictures(indirect_light.render_indirect(scene, photographs, 64, seed))) for seed in range(8)]
+    )
     theirs = np.stack([regions(path(5, 100 + 10 * n) - path(2, 500 + 10 * n)) for n in range(8)])
     error = np.sqrt((ours.var(0, ddof=1) + theirs.var(0, ddof=1)) / 8)
     assert (np.abs(ours.mean(0) - theirs.mean(0)) < 5 * error).all(), (ours.mean(0) - theirs.mean(0)) / error
@@ -149,7 +151,7 @@ def test_a_convex_object_has_none():
     lights = [{"type": "point", "position": [1.0, 2.0, 3.0], "intensity": 4.0}] * 2
     ball = {"type": "shapenet", "subdivisions": 3, "center": CENTER.tolist(), "bsdf": material(ALBEDO, 0.1)}
     scene = load(lights, ball=ball)
-    picture = pictures(indirect.render_indirect(scene, Photographs.of(scene.sensors()), spp=64, seed=1))
+    picture = pictures(indirect_light.render_indirect(scene, Photographs.of(scene.sensors()), spp=64, seed=1))
     assert (picture[..., :3] == 0).all() and picture[..., 3].max() == 1
 
 
@@ -163,13 +165,13 @@ def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cu
     surface = SimpleNamespace(scene=scene, table=None, unit=1.0)
     added = bridge.surroundings(surface, photographs, coverage, 5, width, 1024).interreflection
     assert added.shape == (2, HEIGHT, WIDTH, 3)
-    for k, expected in zip((0, 1), series(indirect.BOUNCES)[::-1]):
+    for k, expected in zip((0, 1), series(indirect_light.BOUNCES)[::-1]):
         even, found = expected * drawn[k, ..., 3:], added[k].detach().cpu().numpy()
         assert np.abs(found - even).max() < 0.12 * expected.max()
         assert np.abs((found - even).sum((0, 1)) / even.sum((0, 1))).max() < 0.01
     added[0, :, :, 1].sum().backward()
     seen = coverage[0] == 1
-    np.testing.assert_allclose(coverage.grad[0][seen].mean().item(), series(indirect.BOUNCES)[1, 1], rtol=0.01)
+    np.testing.assert_allclose(coverage.grad[0][seen].mean().item(), series(indirect_light.BOUNCES)[1, 1], rtol=0.01)
 
 
 def test_it_can_be_rendered_between_a_picture_and_its_gradient(diffuse_cup):
@@ -185,7 +187,7 @@ def test_it_can_be_rendered_between_a_picture_and_its_gradient(diffuse_cup):
         channels = render_photographs(scene, photographs, 4, 7)
         dr.eval(channels)
         if disturb:
-            extra = indirect.render_indirect(scene, photographs, 4, 8)
+            extra = indirect_light.render_indirect(scene, photographs, 4, 8)
             dr.eval(extra)
             assert not any(dr.grad_enabled(c) for c in extra)
         dr.backward(channels[0] * dr.linspace(mi.Float, 0, 1, dr.width(channels[0])))

@@ -4,8 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_ring.rendering.image_formation import render_maps, render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_maps, render_photographs
 
 WIDTH, HEIGHT = 35, 25  # [px]
 CENTER, RADIUS = np.array([0.3, -0.2, 0.4]), 0.8

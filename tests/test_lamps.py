@@ -14,12 +14,12 @@ from test_bridge import OFF_CAMERA, Setting, tensor
 
 import mi_ring
 from mi_ring.fitting.calibration import Calibration, refined_of
-from mi_ring.fitting.certainty import deviations
+from mi_ring.fitting.covariance import deviations
+from mi_ring.fitting.light_selection import Trials, brightest
 from mi_ring.fitting.lighting import Lighting, lit, moved
-from mi_ring.fitting.trials import Trials, brightest
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import Light, emitter_of, light_of, place_lamp, place_of
-from mi_ring.rendering.scenes import lamp_lights, lamps_of, with_lamps
+from mi_ring.scene.assembly import lamp_lights, lamps_of, with_lamps
+from mi_ring.scene.lights import Light, emitter_of, light_of, place_lamp, place_of
 
 LAMPS = [
     Light("point", np.array([-1.9, 2.4, 1.8]), np.array([9.0, 12.0, 7.0])),

@@ -16,17 +16,17 @@ import mi_ring
 from mi_ring import export
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
-from mi_ring.fitting import priors, trials
+from mi_ring.fitting import light_selection, priors
 from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
-from mi_ring.metrics.captures import measure, quality_table
+from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import bridge
-from mi_ring.rendering.elements import load_element
-from mi_ring.rendering.lights import Lights
-from mi_ring.rendering.rooms import BASIS, frames_of, harmonics_in, seen_from_within
-from mi_ring.rendering.shading import is_room, shared_emitters
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, harmonics_in, seen_from_within
+from mi_ring.scene.lights import is_room, shared_emitters
+from mi_ring.scene.xml_elements import load_element
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
@@ -46,7 +46,7 @@ def lobe(path):
 
 @pytest.fixture(autouse=True)
 def short_trials(monkeypatch):
-    monkeypatch.setattr(trials, "COARSE", trials.COARSE | {"iterations": 18, "batch": 4})
+    monkeypatch.setattr(light_selection, "COARSE", light_selection.COARSE | {"iterations": 18, "batch": 4})
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
 
 
 def test_coarse_fits_find_that_it_is_an_environment(in_an_environment, monkeypatch):
-    monkeypatch.setattr(trials, "MOST", 1)
+    monkeypatch.setattr(light_selection, "MOST", 1)
     capture = mi_ring.load_capture(in_an_environment)
     assert mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, light="auto")).lighting.kind == "environment"
 
@@ -325,7 +325,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
 
     config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
     center, _ = capture.sphere()
-    found = trials.lighting_of(capture, config, Trial)
+    found = light_selection.lighting_of(capture, config, Trial)
     assert str(found) == believed and found.plain == plain and found.lamps == ended[believed].lamps
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
 
@@ -443,9 +443,9 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture):
     config, capture = mi_ring.Config.preset("fast", light="environment"), mi_ring.load_capture(small_capture)
     if ends:
         with pytest.raises(InputError, match="small.xml: a coarse fit .* has no finite error"):
-            trials.lighting_of(capture, config, Trial)
+            light_selection.lighting_of(capture, config, Trial)
     else:
-        assert trials.lighting_of(capture, config, Trial).plain > 0
+        assert light_selection.lighting_of(capture, config, Trial).plain > 0
 
 
 def test_only_light_that_was_unknown_is_said_to_be(tmp_path):

@@ -12,7 +12,7 @@ import trimesh
 from mi_ring import images
 from mi_ring.fitting import priors, terms
 from mi_ring.fitting.config import Config
-from mi_ring.nets.brdfnet import BRDFNet, Parameter
+from mi_ring.nets.brdf_net import BRDFNet, Parameter
 
 
 def pixels(*values):

@@ -1,4 +1,4 @@
-"""`mi_ring.ring.material`: one run's BRDF on another's shape, and edits of it, against networks evaluated by hand."""
+"""`mi_ring.objects.material_edits`: one run's BRDF on another's shape, edited, against networks evaluated by hand."""
 
 import math
 
@@ -11,11 +11,11 @@ import trimesh
 from mi_ring import export, render
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
-from mi_ring.nets.brdfnet import Parameter
-from mi_ring.nets.shapenet import ShapeNet
-from mi_ring.ring.material import MaterialOptions, dress
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.nets.brdf_net import Parameter
+from mi_ring.nets.shape_net import ShapeNet
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.ring_file import ring_state
 
 PRINCIPLED = """<bsdf type="principled">
   <texture name="base_color" type="mesh_attribute"><string name="name" value="vertex_base_color"/></texture>
@@ -31,7 +31,7 @@ METAL = """<bsdf type="roughconductor">
 def wild(seed, **properties):
     """A ring whose shape and material are uneven."""
     torch.manual_seed(seed)
-    ring = Ring(**{"center": [40.0, -15.0, 9.0], "radius": 3.0, "steps": 6, "subdivisions": 3} | properties)
+    ring = FittedObject(**{"center": [40.0, -15.0, 9.0], "radius": 3.0, "steps": 6, "subdivisions": 3} | properties)
     ring.shape_net.output.weight.data.normal_(0, 0.03)
     for parameter in ring.brdf_net.parameters():
         parameter.data.mul_(3)

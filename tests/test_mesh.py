@@ -11,8 +11,8 @@ import trimesh
 import mi_ring
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.system.files import write_state
 
 CENTER, RADIUS = [40.0, -15.0, 9.0], 12.5
@@ -39,7 +39,7 @@ def rows(points, digits=5):
 def ring_file(path, domain=None, center=CENTER, radius=RADIUS):
     """A saved fit whose output layers are perturbed, so that neither shape nor material is trivial."""
     torch.manual_seed(11)
-    ring = Ring(center, radius, scale=2.5, domain=domain)
+    ring = FittedObject(center, radius, scale=2.5, domain=domain)
     with torch.no_grad():
         ring.shape_net.output.weight.normal_(std=0.02)
         ring.shape_net.output.bias.normal_(std=0.05)
@@ -290,7 +290,7 @@ def test_files_of_versions_that_are_not_read_are_named(tmp_path):
 
 def test_no_bit_of_a_saved_fit_may_change(tmp_path):
     """Those of the zip file's own records, which it does not check itself, included; without a seal it checks some."""
-    ring = Ring([0.0, 0.0, 0.0], 1.0)
+    ring = FittedObject([0.0, 0.0, 0.0], 1.0)
     path = tmp_path / "ring.pt"
     write_state(ring_state(ring), path)
     whole, random = path.read_bytes(), np.random.default_rng(3)
@@ -336,7 +336,9 @@ def changed(*path, to):
 ])  # fmt: skip
 def test_what_no_fit_has_is_refused(change, tmp_path):
     domain = Domain(BALL.vertices, BALL.faces)
-    state = ring_state(Ring([0.0, 0.0, 0.0], 1.0, domain=domain, ground=torch.tensor([[0.0, 0, -1], [0, 0, 1]])))
+    state = ring_state(
+        FittedObject([0.0, 0.0, 0.0], 1.0, domain=domain, ground=torch.tensor([[0.0, 0, -1], [0, 0, 1]]))
+    )
     path = tmp_path / "ring.pt"
     write_state(state, path)
     load_fit(path)

@@ -10,11 +10,11 @@ from torch.nn import functional as F
 
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets import chunks, mlp
-from mi_ring.nets.brdfnet import BRDFNet, Parameter
+from mi_ring.nets.brdf_net import BRDFNet, Parameter
 from mi_ring.nets.encoding import PosEnc
-from mi_ring.nets.shapenet import SPEED, ShapeNet
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit, ring_state
+from mi_ring.nets.shape_net import SPEED, ShapeNet
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit, ring_state
 
 
 def neurons(net):
@@ -177,7 +177,7 @@ def test_a_way_back_that_would_be_wrong_is_an_error(evaluate):
 @pytest.mark.parametrize("seed", range(5))
 def test_start_surface_is_the_domain(seed):
     torch.manual_seed(seed)
-    ring = Ring(center=[10.0, -4.0, 7.0], radius=50.0)
+    ring = FittedObject(center=[10.0, -4.0, 7.0], radius=50.0)
     s, _ = Sphere().sample(3)
     with torch.no_grad():
         moved = (ring.surface(s) - (torch.tensor([10.0, -4.0, 7.0]) + 50.0 * s)).norm(dim=1)
@@ -189,8 +189,8 @@ def test_nothing_is_below_the_ground():
     up = torch.tensor([2.0, -1.0, 2.0]) / 3
     place = torch.tensor([9.0, 4.0, -1.0])
     torch.manual_seed(3)
-    ring = Ring([10.0, -4.0, 7.0], 50.0, ground=torch.stack([place, up]))
-    free = Ring(ring.center, 50.0, networks=(ring.shape_net, ring.brdf_net))
+    ring = FittedObject([10.0, -4.0, 7.0], 50.0, ground=torch.stack([place, up]))
+    free = FittedObject(ring.center, 50.0, networks=(ring.shape_net, ring.brdf_net))
     s, _ = Sphere().sample(3)
     with torch.no_grad():
         before, after = free.surface(s), ring.surface(s)
@@ -259,7 +259,7 @@ def test_icosphere_has_the_documented_size_and_rotates(level):
 
 
 def test_state_survives_the_file(tmp_path):
-    ring = Ring(center=[1.0, 2.0, 3.0], radius=4.0, scale=5.0, steps=7)
+    ring = FittedObject(center=[1.0, 2.0, 3.0], radius=4.0, scale=5.0, steps=7)
     torch.nn.init.normal_(ring.shape_net.output.weight)  # else no step would lead anywhere
     torch.save(ring_state(ring, {"seed": 3}), tmp_path / "ring.pt")
     again = load_fit(tmp_path / "ring.pt")

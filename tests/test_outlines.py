@@ -9,8 +9,8 @@ import torch
 
 import mi_ring
 from mi_ring import Config, Fit, InputError
-from mi_ring.capture.outlines import grabcut, overlap
-from mi_ring.fitting import outlines
+from mi_ring.capture.grabcut import grabcut, overlap
+from mi_ring.fitting import mask_refinement
 
 WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
 BRIEF = {"iterations": 60, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3}
@@ -93,7 +93,7 @@ def test_outlines_of_reduced_pictures_stay_where_they_are(small_capture):
     sensor = capture.sensors[0]
     outline = torch.zeros(40 // 3, 56 // 3, dtype=torch.uint8)
     outline[4:, 10:] = 1  # from row 12 and column 30 on
-    mask = outlines.with_outlines(capture, {0: outline}).masks[0]
+    mask = mask_refinement.with_outlines(capture, {0: outline}).masks[0]
     assert mask.shape == sensor.size[::-1]
     expected = np.zeros((40, 56), bool)
     expected[12:, 30:] = True
@@ -106,7 +106,7 @@ def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks,
     capture = mi_ring.load_capture(scene)
     fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
     monkeypatch.setattr(
-        outlines, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
+        mask_refinement, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
     )
     fit.iteration = 30
     fit.step()

@@ -200,7 +200,7 @@ def test_example_and_fit_without_a_checkout(program):
 
 def test_the_example_is_as_its_scene_file_says(tmp_path, monkeypatch):
     from mi_ring import example
-    from mi_ring.synthesis import example as making
+    from mi_ring.synthesis import example_pot as making
 
     monkeypatch.setattr(making, "VIEWS", 3)
     monkeypatch.setattr(example, "write_example", lambda folder: making.write_example(folder, spp=4))

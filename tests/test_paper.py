@@ -38,17 +38,17 @@ from mi_ring.experiments.experiment import (
     Run,
     require_distinct,
 )
-from mi_ring.experiments.figures import bars, curves
+from mi_ring.experiments.plots import bars, curves
 from mi_ring.fit import parse_options
 from mi_ring.fitting.config import Config
 from mi_ring.metrics import evaluation, surfaces
 from mi_ring.metrics.surfaces import hits, load_true_mesh
-from mi_ring.rendering.lights import Lights
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
-from mi_ring.synthesis.capture import settings_of
-from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
+from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.synthesis.options import SynthesizeConfig
+from mi_ring.synthesis.path_traced_capture import settings_of
 from mi_ring.synthesis.stage import shape_of
 from mi_ring.system import machine
 
@@ -449,7 +449,7 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
     part = recipes.Part("part", recipes.given(known_capture), 3)
     scene = part.made(tmp_path / "captures")
     radius, more, ball = 16.0, 1.5, trimesh.creation.icosphere(subdivisions=4)
-    ring = Ring(CENTER, radius, scale=0.5, subdivisions=2)
+    ring = FittedObject(CENTER, radius, scale=0.5, subdivisions=2)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
     (tmp_path / "log.jsonl").write_text('{"seconds": 7.0}\n')
     fitted = scenefile.fitted_scene_xml(scene, tmp_path, 2, '<bsdf type="cooktorrance"/>')

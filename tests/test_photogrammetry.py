@@ -10,21 +10,21 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.outlines import grown
+from mi_ring.capture.grabcut import grown
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
-from mi_ring.photogrammetry import bundle, masks, motion, table, trial
-from mi_ring.photogrammetry.board import Sighting
+from mi_ring.photogrammetry import automatic_masks, bundle_adjustment, shading_trial, structure_from_motion, table_plane
+from mi_ring.photogrammetry.capture_files import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
 from mi_ring.photogrammetry.folder import Picture, find_pictures
+from mi_ring.photogrammetry.marker_sheet import Sighting
 from mi_ring.photogrammetry.matching import pairs_to_match
-from mi_ring.photogrammetry.motion import Motion
-from mi_ring.photogrammetry.object import Hints, find_body
-from mi_ring.photogrammetry.scene import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
-from mi_ring.photogrammetry.views import View, around, camera_of, pasted, reduced, whole_of
-from mi_ring.rendering.elements import load_element
-from mi_ring.rendering.lights import Light
+from mi_ring.photogrammetry.object_masks import Hints, find_body
+from mi_ring.photogrammetry.reduced_photographs import View, around, camera_of, pasted, reduced, whole_of
+from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.scene.lights import Light
+from mi_ring.scene.xml_elements import load_element
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid
 LENS = Lens("PINHOLE", (160, 120), (170.0, 176.0, 77.0, 64.0))
@@ -96,10 +96,12 @@ def test_masks_of_a_dim_room_with_lamps():
         rgb, mask = in_a_dim_room(pose, random)
         views.append(view(str(k), pose, rgb))
         true.append(mask)
-    guesses = [masks.bright(v) for v in views]
-    assert min(masks.overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
-    found = masks.settle(masks.Space.seen_by(views), guesses, masks.nothing(views), lambda things, *_: things)
-    assert min(masks.overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
+    guesses = [automatic_masks.bright(v) for v in views]
+    assert min(automatic_masks.overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
+    found = automatic_masks.settle(
+        automatic_masks.Space.seen_by(views), guesses, automatic_masks.nothing(views), lambda things, *_: things
+    )
+    assert min(automatic_masks.overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
     assert found.quality > 0.9
     np.testing.assert_allclose(found.body.points.mean(0), CENTER, atol=0.15)
 
@@ -113,13 +115,13 @@ def test_a_trial_fit_covers_the_object_without_any_mask():
         true.append(mask)
     directions = random.normal(size=(200, 3))
     points = CENTER + AXES * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    space = masks.Space.seen_by(views)
-    assert trial.sphere_of(points[:20], space.center, space.reach) is None
-    center, radius = trial.sphere_of(points, space.center, space.reach)
+    space = automatic_masks.Space.seen_by(views)
+    assert shading_trial.sphere_of(points[:20], space.center, space.reach) is None
+    center, radius = shading_trial.sphere_of(points, space.center, space.reach)
     np.testing.assert_allclose(center, CENTER, atol=0.5)
     assert AXES.min() < radius < AXES.max()
-    covered = trial.coverages(views, center, radius, lambda things, *_: things)
-    assert np.median([masks.overlap(c, t) for c, t in zip(covered, true)]) > 0.9
+    covered = shading_trial.coverages(views, center, radius, lambda things, *_: things)
+    assert np.median([automatic_masks.overlap(c, t) for c, t in zip(covered, true)]) > 0.9
 
 
 def test_nothing_in_common_is_no_object():
@@ -129,7 +131,12 @@ def test_nothing_in_common_is_no_object():
     for guess in guesses:
         x, y = random.integers(0, 150, 2)
         guess[y : y + 8, x : x + 8] = 1
-    assert masks.settle(masks.Space.seen_by(views), guesses, masks.nothing(views), lambda things, *_: things) is None
+    assert (
+        automatic_masks.settle(
+            automatic_masks.Space.seen_by(views), guesses, automatic_masks.nothing(views), lambda things, *_: things
+        )
+        is None
+    )
 
 
 def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
@@ -138,7 +145,7 @@ def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
     guess[20:40, 28:32] = guess[2:6, 2:6] = 1
     expected = np.zeros((40, 60), np.uint8)
     expected[20:40, 28:32] = 1
-    np.testing.assert_array_equal(masks.unsure(mask, guess), expected)
+    np.testing.assert_array_equal(automatic_masks.unsure(mask, guess), expected)
 
 
 def on_a_table(pose, random, gain, bare=False):
@@ -171,11 +178,13 @@ def test_what_stands_on_a_table_differs_from_it():
         rgb, mask = on_a_table(pose, random, random.uniform(0.8, 1.2))
         views.append(view(str(k), pose, rgb))
         true.append(mask)
-    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
-    space = masks.Space.seen_by(views)
-    guesses = table.Table(views, table.Ground(plane, space.center, space.reach), lambda things, *_: things).others()
-    assert np.median([masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
-    sure = table.Table(views, table.Ground(plane, CENTER, 5.0), lambda things, *_: things).patterns()
+    plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    space = automatic_masks.Space.seen_by(views)
+    guesses = table_plane.Table(
+        views, table_plane.Ground(plane, space.center, space.reach), lambda things, *_: things
+    ).others()
+    assert np.median([automatic_masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
+    sure = table_plane.Table(views, table_plane.Ground(plane, CENTER, 5.0), lambda things, *_: things).patterns()
     assert max((s & t).sum() for s, t in zip(sure, true)) < 0.01 * np.mean([t.sum() for t in true])
     assert np.mean([s.sum() for s in sure]) > 0.1 * sure[0].size
 
@@ -189,14 +198,14 @@ def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
         rgb[:, 20:45] *= np.where(mask[:, 20:45, None], 1, 0.5)  # a shadow
         views.append(view(str(k), pose, rgb))
         true.append(mask)
-    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     covered = [mask.astype(np.uint8) for mask in true]
     hidden = [grown(mask, 0.1) for mask in covered]
-    grounds = table.Ground(plane, CENTER, 3.0), table.Ground(plane, CENTER, 8.0)
+    grounds = table_plane.Ground(plane, CENTER, 3.0), table_plane.Ground(plane, CENTER, 8.0)
 
     def known(pictures):
-        tables = [table.Table(pictures, ground, lambda things, *_: things, hidden) for ground in grounds]
-        return tables, table.bare(pictures, covered, tables, lambda things, *_: things)
+        tables = [table_plane.Table(pictures, ground, lambda things, *_: things, hidden) for ground in grounds]
+        return tables, table_plane.bare(pictures, covered, tables, lambda things, *_: things)
 
     tables, found = known(views)
     assert np.mean([f[t].mean() for f, t in zip(found, true)]) < 0.05
@@ -217,8 +226,10 @@ def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
 def test_a_table_that_the_flash_lights_is_no_object(bare):
     random = np.random.default_rng(1)
     views = [view(str(k), pose, on_a_table(pose, random, 1.0, bare)[0]) for k, pose in enumerate(poses(20, lowest=30))]
-    plane = table.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
-    body = find_body(masks.Space.seen_by(views), np.zeros((0, 3)), Hints(plane), False, lambda things, *_: things)
+    plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
+    body = find_body(
+        automatic_masks.Space.seen_by(views), np.zeros((0, 3)), Hints(plane), False, lambda things, *_: things
+    )
     if bare:
         assert body is None
     else:
@@ -227,26 +238,26 @@ def test_a_table_that_the_flash_lights_is_no_object(bare):
 
 def test_a_few_voxels_are_no_object():
     views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
-    space = masks.Space.seen_by(views)
+    space = automatic_masks.Space.seen_by(views)
     for radius, enough in ((1.2, False), (3.0, True)):
         near = np.linalg.norm(space.grid - space.grid[len(space.grid) // 2], axis=1)
         space.allowed = near < radius * (space.axis[1] - space.axis[0])
-        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views], masks.AGREE) is not None) == enough
+        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views], automatic_masks.AGREE) is not None) == enough
 
 
 def test_a_mask_that_misses_far_more_than_others_has_no_vote():
     views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
     true = [np.isfinite(hit_ellipsoid(v.camera)[0]).reshape(120, 160).astype(np.uint8) for v in views]
-    space = masks.Space.seen_by(views)
+    space = automatic_masks.Space.seen_by(views)
     body = space.vote(true, 0.96)
     np.testing.assert_allclose(body.points.mean(0), CENTER, atol=0.1)
     wrong = [
         mask * (np.arange(160) < 80) if k == 5 else mask for k, mask in enumerate(true)
     ]  # a lamp in the other half
     covered = [body.coverage(v) for v in views]
-    voters = masks.reliable(views, wrong, covered)
+    voters = automatic_masks.reliable(views, wrong, covered)
     assert voters == [k != 5 for k in range(12)]
-    assert masks.reliable(views, true, covered) == [True] * 12
+    assert automatic_masks.reliable(views, true, covered) == [True] * 12
     assert space.vote(wrong, 0.96).voxels.sum() < 0.8 * body.voxels.sum()
     assert space.vote(wrong, 0.96, voters).voxels.sum() == pytest.approx(body.voxels.sum(), rel=0.05)
     for v, mask in zip(views, true):
@@ -261,7 +272,7 @@ def test_the_pattern_of_the_table_is_known_again_in_a_shadow():
     seen[:, 40:110] -= 2.5  # shadow
     seen[60:90, 60:100] = np.log(0.3) + random.normal(0, 0.1, (30, 40))  # something of one colour on it
     known[105:] = np.nan
-    sure = table.alike(seen, known)
+    sure = table_plane.alike(seen, known)
     assert sure[10:45, 55:95].mean() > 0.9
     assert sure[60:90, 60:100].mean() < 0.05
     assert not sure[100:].any()
@@ -272,7 +283,7 @@ def test_masks_that_others_contradict_are_left_open():
     coverage[10:30, 20:40] = 1
     mask = coverage.copy()
     mask[15:25, 38:50], mask[18:22, 25:30] = 1, 0  # a shadow, and a hole
-    found = masks.disputed(mask, coverage, 2.0)
+    found = automatic_masks.disputed(mask, coverage, 2.0)
     assert found[16:24, 43:50].all() and found[18:22, 25:30].all()
     assert found.sum() < 10 * 12 + 4 * 5 + 10
 
@@ -309,10 +320,10 @@ def test_the_plane_under_an_object():
     object_ = np.abs(random.normal(size=(250, 3))) * [1, 1, 2]
     cameras = np.array([[8, 0, 9], [-3, 8, 7], [0, -9, 6.0]])
     points = np.concatenate([sheet, object_]) @ turn.T + CENTER
-    plane = table.find_plane(points, cameras @ turn.T + CENTER, CENTER, 4.0)
+    plane = table_plane.find_plane(points, cameras @ turn.T + CENTER, CENTER, 4.0)
     np.testing.assert_allclose(plane.normal, turn[:, 2], atol=0.01)
     assert abs(plane.height(CENTER)) < 0.02
-    assert table.find_plane(random.normal(size=(300, 3)), cameras, np.zeros(3), 4.0) is None
+    assert table_plane.find_plane(random.normal(size=(300, 3)), cameras, np.zeros(3), 4.0) is None
     axes = plane.axes()
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
@@ -335,12 +346,12 @@ def test_how_far_matches_are_from_what_two_cameras_say():
     for camera, image in ((first, one), (second, two)):
         local = points @ image.cam_from_world().matrix()[:, :3].T + image.cam_from_world().matrix()[:, 3]
         seen.append(camera.img_from_cam(local))
-    np.testing.assert_allclose(motion.epipolar(model, one, two, *seen), 0, atol=1e-9)
+    np.testing.assert_allclose(structure_from_motion.epipolar(model, one, two, *seen), 0, atol=1e-9)
     centre = one.cam_from_world().inverse().matrix()[:, 3]
     local = two.cam_from_world().matrix()[:, :3] @ centre + two.cam_from_world().matrix()[:, 3]
     toward = seen[1] - (170 * local[:2] / local[2] + [80, 60])  # lines of the second picture meet in the first's camera
     aside = toward[:, ::-1] * [1, -1] / np.linalg.norm(toward, axis=1, keepdims=True)
-    off = motion.epipolar(model, one, two, seen[0], seen[1] + 1e-3 * aside)
+    off = structure_from_motion.epipolar(model, one, two, seen[0], seen[1] + 1e-3 * aside)
     # Sampson's distance shares the error out among both pictures, whose lines are about equally steep.
     np.testing.assert_allclose(off, 1e-3 / np.sqrt(2), rtol=0.35)
 
@@ -353,26 +364,32 @@ def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_
 
     for counts, best, kept in (((50, 40), "together", [0, 1]), ((40, 50), "after", [0, 1, 2])):
         together, after = model("together", [90, 80, 12]), model("after", [90, 80, 70])
-        monkeypatch.setattr(motion, "map_globally", lambda *_, model=together: model)
-        monkeypatch.setattr(motion, "map_incrementally", lambda *_, model=after: model)
-        found = {name: [motion.Agreement(0, 1, n, n), motion.Agreement(2, 1, 50, 45)]
+        monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_, model=together: model)
+        monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_, model=after: model)
+        found = {name: [structure_from_motion.Agreement(0, 1, n, n), structure_from_motion.Agreement(2, 1, 50, 45)]
                  for name, n in zip(("together", "after"), counts)}  # fmt: skip
-        monkeypatch.setattr(motion, "agreements", lambda model, _, found=found: found[model.name])
-        taken = motion.put_together(tmp_path, 3, None)
+        monkeypatch.setattr(structure_from_motion, "agreements", lambda model, _, found=found: found[model.name])
+        taken = structure_from_motion.put_together(tmp_path, 3, None)
         assert taken.name == best and taken.reg_image_ids() == kept
     # What hangs on matches that do not fit is left out, and what it explains within itself does not count.
     together, after = model("together", [90] * 7), model("after", [90] * 7)
-    monkeypatch.setattr(motion, "map_globally", lambda *_: together)
-    monkeypatch.setattr(motion, "map_incrementally", lambda *_: after)
-    whole = [motion.Agreement(k, k + 1, 100, 80) for k in range(6)]
-    torn = [*(motion.Agreement(k, k + 1, 100, 90) for k in range(3)), motion.Agreement(3, 4, 100, 60),
-            *(motion.Agreement(k, k + 1, 900, 890) for k in (4, 5)), motion.Agreement(0, 6, 14, 14)]  # fmt: skip
-    assert motion.loose([9, 8, 0, 1, 2, 3, 4, 5, 6], torn) == [4, 5, 6]  # of single ones nothing can be said
-    monkeypatch.setattr(motion, "agreements", lambda model, _: whole if model is together else torn)
-    assert motion.put_together(tmp_path, 7, None) is together and after.reg_image_ids() == [0, 1, 2, 3]
-    monkeypatch.setattr(motion, "map_globally", lambda *_: None)
-    monkeypatch.setattr(motion, "map_incrementally", lambda *_: None)
-    assert motion.put_together(tmp_path, 3, None) is None
+    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: together)
+    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: after)
+    whole = [structure_from_motion.Agreement(k, k + 1, 100, 80) for k in range(6)]
+    torn = [*(structure_from_motion.Agreement(k, k + 1, 100, 90) for k in range(3)),
+            structure_from_motion.Agreement(3, 4, 100, 60),
+            *(structure_from_motion.Agreement(k, k + 1, 900, 890) for k in (4, 5)),
+            structure_from_motion.Agreement(0, 6, 14, 14)]  # fmt: skip
+    assert structure_from_motion.loose([9, 8, 0, 1, 2, 3, 4, 5, 6], torn) == [
+        4,
+        5,
+        6,
+    ]  # of single ones nothing can be said
+    monkeypatch.setattr(structure_from_motion, "agreements", lambda model, _: whole if model is together else torn)
+    assert structure_from_motion.put_together(tmp_path, 7, None) is together and after.reg_image_ids() == [0, 1, 2, 3]
+    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: None)
+    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: None)
+    assert structure_from_motion.put_together(tmp_path, 3, None) is None
 
 
 def test_pairs_of_few_photographs_are_all_and_of_many_are_near_ones_and_some():
@@ -388,7 +405,7 @@ def test_a_motion_in_another_frame_shows_points_at_the_same_pixels():
     cameras = {str(k): (LENS, pose) for k, pose in enumerate(poses(3))}
     motion = Motion(cameras, points, 0.3, {})
     turn = Rotation.from_euler("xyz", [10, 80, -40], degrees=True).as_matrix()
-    moved = motion.moved(2.5, turn, np.array([1.0, -2, 3]))
+    moved = structure_from_motion.moved(2.5, turn, np.array([1.0, -2, 3]))
     for name in cameras:
         local = (np.linalg.inv(m.cameras[name][1]) @ np.c_[m.points, np.ones(9)].T for m in (motion, moved))
         before, after = (LENS.colmap.img_from_cam(points[:3].T) for points in local)
@@ -524,9 +541,9 @@ def seen_by(lens, pose, points):
 @pytest.mark.parametrize(("focal", "told"), [(500.0, True), (8000.0, False)])
 def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
     model, _ = model_of(np.random.default_rng(1).normal(0, 1, (300, 3)), 0.3, focal, (7, -4))
-    motion.leave_out(model, [3])
+    structure_from_motion.leave_out(model, [3])
     pictures = [SimpleNamespace(name=str(k), path=Path(f"{k}.jpg"), size=(1000, 700)) for k in range(14)]
-    (lens,) = bundle.adjusted(model, pictures, {}, quiet).cameras.values()
+    (lens,) = bundle_adjustment.adjusted(model, pictures, {}, quiet).cameras.values()
     np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.5 if told else 0.0)
 
 
@@ -550,7 +567,7 @@ def adjusted_by_corners(shift):
     for k, pose in poses.items():
         seen = seen_by(lens, pose, grid + np.array([k % 2 * (shift or 0), 0, 0])) + random.normal(0, 0.05, (30, 2))
         sightings[str(k)] = Sighting(np.arange(30), 40 * grid, 2 * seen)
-    model = bundle.adjusted(model, pictures, {} if shift is None else sightings, quiet)
+    model = bundle_adjustment.adjusted(model, pictures, {} if shift is None else sightings, quiet)
     (found,) = model.cameras.values()
     shown = [seen_by(found, model.images[k + 1].cam_from_world().matrix(), points) for k in poses]
     return np.abs(shown - np.array([seen_by(lens, pose, points) for pose in poses.values()])).mean(), model
@@ -575,5 +592,5 @@ def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_p
     for name, picture in (("sharp", sharp), ("blurred", cv2.blur(sharp, (31, 3)))):
         noisy = picture + random.normal(0, 3, sharp.shape)
         cv2.imwrite(str(tmp_path / f"{name}.png"), noisy.clip(0, 255).astype(np.uint8))
-    sharp, blurred = (motion.detail_of(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
-    assert blurred < motion.BLURRED * sharp
+    sharp, blurred = (structure_from_motion.detail_of(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
+    assert blurred < structure_from_motion.BLURRED * sharp

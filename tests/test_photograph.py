@@ -417,12 +417,12 @@ import sys, mi_ring, mitsuba as mi
 from pathlib import Path
 from mi_ring.capture import loading
 from mi_ring.metrics import path_tracing
-from mi_ring.rendering import shading
+from mi_ring.rendering import direct_light
 from mi_ring import validate, render
 mi.set_variant("scalar_rgb")
 mi.set_variant("llvm_ad_rgb")
 scene, sensors = path_tracing.open_lit_scene(Path(sys.argv[1]))
-assert len(sensors) == 1 and not shading.shared_emitters(scene)
+assert len(sensors) == 1 and not direct_light.shared_emitters(scene)
 assert sum(isinstance(e, path_tracing.flash.Flash) for e in scene.emitters()) == 1
 assert loading.load_capture(sys.argv[1], images=False).sensors
 """

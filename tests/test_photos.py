@@ -19,10 +19,10 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures, without_exposure
-from mi_ring.photogrammetry.motion import Motion
-from mi_ring.photogrammetry.object import box_in, kept_masks
-from mi_ring.photogrammetry.table import Plane
-from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.object_masks import box_in, kept_masks
+from mi_ring.photogrammetry.reduced_photographs import camera_of
+from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.photogrammetry.workflow import cameras_beside, find_sheet, require_sides, upright
 from mi_ring.system import command
 from mi_ring.system.progress import progress

@@ -11,8 +11,8 @@ from test_fit import TABLE
 
 from mi_ring import fit
 from mi_ring.fitting.processes import ALONE, Processes, Share
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import results
-from mi_ring.ring.saved import load_fit
 from mi_ring.system.files import is_sealed
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="PyTorch is built without gloo")

@@ -12,9 +12,10 @@ from mi_ring import fit
 from mi_ring.capture import reflectance
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.rendering import bridge, elements
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit
+from mi_ring.rendering import bridge
+from mi_ring.scene import xml_elements
 
 QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
 PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
@@ -41,7 +42,7 @@ def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
     assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
     assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
     assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
-    text = str(elements.load_bsdf(xml))
+    text = str(xml_elements.load_bsdf(xml))
     assert '"vertex_base_color"' in text and '"vertex_roughness"' in text and "vertex_spec_tint" not in text
 
 
@@ -81,7 +82,7 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
 def test_gradients_of_attributes_equal_finite_differences(scene, which):
     loaded = load_capture(scene[0])
     parameters, xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
-    ring = Ring(*loaded.sphere(), 1.0, None, parameters, xml)
+    ring = FittedObject(*loaded.sphere(), 1.0, None, parameters, xml)
     surface = bridge.Surface(loaded.scene, loaded.shape, ring)
     s, faces = ring.domain.sample(3)
     surface.set_faces(faces)
@@ -121,7 +122,7 @@ def test_part_of_cooktorrance(broken_capture):
     shape = load_capture(path).shape
     parameters, xml = reflectance.predicted_parameters(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
-    assert "vertex_specular" not in str(elements.load_bsdf(xml))
+    assert "vertex_specular" not in str(xml_elements.load_bsdf(xml))
     # Without ranges: all but the constant.
     assert [p.name for p in reflectance.predicted_parameters(path, shape, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):

@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from mi_ring import render
 from mi_ring.capture import loading
 from mi_ring.errors import InputError
-from mi_ring.nets.shapenet import SPEED
-from mi_ring.output import views
+from mi_ring.nets.shape_net import SPEED
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
+from mi_ring.output import camera_paths
 from mi_ring.output.film import write_film
 from mi_ring.plugins.flash import Flash
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
 from mi_ring.system import command
 
 CENTER, RADIUS, SHIFT = np.array([400.0, -150.0, 90.0]), 20.0, np.array([0.3, -0.5, 0.2])
@@ -43,7 +43,7 @@ def set_material(ring, diffuse, specular=0.0, roughness=0.5):
 
 def sphere(shift=SHIFT, **material):
     """A matte sphere that the flow moves as a whole, by `shift` times its radius."""
-    ring = Ring(CENTER, RADIUS, steps=8, subdivisions=4)
+    ring = FittedObject(CENTER, RADIUS, steps=8, subdivisions=4)
     ring.shape_net.output.weight.data.zero_()
     ring.shape_net.output.bias.data.copy_(torch.atanh(torch.tensor(shift) / SPEED))
     set_material(ring, **{"diffuse": ALBEDO / np.pi} | material)
@@ -119,7 +119,7 @@ def arguments(*options):
 
 
 def frames_of(path, ring, *options):
-    return views.views_of(loading.load_capture(path, images=False), ring, arguments(*options))
+    return camera_paths.views_of(loading.load_capture(path, images=False), ring, arguments(*options))
 
 
 def eye_of(frame):
@@ -633,9 +633,9 @@ def test_pictures_by_other_integrators_are_made_in_passes_of_bounded_size(monkey
     integrator, (sensor,) = mi.load_dict({"type": "path"}), scene.sensors()
     genuine, passes = mi.render, []
     monkeypatch.setattr(mi, "render", lambda *a, **k: passes.append((k["spp"], k["seed"])) or genuine(*a, **k))
-    whole = views.in_passes(scene, sensor, integrator, 400, seed=3)
-    monkeypatch.setattr(views, "LANES", 7 * 5 * 150)
-    parts = views.in_passes(scene, sensor, integrator, 400, seed=3)
+    whole = camera_paths.in_passes(scene, sensor, integrator, 400, seed=3)
+    monkeypatch.setattr(camera_paths, "LANES", 7 * 5 * 150)
+    parts = camera_paths.in_passes(scene, sensor, integrator, 400, seed=3)
     assert [spp for spp, _ in passes] == [400, 150, 150, 100] and len({seed for _, seed in passes[1:]}) == 3
     assert whole.shape == parts.shape == (5, 7, 3)
     np.testing.assert_allclose(parts, whole, atol=0.05)

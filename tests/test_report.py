@@ -20,7 +20,7 @@ from playwright.sync_api import sync_playwright
 from mi_ring import fit, images
 from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.fit import Fit
-from mi_ring.output import figures, report
+from mi_ring.output import report, svg
 
 VIEWER = Path(report.__file__).parent / "viewer"
 QUICK = ["--levels", "2", "--widths", "56", "--shares", "1", "--batch", "4", "--subdivisions", "3", "--no-indirect"]
@@ -140,7 +140,7 @@ def test_figures_are_the_same_whenever_they_are_drawn():
     for _ in range(2):
         drawn = Figure()
         drawn.subplots().plot([1, 3, 2], label="a")
-        pages.append(figures.svg_uri(drawn))
+        pages.append(svg.svg_uri(drawn))
     assert pages[0] == pages[1]
 
 

@@ -13,12 +13,12 @@ from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, m
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, room_element, room_elements, scene_bytes
-from mi_ring.fitting.room import Room
-from mi_ring.rendering import bridge, indirect
-from mi_ring.rendering.elements import load_element
+from mi_ring.fitting.room_light import Room
+from mi_ring.rendering import bridge, indirect_light
+from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_photographs
-from mi_ring.rendering.rooms import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to
+from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to
+from mi_ring.scene.xml_elements import load_element
 from mi_ring.system import machine
 
 LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value": i}}
@@ -67,7 +67,7 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
     ball = {"type": "sphere", "center": CENTER.tolist(), "radius": 0.5, "bsdf": material(ALBEDO / np.pi)}
     scene = load(LIGHTS, ball=ball)
     photographs = Photographs.of(scene.sensors())
-    channels = indirect.render_indirect(scene, photographs, spp=256, seed=1, room=ALL)
+    channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, room=ALL)
     images, free = (np.moveaxis(part, 0, 3) for part in shown(channels))
     inside = pictures(channels[:4])[..., 3] == 1
     assert inside[0].sum() > 60 and inside[1].sum() > 60
@@ -105,7 +105,7 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
                          for k in range(2)])  # fmt: skip
 
     def ours(seed):
-        channels = indirect.render_indirect(dark, photographs, 64, seed, room=which)
+        channels = indirect_light.render_indirect(dark, photographs, 64, seed, room=which)
         return np.einsum("jnhwc,jc->nhwc", shown(channels, which)[0], room[which])
 
     def regions(picture):
@@ -130,7 +130,7 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=256, seed=2))
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
-    channels = indirect.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, room=ALL)
+    channels = indirect_light.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, room=ALL)
     ours = np.einsum("jnhwc,jc->nhwc", shown(channels)[0], room[ALL])[1]
     np.testing.assert_allclose(added.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
 

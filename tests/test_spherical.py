@@ -6,7 +6,7 @@ import trimesh
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
-from mi_ring.geometry.spherical import SphericalMap
+from mi_ring.geometry.sphere_map import SphericalMap
 
 BALL = trimesh.creation.icosphere(subdivisions=5)
 

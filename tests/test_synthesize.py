@@ -20,18 +20,19 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.photogrammetry.board import Board
-from mi_ring.rendering.lights import Light, Lights
-from mi_ring.rendering.plain_mesh import mesh_of, scene_of
-from mi_ring.rendering.rooms import COUNT
-from mi_ring.synthesis import lamps
-from mi_ring.synthesis.cameras import look_at, poses
-from mi_ring.synthesis.capture import Production, write_scenes
-from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.photogrammetry.marker_sheet import Board
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.scene.lights import Light
+from mi_ring.scene.plain_mesh import mesh_of, scene_of
+from mi_ring.synthesis import light_sources
 from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURS, load_material, plugin
+from mi_ring.synthesis.options import SynthesizeConfig
+from mi_ring.synthesis.path_traced_capture import Production, write_scenes
 from mi_ring.synthesis.stage import Stage, load_object
 from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.viewpoints import look_at, poses
 
 SMALL = ["--views", "9", "--size", "56", "40", "--spp", "16", "--novel", "2"]
 ALBEDO = np.array([0.6, 0.3, 0.2])
@@ -113,8 +114,8 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     stage = Stage(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
     camera = camera_at([5, 9, -14], [0.05, 0.02, 0], (27, 21))
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
-    room = lamps.room_of("harmonics", in_camera, np.random.default_rng(4))
-    lamp = lamps.environment_of(lamps.seen_from_within(room, camera.to_world))
+    room = light_sources.room_of("harmonics", in_camera, np.random.default_rng(4))
+    lamp = light_sources.environment_of(light_sources.seen_from_within(room, camera.to_world))
     found = stage.radiance(Shot(camera), lamp, 256, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
@@ -319,7 +320,7 @@ def test_lights_bring_as_much_to_the_middle_and_stay_near_their_cameras():
     random = np.random.default_rng(7)
     up = np.array([0.0, 0.0, 1.0])
     cameras = [Camera(pose, np.ones(2), np.ones(2), (2, 2)) for pose in poses("free", 40, 2.0, 9.0, up, random)]
-    flash = lamps.lights_of("flash", cameras, (0.1, -0.2, 0.05), 40, random)
+    flash = light_sources.lights_of("flash", cameras, (0.1, -0.2, 0.05), 40, random)
     for camera, light in zip(cameras, flash):  # left, up, forward of the lens
         away = np.linalg.norm(camera.position)
         expected = away * np.array([0.1, -0.2, 0.05])
@@ -328,7 +329,7 @@ def test_lights_bring_as_much_to_the_middle_and_stay_near_their_cameras():
     brought = [light.rgb[0] / (light.vector @ light.vector) for light in flash]
     assert abs(np.median(brought) - 1) < 0.05
     for kind in ("point", "distant"):
-        lights = lamps.lights_of(kind, cameras, (0, 0, 0), 40, random)
+        lights = light_sources.lights_of(kind, cameras, (0, 0, 0), 40, random)
         toward = [(light.vector if kind == "point" else -light.vector) for light in lights]
         angles = [np.degrees(np.arccos(camera.position @ t / np.linalg.norm(camera.position) / np.linalg.norm(t)))
                   for camera, t in zip(cameras, toward)]  # fmt: skip

@@ -10,13 +10,13 @@ from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
-from mi_ring.photogrammetry.flash import Flash
+from mi_ring.photogrammetry.capture_files import OBJECT, Shot, write_table
+from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.scene import OBJECT, Shot, write_table
-from mi_ring.photogrammetry.table import Ground, Plane, reflectance
-from mi_ring.photogrammetry.views import camera_of
+from mi_ring.photogrammetry.reduced_photographs import camera_of
+from mi_ring.photogrammetry.table_plane import Ground, Plane, reflectance
 from mi_ring.rendering import bridge
-from mi_ring.rendering.lights import Light
+from mi_ring.scene.lights import Light
 from mi_ring.system import machine
 
 TURNED = mi.ScalarTransform4f().translate([0.3, -0.2, -1.1]).rotate([1, 0.4, 0], 12).scale([6, 4, 1])

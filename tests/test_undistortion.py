@@ -10,7 +10,7 @@ from test_convert import converted, transforms
 
 from mi_ring.geometry.hull import Hull, Silhouette
 from mi_ring.images import linear_to_srgb, srgb_to_linear
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import undistort
 
 W, H = 57, 41

@@ -12,12 +12,12 @@ from scipy import stats
 
 from mi_ring import __main__, validate
 from mi_ring.errors import InputError
-from mi_ring.metrics import path_tracing, statistics
+from mi_ring.metrics import path_tracing, renderer_agreement
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import validation_sheet
 from mi_ring.plugins.cooktorrance import CookTorrance
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
 from mi_ring.system import files
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 35, 25, (30.0, 27.0), (16.2, 13.4)  # [px]
@@ -71,7 +71,7 @@ def comparison(scene, sensors, k=0, depth=6, spp=4):
     pictures = path_tracing.render_both(
         path_tracing.with_flash(scene), Photographs.of(sensors), k, sensors[k], 1, spp, depth, 32 * k
     )
-    return statistics.compare_renderers("this", pictures)
+    return renderer_agreement.compare_renderers("this", pictures)
 
 
 # What it says of scenes with a known answer.
@@ -231,7 +231,7 @@ def test_pictures_of_several_launches_are_those_of_one(tmp_path, monkeypatch):
     many = path_tracing.render_both(scene, photographs, 0, sensors[0], 1, 4, 3, 1000)
     for a, b in zip(vars(one).values(), vars(many).values()):
         assert a.shape == b.shape == (16, HEIGHT, WIDTH, 3)
-        assert statistics.p_of_agreement(a.astype(float), b.astype(float)) > 0.001
+        assert renderer_agreement.p_of_agreement(a.astype(float), b.astype(float)) > 0.001
         assert len({x.tobytes() for x in b}) == 16
 
 
@@ -253,7 +253,7 @@ def test_p_values_are_uniform_where_there_is_no_difference(noise):
         }[noise]()
         return value * lit
 
-    p = np.array([statistics.p_of_agreement(pictures(), pictures()) for _ in range(300)])
+    p = np.array([renderer_agreement.p_of_agreement(pictures(), pictures()) for _ in range(300)])
     assert stats.kstest(p, "uniform").pvalue > 1e-3
     assert (p < 0.01).sum() <= 10  # 3 are expected, more than 10 once in 3,000
 
@@ -265,7 +265,7 @@ def test_p_values_of_photometric_and_path_are_uniform(tmp_path):
     for seed in range(50):
         for k in range(3):
             pictures = path_tracing.render_both(scene, photographs, k, sensors[k], 1, 4, 2, 32 * (3 * seed + k))
-            p.append(statistics.p_of_agreement(pictures.photometric.astype(float), pictures.path.astype(float)))
+            p.append(renderer_agreement.p_of_agreement(pictures.photometric.astype(float), pictures.path.astype(float)))
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
@@ -273,39 +273,41 @@ def test_p_values_of_photometric_and_path_are_uniform(tmp_path):
 def test_differences_are_found(where):
     random = np.random.default_rng(4)
     a, b = (1 + 0.3 * random.normal(size=(16, 40, 56, 3)) for _ in range(2))
-    assert statistics.p_of_agreement(a, b) > 0.01
+    assert renderer_agreement.p_of_agreement(a, b) > 0.01
     if where == "everywhere":
         b *= 1.005  # 5 standard errors of the mean, a tenth of that of a block
     elif where == "in one place":
         b[:, 8:16, 16:24] *= 1.15
     else:
         b *= [1.05, 1, 1 / 1.05]
-    assert statistics.p_of_agreement(a, b) < 1e-3
+    assert renderer_agreement.p_of_agreement(a, b) < 1e-3
 
 
 def test_pictures_without_noise_may_differ_by_rounding_only():
     a = np.full((16, 20, 30, 3), 0.7)
-    assert statistics.p_of_agreement(a, a) == 1
-    assert statistics.p_of_agreement(a, a * (1 + 1e-7)) > 0.5
-    assert statistics.p_of_agreement(a, a * (1 + 1e-4)) < 1e-6
-    assert statistics.p_of_agreement(0 * a, 0 * a) == 1
-    assert statistics.p_of_agreement(a, 0 * a) < 1e-6
+    assert renderer_agreement.p_of_agreement(a, a) == 1
+    assert renderer_agreement.p_of_agreement(a, a * (1 + 1e-7)) > 0.5
+    assert renderer_agreement.p_of_agreement(a, a * (1 + 1e-4)) < 1e-6
+    assert renderer_agreement.p_of_agreement(0 * a, 0 * a) == 1
+    assert renderer_agreement.p_of_agreement(a, 0 * a) < 1e-6
 
 
 def test_least_of_many_p_values_is_corrected_for_their_number():
     random = np.random.default_rng(5)
-    p = [statistics.sidak(random.random(7)) for _ in range(1000)]
+    p = [renderer_agreement.sidak(random.random(7)) for _ in range(1000)]
     assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert statistics.sidak([0.01, 0.5]) == pytest.approx(1 - 0.99**2)
-    assert statistics.sidak([1e-30, 0.5, 1.0]) == pytest.approx(3e-30)
-    assert statistics.sidak([1.0]) == 1
+    assert renderer_agreement.sidak([0.01, 0.5]) == pytest.approx(1 - 0.99**2)
+    assert renderer_agreement.sidak([1e-30, 0.5, 1.0]) == pytest.approx(3e-30)
+    assert renderer_agreement.sidak([1.0]) == 1
 
 
 def test_all_photographs_together_are_weighted_by_their_light():
     def row(radiance, share, p):
-        return statistics.Comparison("x", radiance, -share, share, 0.1, 20.0, 2 * share, share, 0.0, 0.3, p, 0.5)
+        return renderer_agreement.Comparison(
+            "x", radiance, -share, share, 0.1, 20.0, 2 * share, share, 0.0, 0.3, p, 0.5
+        )
 
-    all_ = statistics.all_as_one([row(1.0, 0.1, 0.02), row(3.0, 0.3, 0.9)])
+    all_ = renderer_agreement.all_as_one([row(1.0, 0.1, 0.02), row(3.0, 0.3, 0.9)])
     assert all_.radiance == 2
     assert all_.interreflection == pytest.approx((1 * 0.1 + 3 * 0.3) / 4)
     assert all_.unexplained_noise == pytest.approx(np.hypot(0.3 * 1, 0.3 * 3) / 4)
@@ -320,7 +322,7 @@ def test_folder_of_a_fit_and_its_default_out(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()
     torch.manual_seed(0)
-    files.write_state(ring_state(Ring([0.3, -0.2, 0.4], 0.8, scale=0.2)), folder / "ring.pt")
+    files.write_state(ring_state(FittedObject([0.3, -0.2, 0.4], 0.8, scale=0.2)), folder / "ring.pt")
     ring = """<shape type="shapenet" id="object"><string name="weights" value="ring.pt"/>
       <bsdf type="cooktorrance"/></shape>"""
     write(folder, ring, *CONVEX, name="scene.xml")
@@ -351,7 +353,7 @@ def test_contact_sheet_shows_who_is_brighter_in_red_and_blue(tmp_path):
     photometric[:, :20] += 0.04
     direct[:, 20:] += 0.01
     pictures = path_tracing.Pictures(photometric, photometric + 0.1, path, direct)
-    line = validation_sheet.strip(statistics.compare_renderers("this", pictures), pictures)
+    line = validation_sheet.strip(renderer_agreement.compare_renderers("this", pictures), pictures)
     cell = validation_sheet.THUMBNAIL + 4
     image = np.array(line).astype(int)[16:]
     top, bottom = image[20, 10 + 2 * cell], image[100, 10 + 2 * cell]

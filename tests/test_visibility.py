@@ -19,10 +19,10 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.camera import Camera
 from mi_ring.metrics import surfaces
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import gltf, ply
-from mi_ring.rendering.visibility import View, Visibility, seen_of
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.scene.visibility import View, Visibility, seen_of
 
 RADIUS, DISTANCE = 25.0, 70.0
 
@@ -167,7 +167,7 @@ def test_no_view_shows_nothing():
 def ring():
     """The start of a fit, which is a ball, nearly."""
     torch.manual_seed(3)
-    return Ring(CENTER, RADIUS, scale=0.5, subdivisions=4)
+    return FittedObject(CENTER, RADIUS, scale=0.5, subdivisions=4)
 
 
 @pytest.fixture(scope="module")

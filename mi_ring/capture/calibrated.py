@@ -8,10 +8,11 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.geometry.camera import Camera, moved_pose
-from mi_ring.rendering.elements import load_element
-from mi_ring.rendering.lights import Light, Lights
+from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.scenes import with_lamps
+from mi_ring.scene.assembly import with_lamps
+from mi_ring.scene.lights import Light
+from mi_ring.scene.xml_elements import load_element
 
 
 def with_calibration(

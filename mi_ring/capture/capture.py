@@ -20,7 +20,7 @@ from mi_ring.geometry.camera import NoParallax, nearest_point
 from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
 from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.visibility import View
+from mi_ring.scene.visibility import View
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23

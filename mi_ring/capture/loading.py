@@ -9,19 +9,19 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.capture.brightness_masks import find_masks
 from mi_ring.capture.capture import Capture, views_of
 from mi_ring.capture.decoding import read_mask, read_photograph, require_header
-from mi_ring.capture.masks import find_masks
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.errors import InputError, SceneError, require_file
 from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
-from mi_ring.rendering.attributes import require_attributes
-from mi_ring.rendering.edges import Edges
-from mi_ring.rendering.elements import require_parts
+from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.rooms import room_of
-from mi_ring.rendering.visibility import View
+from mi_ring.rendering.spherical_harmonics import room_of
+from mi_ring.scene.mesh_attributes import require_attributes
+from mi_ring.scene.visibility import View
+from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system import llvm
 from mi_ring.system.progress import progress
 

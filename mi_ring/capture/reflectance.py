@@ -9,9 +9,9 @@ import numpy as np
 
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
-from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.rendering.attributes import attributes_of, constants
-from mi_ring.rendering.elements import load_bsdf
+from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
+from mi_ring.scene.mesh_attributes import attributes_of, constants
+from mi_ring.scene.xml_elements import load_bsdf
 
 
 def predicted_parameters(

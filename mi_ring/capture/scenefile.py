@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
-from mi_ring.rendering.lights import Light, Lights
-from mi_ring.rendering.rooms import COUNT, ORDER
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering.spherical_harmonics import COUNT, ORDER
+from mi_ring.scene.lights import Light
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
@@ -156,9 +157,9 @@ def recalibrated_xml(
 ) -> bytes:  # fmt: skip
     """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order.
 
-    `room`: the light of their room, as `mi_ring.rendering.rooms` has it; `frames`: axes that it has, even without
-    light, by default those of the rooms that the scene file has; `lamps`: point lights and distant ones that light all
-    photographs, by default those of the scene file.
+    `room`: the light of their room, as `mi_ring.rendering.spherical_harmonics` has it; `frames`: axes that it has, even
+    without light, by default those of the rooms that the scene file has; `lamps`: point lights and distant ones that
+    light all photographs, by default those of the scene file.
     """
     root = ElementTree.fromstring(scene)
     for old, k in photographs_of(root, sensors):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_ring.errors import InputError
-from mi_ring.experiments import figures, measures, published
+from mi_ring.experiments import measures, plots, published
 from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
 from mi_ring.experiments.recipes import DiligentObject, Part, Perturbed, own
 from mi_ring.experiments.single_view import SingleView
@@ -215,7 +215,7 @@ _MATERIAL = {"slice_error": Column("BRDF slices, relative error %", 1)}
 EXPERIMENTS = {
     "table1": Experiment(
         "The paper's table 1: accuracy on captures with measured materials.", table1, USUAL,
-        figures.bars(_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"), ("psnr_novel", "novel [dB]")),
+        plots.bars(_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"), ("psnr_novel", "novel [dB]")),
         published=published.TABLE1, data=f"{CAPTURES}, or meshes",
     ),
     "table2": Experiment(
@@ -223,63 +223,63 @@ EXPERIMENTS = {
         "shows, the mean of both directions, to the other surface and not to points of it.",
         table2,
         {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
-        figures.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published=published.TABLE2,
+        plots.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published=published.TABLE2,
         mean_over="object", data="the folder of DiLiGenT-MV",
     ),
     "table3": Experiment(
         "The paper's table 3: poses wrong by 0.5° and 0.5 % of the distance, and refined; after rigid alignment.",
         table3,
         {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
-        figures.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published=published.TABLE3,
+        plots.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published=published.TABLE3,
         data=f"{CAPTURES}, or meshes",
     ),
     "specularity": Experiment(
         "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
-        specularity, {**USUAL, **_MATERIAL}, figures.slices, data="one mesh",
+        specularity, {**USUAL, **_MATERIAL}, plots.slices, data="one mesh",
     ),
     "stripes": Experiment(
         "Two materials in stripes: normals, and whether each place has the right one.", stripes,
-        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, figures.pictures, data="one mesh",
+        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, plots.pictures, data="one mesh",
     ),
     "views": Experiment(
         "Accuracy by the number of photographs.", views, USUAL,
-        figures.curves(("views", "photographs"), _ERROR), data=f"{CAPTURES}, or meshes",
+        plots.curves(("views", "photographs"), _ERROR), data=f"{CAPTURES}, or meshes",
     ),
     "ablation": Experiment(
         "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.", ablation,
-        SHAPE, figures.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR),
+        SHAPE, plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR),
         data=f"{CAPTURES}, or meshes",
     ),
     "encoding": Experiment(
         "Positional encodings: linear frequencies, powers of two, none.", encoding, {**USUAL, **FLAWS},
-        figures.bars(_ERROR, ("psnr_novel", "novel [dB]")), data=f"{CAPTURES}, or meshes",
+        plots.bars(_ERROR, ("psnr_novel", "novel [dB]")), data=f"{CAPTURES}, or meshes",
     ),
     "steps": Experiment(
         "Steps of the flow, the paper's T.", steps, {**USUAL, **FLAWS},
-        figures.curves(("T", "T"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
+        plots.curves(("T", "T"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
     ),
     "genus": Experiment(
         "An object with a handle, from a sphere and from the masks' visual hull.", genus,
-        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, figures.pictures,
+        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures,
         data=f"{CAPTURES}, or meshes",
     ),
     "swap": Experiment(
-        "Materials exchanged between fits from one domain, the sphere.", swap, USUAL, figures.swapped,
+        "Materials exchanged between fits from one domain, the sphere.", swap, USUAL, plots.swapped,
         data=f"two or more {CAPTURES}, or meshes",
     ),
     "resolution": Experiment(
         "One fit, sampled at several levels: the networks are functions.", resolution,
         {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
-        figures.curves(("vertices", "vertices"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
+        plots.curves(("vertices", "vertices"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
     ),
     "timing": Experiment(
         "The error of normals in the course of a fit.", timing,
         {"iteration": Column("iteration", 0), **TIME, **NORMALS, "depth_mean": DEPTHS["depth_mean"]},
-        figures.curves(("seconds", "fit [s]"), _ERROR), data=f"{CAPTURES}, or meshes",
+        plots.curves(("seconds", "fit [s]"), _ERROR), data=f"{CAPTURES}, or meshes",
     ),
     "single": Experiment(
         "DiLiGenT's photographs from one side: errors of normals, 90° where the camera misses the surface.", single,
-        {**NORMALS, "missed": Column("missed %"), **TIME}, figures.pictures,
+        {**NORMALS, "missed": Column("missed %"), **TIME}, plots.pictures,
         data=".npz files of DiLiGenT's photographs from one side",
     ),
 }  # fmt: skip

@@ -22,7 +22,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.metrics.evaluation import rounded
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.system.command import interrupted, one_line
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of

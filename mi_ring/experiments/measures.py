@@ -15,10 +15,10 @@ from mi_ring.experiments.slices import bsdf_of, second_at, slices
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.metrics.evaluation import evaluate_fit
 from mi_ring.metrics.surfaces import compare_surfaces, hits, load_true_mesh
+from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.results import read_log
-from mi_ring.rendering.crossings import crossing_triangles
-from mi_ring.rendering.plain_mesh import scene_of
-from mi_ring.ring.saved import load_fit
+from mi_ring.scene.plain_mesh import scene_of
+from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.synthesis.materials import load_material
 from mi_ring.system.optional import installed
 

@@ -20,12 +20,12 @@ from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
-from mi_ring.rendering.lights import Lights
-from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.synthesis.capture import SETTINGS, claim, write_capture
-from mi_ring.synthesis.config import SynthesizeConfig, require_options
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.degradation import miscalibrated
-from mi_ring.synthesis.example import VIEWS, pot, write_example
+from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
+from mi_ring.synthesis.options import SynthesizeConfig, require_options
+from mi_ring.synthesis.path_traced_capture import SETTINGS, claim, write_capture
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import in_turn, partial_path, read_json, write_file, writing
 

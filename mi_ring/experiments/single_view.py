@@ -13,7 +13,7 @@ from mi_ring.experiments.recipes import Recipe, filled
 from mi_ring.foreign import load_npz
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import write_image
-from mi_ring.rendering.lights import Light
+from mi_ring.scene.lights import Light
 from mi_ring.system.files import write_file
 
 DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import pattern_of
+from mi_ring.synthesis.options import SynthesizeConfig
 
 ANGLES = np.radians(np.arange(0, 76, 5))  #: θh of slices, light and camera at one place
 

@@ -6,8 +6,8 @@ from typing import Any
 from mi_ring.errors import InputError
 from mi_ring.experiments.experiment import Asked
 from mi_ring.experiments.recipes import Recipe, Synthetic, given, own
-from mi_ring.synthesis.config import SynthesizeConfig
 from mi_ring.synthesis.materials import COLOURS, load_material
+from mi_ring.synthesis.options import SynthesizeConfig
 
 MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
 #: Of captures that are path traced: less than the paper's 50 and 50 photographs of 512² px, where fits see no more.

@@ -24,14 +24,14 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.curve import Curve
 from mi_ring.fitting.lamps import Lamps
-from mi_ring.fitting.room import Room
+from mi_ring.fitting.room_light import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
 from mi_ring.geometry.rotations import quarter_turns, rotations
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.rooms import BASIS
-from mi_ring.rendering.scenes import has_table, lamp_lights, lamps_of
-from mi_ring.rendering.shading import shared_emitters
+from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.scene.assembly import has_table, lamp_lights, lamps_of
+from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
 #: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.

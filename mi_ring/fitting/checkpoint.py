@@ -9,7 +9,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import WEIGHTS, Config, as_typed
 from mi_ring.fitting.fit import Fit
-from mi_ring.ring.saved import read_state
+from mi_ring.objects.ring_file import read_state
 from mi_ring.system.files import is_sealed, relative_to, write_state
 from mi_ring.version import __version__
 

@@ -14,16 +14,17 @@ from torch import Tensor
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
-from mi_ring.fitting.averages import Averages
 from mi_ring.fitting.calibration import Calibration, overall, refined_of
-from mi_ring.fitting.caution import Caution
-from mi_ring.fitting.certainty import deviations
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.holdout import confirm, kept_out
+from mi_ring.fitting.covariance import deviations
+from mi_ring.fitting.indirect_average import Averages
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.light_selection import lighting_of
 from mi_ring.fitting.lighting import AMBIGUOUS, Lighting, frames, lit, smoothed
+from mi_ring.fitting.mask_refinement import REDRAWN, find_outlines, with_outlines
+from mi_ring.fitting.nan_guard import Caution
 from mi_ring.fitting.optimizers import optimizers_of
-from mi_ring.fitting.outlines import REDRAWN, find_outlines, with_outlines
+from mi_ring.fitting.other_light import with_surroundings
 from mi_ring.fitting.powers import Looker, lookers_of
 from mi_ring.fitting.processes import current
 from mi_ring.fitting.restraint import Restraint
@@ -32,15 +33,14 @@ from mi_ring.fitting.schedule import stages_of
 from mi_ring.fitting.start import require_settings, starting_ring
 from mi_ring.fitting.state import restore, state_of
 from mi_ring.fitting.summary import summary
-from mi_ring.fitting.surroundings import with_surroundings
 from mi_ring.fitting.terms import Term, default_terms
-from mi_ring.fitting.trials import lighting_of
+from mi_ring.fitting.validation import confirm, kept_out
 from mi_ring.geometry.domain import Sphere
-from mi_ring.nets.brdfnet import ReflectanceMap
-from mi_ring.nets.shapenet import Flow
+from mi_ring.nets.brdf_net import MaterialNet
+from mi_ring.nets.shape_net import Flow
+from mi_ring.objects.ring_file import ring_of
 from mi_ring.output import results
 from mi_ring.rendering import bridge
-from mi_ring.ring.saved import ring_of
 from mi_ring.system.machine import autocast, device, release_memory
 
 LOG_EVERY = 5  #: iterations between entries of the log
@@ -59,7 +59,7 @@ class Fit:
             print(it.number, it.loss)
 
     `networks`: (Shape-Net, BRDF-Net), others than the paper's, which are trained in place, as
-    `mi_ring.nets.shapenet.Flow` and `mi_ring.nets.brdfnet.ReflectanceMap` say. `terms`: of the loss, by name, each a
+    `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet` say. `terms`: of the loss, by name, each a
     `Term` or a function of an `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration`
     when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there. `lighting`: what lights
     the photographs, where that is known better than `Config.light` says.
@@ -70,7 +70,7 @@ class Fit:
     """
 
     def __init__(
-        self, capture: Capture, config: Config | None = None, networks: tuple[Flow, ReflectanceMap] | None = None,
+        self, capture: Capture, config: Config | None = None, networks: tuple[Flow, MaterialNet] | None = None,
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
         state: dict | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
@@ -133,7 +133,7 @@ class Fit:
         self.stages = self.stages_by(self.config)
         self.iterations = self.stages[-1].last
         self.autocast = autocast(self.config.precision, self.device)
-        #: Masks that were found anew, as `mi_ring.fitting.outlines` has them.
+        #: Masks that were found anew, as `mi_ring.fitting.mask_refinement` has them.
         self.outlines: dict[int, Tensor] = {}
         self.iteration = 0
         self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last

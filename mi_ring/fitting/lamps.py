@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mi_ring.rendering.lights import Light
+from mi_ring.scene.lights import Light
 
 
 class Lamps(NamedTuple):

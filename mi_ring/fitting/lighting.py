@@ -17,10 +17,9 @@ from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
-from mi_ring.rendering.lights import Light
-from mi_ring.rendering.rooms import BASIS, frames_of, without_environment
-from mi_ring.rendering.scenes import lamp_lights
-from mi_ring.rendering.shading import shared_emitters
+from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, without_environment
+from mi_ring.scene.assembly import lamp_lights
+from mi_ring.scene.lights import Light, shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
 AMBIGUOUS: set[Kind] = {"environment", "turntable"}  #: light that can hardly be told from what the material is

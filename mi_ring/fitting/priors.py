@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.nets.brdfnet import ReflectanceMap
+from mi_ring.nets.brdf_net import MaterialNet
 
 FAINT = 1e-3  #: means that nothing is divided by less than, and how far from its ends a parameter's logit stays
 
@@ -56,7 +56,7 @@ def number_of_bases(values: Tensor) -> Tensor:
     return torch.linalg.matrix_norm(values, "nuc") / values.norm()
 
 
-def columns_of(material: dict[str, Tensor], brdf_net: ReflectanceMap) -> Tensor:
+def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
     """The material at V points as a matrix (V, C) of numbers near 1: in units of `scale`, or as shares of a range."""
     columns = []
     for p in brdf_net.bsdf_parameters:

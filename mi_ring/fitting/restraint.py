@@ -3,7 +3,7 @@
 import math
 
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.rendering.crossings import crossing_triangles
+from mi_ring.scene.self_intersections import crossing_triangles
 
 CROSSING = 1e-3  #: share of the triangles that may cross others; beyond, the regulariser does not weaken
 CROSSING_EVERY = 20  #: iterations between counts of them

@@ -14,11 +14,11 @@ from mi_ring.fitting.calibration import overall, refined_of
 from mi_ring.fitting.config import Config
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
-from mi_ring.nets.brdfnet import BRDFNet, ReflectanceMap
+from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
 from mi_ring.nets.resnet import shape_net_of
-from mi_ring.nets.shapenet import Flow
-from mi_ring.rendering.scenes import has_table, lamps_of
-from mi_ring.ring.ring import Ring
+from mi_ring.nets.shape_net import Flow
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
 
@@ -38,8 +38,8 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 def starting_ring(
-    capture: Capture, config: Config, exposure: float, networks: tuple[Flow, ReflectanceMap] | None
-) -> Ring:
+    capture: Capture, config: Config, exposure: float, networks: tuple[Flow, MaterialNet] | None
+) -> FittedObject:
     """The networks before the first iteration, on the surface that a fit of these photographs starts from.
 
     `exposure`: radiance of the object in them.
@@ -73,7 +73,7 @@ def starting_ring(
     else:
         networks = (shape_net_of(config.shape_net, config.steps, config.solver, config.encoding, config.frequencies),
                     BRDFNet(scale, parameters, config.encoding, config.frequencies))  # fmt: skip
-    ring = Ring(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
+    ring = FittedObject(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
                 networks, capture.shape.ground, capture.shape.up, capture.shape.metres, config.material_at)  # fmt: skip
     require_networks(ring)
     return ring
@@ -132,7 +132,7 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
             )
 
 
-def require_networks(ring: Ring) -> None:
+def require_networks(ring: FittedObject) -> None:
     """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
     s = torch.zeros(2, 3, device=next(ring.parameters()).device)
     with torch.no_grad():

@@ -3,7 +3,7 @@
 import copy
 from typing import TYPE_CHECKING
 
-from mi_ring.ring.saved import ring_state
+from mi_ring.objects.ring_file import ring_state
 
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit

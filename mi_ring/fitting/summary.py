@@ -16,7 +16,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
 
     `light`: what it was taken to be. `photographs`: of each that was not kept out how far its picture of the object
     moved [px]; if cameras were refined how far it was turned and moved, if powers or gains were, the factor of each
-    colour. `refined`: the capture with all of it; `deviations`: as `mi_ring.fitting.certainty` has them.
+    colour. `refined`: the capture with all of it; `deviations`: as `mi_ring.fitting.covariance` has them.
     """
     calibration = fit.calibration
     assert calibration is not None

@@ -13,7 +13,7 @@ from torch import Tensor
 from mi_ring.fitting import priors
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.images import blur
-from mi_ring.nets.shapenet import Flow
+from mi_ring.nets.shape_net import Flow
 
 DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
 PATTERNED = 0.1  #: weight of the variation of a material that varies, by that of one that hardly does

@@ -1,4 +1,4 @@
 """Captures of other tools, one file a format, and the scene files that they become.
 
-May import: mitsuba, numpy, scipy, PIL, pycolmap, tyro; foreign, images, capture, rendering, geometry, system.
+May import: mitsuba, numpy, scipy, PIL, pycolmap, tyro; foreign, images, capture, rendering, scene, geometry, system.
 """

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import inverse, pinhole
+from mi_ring.importers.camera_models import inverse, pinhole
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
 from mi_ring.importers.reading import chosen, entry, existing, image_size, load_mat, load_table
 

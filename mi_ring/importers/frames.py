@@ -12,9 +12,9 @@ from tyro.conf import Positional, Suppress, arg
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.reading import image_size
-from mi_ring.rendering.lights import Light
+from mi_ring.scene.lights import Light
 from mi_ring.system import command
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's

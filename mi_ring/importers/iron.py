@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os.path import splitext
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import inverse, pinhole
+from mi_ring.importers.camera_models import inverse, pinhole
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.reading import first_file, image_size, load_json, matrix, with_suffix
 

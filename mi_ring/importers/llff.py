@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import load_npy
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import existing, image_size, matrix, pictures

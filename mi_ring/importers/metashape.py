@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens, brown
+from mi_ring.importers.camera_models import Lens, brown
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_xml, matrix

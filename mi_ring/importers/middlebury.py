@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import inverse, pinhole
+from mi_ring.importers.camera_models import inverse, pinhole
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, load_lines, matrix

@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import load_npy, load_npz
-from mi_ring.importers.cameras import decompose, pinhole
+from mi_ring.importers.camera_models import decompose, pinhole
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered
 

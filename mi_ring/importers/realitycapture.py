@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens, brown, inverse
+from mi_ring.importers.camera_models import Lens, brown, inverse
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, load_lines, load_xml, matrix, pictures

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError, is_file
-from mi_ring.importers.cameras import Lens, brown, inverse
+from mi_ring.importers.camera_models import Lens, brown, inverse
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_json, matrix

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens, brown
+from mi_ring.importers.camera_models import Lens, brown
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source, called
 from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
 

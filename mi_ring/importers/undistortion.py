@@ -7,7 +7,7 @@ import numpy as np
 import scipy.ndimage
 
 from mi_ring.images import linear_to_srgb, srgb_to_linear
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 
 
 class Undistorted(NamedTuple):

@@ -4,13 +4,13 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from mi_ring.ring.ring import Ring
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.optional import need
 
 STEP = 1e-3  #: from a triangle to both sides, in the normalised frame
 
 
-def inside_out(ring: Ring, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
+def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
     """Which triangles (F,) bool of a sampling of the domain, points (V, 3), Shape-Net flattens or turns inside out.
 
     Those for which what lay on their outer side lies on their inner side afterwards: det ∂Φ/∂s ≤ 0 there, if triangles
@@ -32,7 +32,7 @@ def inside_out(ring: Ring, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Which triangles (F,) bool cross another, by exact arithmetic: CGAL's, in the package libigl (extra `exact`).
 
-    The reference for `mi_ring.rendering.crossings`, which is faster and needs no other package; those that overlap in
+    The reference for `mi_ring.scene.self_intersections`, faster and without other packages; those that overlap in
     a plane, or touch, count as well. Raises InputError if it is not installed.
     """
     need("igl", "the exact count of crossing triangles", "libigl")

@@ -10,11 +10,11 @@ from mi_ring.capture.calibrated import moved
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
-from mi_ring.metrics.predictions import SPP, compare_photographs
+from mi_ring.metrics.image_errors import SPP, compare_photographs
 from mi_ring.metrics.surfaces import THRESHOLDS, alignment, compare_shapes, compare_surfaces, load_true_mesh
-from mi_ring.rendering.crossings import crossing_triangles
-from mi_ring.rendering.plain_mesh import scene_of
-from mi_ring.ring.saved import load_fit
+from mi_ring.objects.ring_file import load_fit
+from mi_ring.scene.plain_mesh import scene_of
+from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
 LINES = {  # of the table

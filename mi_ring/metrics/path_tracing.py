@@ -11,11 +11,11 @@ import numpy as np
 from mi_ring.capture.loading import open_scene
 from mi_ring.errors import InputError, SceneError
 from mi_ring.plugins import flash, photograph, shapenet
-from mi_ring.rendering.attributes import attributes_of, require_attributes
+from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs, pixel_rays
-from mi_ring.rendering.pictures import render_photographs
-from mi_ring.rendering.scenes import assembled, own_emitters, parted
-from mi_ring.rendering.shading import is_room
+from mi_ring.scene.assembly import assembled, own_emitters, parted
+from mi_ring.scene.lights import is_room
+from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
 
 BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
 LANES = 1 << 21  #: rays per launch, at most

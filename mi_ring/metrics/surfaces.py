@@ -14,8 +14,8 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
-from mi_ring.rendering.plain_mesh import scene_of
-from mi_ring.rendering.visibility import View, Visibility
+from mi_ring.scene.plain_mesh import scene_of
+from mi_ring.scene.visibility import View, Visibility
 from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured

@@ -7,7 +7,7 @@ from torch import nn
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import WIDTH
 from mi_ring.nets.registry import register_network
-from mi_ring.nets.shapenet import Flow, ShapeNet, VelocityField
+from mi_ring.nets.shape_net import Flow, ShapeNet, VelocityField
 from mi_ring.nets.solvers import Velocity
 
 

@@ -9,8 +9,8 @@ import scipy.ndimage
 import torch
 import trimesh
 
-from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.ring.ring import Ring
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
@@ -32,7 +32,7 @@ class Atlas(NamedTuple):
     subdivisions: int
 
 
-def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
+def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
     """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
     points, faces = ring.domain.sample(min(subdivisions, CUT))
     xatlas = need("xatlas", "textures")
@@ -48,14 +48,14 @@ def unwrap(ring: Ring, subdivisions: int, resolution: int = 1024, time: float = 
     return assemble(ring, s, uv, faces, subdivisions, time)
 
 
-def flowed(ring: Ring, s: np.ndarray, time: float = 1.0) -> np.ndarray:
+def flowed(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
     """The surface (V, 3) in the normalised frame at domain points (V, 3)."""
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
 
 def subdivide(
-    ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
+    ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Every triangle cut in four, new points on the domain; `more` (V, n) is interpolated like `uv`."""
     columns = [s, uv, *more]
@@ -66,7 +66,9 @@ def subdivide(
     return (s.astype(np.float32), rest[0], faces, *rest[1:])
 
 
-def assemble(ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float) -> Atlas:
+def assemble(
+    ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
+) -> Atlas:
     """An atlas with its vertices, normals and tangents."""
     points, normals, whole = seamless_surface(ring, s, faces, time)
     # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
@@ -89,7 +91,7 @@ def assemble(ring: Ring, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdi
 
 
 def seamless_surface(
-    ring: Ring, s: np.ndarray, faces: np.ndarray, time: float
+    ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (V, 3) in the normalised frame, smooth normals (V, 3) that know of no seam, and `Atlas.whole`."""
     once, whole = np.unique(s, axis=0, return_inverse=True)
@@ -108,7 +110,7 @@ class Texels:
     index: np.ndarray  # (resolution, resolution): which of the N
 
 
-def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
+def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
     """The texels of an atlas. The normals are those of the surface at the level of the fit, if that is finer."""
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
@@ -142,7 +144,7 @@ def rasterise(ring: Ring, atlas: Atlas, resolution: int, time: float = 1.0) -> T
     return Texels(at(s), local, number[tuple(nearest)])
 
 
-def reflectances(ring: Ring, s: np.ndarray) -> dict[str, np.ndarray]:
+def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
     """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.ambiguity import ambiguity
-from mi_ring.output.figures import svg_uri
-from mi_ring.rendering.rooms import COUNT, seen_from_within
-from mi_ring.rendering.scenes import lamp_lights
+from mi_ring.output.svg import svg_uri
+from mi_ring.rendering.spherical_harmonics import COUNT, seen_from_within
+from mi_ring.scene.assembly import lamp_lights
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 LISTED = 6  #: unknowns of one kind that are listed one by one
@@ -73,7 +73,7 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """How well photographs that were kept out are explained, as `mi_ring.fitting.holdout` has it."""
+    """How well photographs that were kept out are explained, as `mi_ring.fitting.validation` has it."""
     if not held_out:
         return "not asked, for the fit ended early"
     if "unexplained" not in held_out:

@@ -10,10 +10,10 @@ from scipy import ndimage
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.metrics.captures import PhotographQuality
+from mi_ring.metrics.capture_findings import PhotographQuality
 from mi_ring.metrics.mask_agreement import CONFORMS
 from mi_ring.metrics.surfaces import hits
-from mi_ring.rendering.plain_mesh import scene_of
+from mi_ring.scene.plain_mesh import scene_of
 
 CELL, LINE = 200, 16  # of the contact sheet: its photographs, lines of text [px]
 GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # names of photographs

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
-from mi_ring.rendering.attributes import constants
-from mi_ring.rendering.elements import load_bsdf
-from mi_ring.rendering.visibility import View, seen_of
-from mi_ring.ring.ring import Ring
+from mi_ring.scene.mesh_attributes import constants
+from mi_ring.scene.visibility import View, seen_of
+from mi_ring.scene.xml_elements import load_bsdf
 
 LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled`, but for glTF's
 
@@ -81,7 +81,7 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     raise InputError(f"{kind}: this material cannot be told in glTF's terms; write PLY or a scene for Mitsuba (.xml)")
 
 
-def require_expressible(ring: Ring) -> None:
+def require_expressible(ring: FittedObject) -> None:
     """Raise InputError if the material of a ring cannot be told in glTF's terms: before the work of baking it."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
@@ -106,7 +106,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def glb(
-    ring: Ring, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
+    ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
     views: Sequence[View] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The object as a GLB file with textures of `resolution` texels a side.

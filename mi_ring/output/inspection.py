@@ -9,7 +9,7 @@ from PIL import Image
 
 from mi_ring.capture.capture import Capture, sphere_of_cameras
 from mi_ring.geometry.hull import NoHull
-from mi_ring.metrics.captures import capture_findings, drop_empty, facing, measure, quality_table
+from mi_ring.metrics.capture_findings import capture_findings, drop_empty, facing, measure, quality_table
 from mi_ring.metrics.mask_agreement import agreements
 from mi_ring.output.capture_sheet import capture_sheet
 from mi_ring.system.files import write_file, writing

@@ -14,9 +14,9 @@ from mi_ring.images import write_image
 from mi_ring.output import gltf
 from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
-from mi_ring.rendering.lights import Lights
-from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.rendering.rooms import room_of, seen_from_within
+from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering.spherical_harmonics import room_of, seen_from_within
+from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.files import write_file
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import mitsuba as mi
 import torch
 
-from mi_ring.rendering.plain_mesh import mesh_of
-from mi_ring.rendering.visibility import View, seen_of
-from mi_ring.ring.ring import Ring
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.visibility import View, seen_of
 from mi_ring.system.files import write_file
 
 
 def write_mesh(
-    ring: Ring, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[View] | None = None
+    ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[View] | None = None
 ) -> float | None:
     """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …).
 

@@ -21,12 +21,12 @@ from skimage.registration import phase_cross_correlation
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.metrics.captures import moved_far
-from mi_ring.metrics.predictions import comparable
+from mi_ring.metrics.capture_findings import moved_far
+from mi_ring.metrics.image_errors import comparable
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output import calibration_panel
-from mi_ring.output.figures import svg_uri
+from mi_ring.output.svg import svg_uri
 from mi_ring.rendering import bridge
-from mi_ring.ring.ring import Ring
 from mi_ring.system.command import scene_name
 from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
@@ -102,7 +102,7 @@ def report_html(
     )  # fmt: skip
 
 
-def first_view(capture: Capture, ring: Ring) -> dict[str, list[float]]:
+def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
     eye = capture.sensors[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)

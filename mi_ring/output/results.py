@@ -14,15 +14,15 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import bridge
-from mi_ring.rendering.rooms import seen_from_within
-from mi_ring.rendering.scenes import lamp_lights
-from mi_ring.rendering.shading import shared_emitters
-from mi_ring.rendering.visibility import View
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import ring_state
+from mi_ring.rendering.spherical_harmonics import seen_from_within
+from mi_ring.scene.assembly import lamp_lights
+from mi_ring.scene.lights import shared_emitters
+from mi_ring.scene.visibility import View
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
@@ -189,7 +189,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
     return names
 
 
-def viewed(ring: Ring, views: Sequence[View] | None = None) -> bytes | None:
+def viewed(ring: FittedObject, views: Sequence[View] | None = None) -> bytes | None:
     """The object for the report's viewer as GLB, where that is possible."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:

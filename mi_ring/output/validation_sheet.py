@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.metrics.path_tracing import Pictures
-from mi_ring.metrics.statistics import Comparison, percent, probability
+from mi_ring.metrics.renderer_agreement import Comparison, percent, probability
 
 THUMBNAIL = 128  #: width and height of the contact sheet's pictures, at most [px]
 COLUMNS = ("path", "photometric", "8 x difference", "shadows", "4 x interreflection", "32 x unexplained")

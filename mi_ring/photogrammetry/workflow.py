@@ -11,20 +11,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.importers.cameras import Lens
+from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.photogrammetry.board import Board, Sighting, White, calibrate, white
-from mi_ring.photogrammetry.flash import Ball, Flash, find_flash
+from mi_ring.photogrammetry.capture_files import OBJECT, Shot, reduction
+from mi_ring.photogrammetry.flash_light import Ball, Flash, find_flash
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
-from mi_ring.photogrammetry.motion import Motion, model_points, structure_from_motion
-from mi_ring.photogrammetry.object import Object
-from mi_ring.photogrammetry.scene import OBJECT, Shot, reduction
-from mi_ring.photogrammetry.table import Plane
-from mi_ring.photogrammetry.trial import DIM
-from mi_ring.rendering.lights import Light
+from mi_ring.photogrammetry.marker_sheet import Board, Sighting, White, calibrate, white
+from mi_ring.photogrammetry.object_masks import Object
+from mi_ring.photogrammetry.shading_trial import DIM
+from mi_ring.photogrammetry.structure_from_motion import Motion, model_points, structure_from_motion
+from mi_ring.photogrammetry.table_plane import Plane
+from mi_ring.scene.lights import Light
 from mi_ring.system.files import write_file, writing
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress

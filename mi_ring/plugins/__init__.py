@@ -1,6 +1,6 @@
 """The Mitsuba plugins, one file each, named like it.
 
-May import: mitsuba, drjit, numpy, torch; rendering, ring, geometry.
+May import: mitsuba, drjit, numpy, torch; rendering, objects, scene, geometry.
 """
 
 import importlib

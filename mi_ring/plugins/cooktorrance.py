@@ -7,7 +7,7 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.rendering.shading import MIN_COSINE
+from mi_ring.rendering.direct_light import MIN_COSINE
 
 MIN_ROUGHNESS = 0.02  #: below it the highlight is narrower than float32 can integrate
 DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Beckmann}

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_ring.plugins.photograph import SHUTTER, Photograph
-from mi_ring.rendering.lights import FAR, cone
+from mi_ring.rendering.photograph_lights import FAR, cone
 
 
 def flash_light(it, sample=(0, 0), active=True):

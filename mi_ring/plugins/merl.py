@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.plugins.properties import beside_scene
-from mi_ring.rendering.measured import Network, Table
+from mi_ring.rendering.measured_brdf import Network, Table
 
 NODES = 180  #: at which the density of half vectors is known, by the square root of their angle
 TYPICAL = np.radians(30)  #: θd for which it is

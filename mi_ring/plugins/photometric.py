@@ -6,11 +6,11 @@ from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` ke
 
 from mi_ring.plugins.flash import flash_light
 from mi_ring.plugins.photograph import Photograph
-from mi_ring.rendering.attributes import require_attributes
-from mi_ring.rendering.boundaries import boundaries
-from mi_ring.rendering.edges import Edges
+from mi_ring.rendering.direct_light import shade
+from mi_ring.rendering.edge_gradients import boundaries
+from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.shading import shade
+from mi_ring.scene.mesh_attributes import require_attributes
 
 
 class Photometric(ADIntegrator):

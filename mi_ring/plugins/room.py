@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from mi_ring.plugins.photograph import SHUTTER, Photograph
 from mi_ring.plugins.properties import number_list
-from mi_ring.rendering.lights import FAR
-from mi_ring.rendering.rooms import ORDER, in_camera
+from mi_ring.rendering.photograph_lights import FAR
+from mi_ring.rendering.spherical_harmonics import ORDER, in_camera
 
 
 class Room(mi.Emitter):

@@ -4,8 +4,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.plugins.properties import beside_scene, number, vector
-from mi_ring.rendering.attributes import require_attributes
-from mi_ring.rendering.plain_mesh import FACES, POSITIONS
+from mi_ring.scene.mesh_attributes import require_attributes
+from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
 #: What says where a fit starts and what its result is to other programs; finished ones have it in them.
 FOR_FITS = "center", "radius", "domain", "ground", "up", "metres"
@@ -81,7 +81,7 @@ class ShapeNetMesh(mi.Mesh):
 
         from mi_ring.geometry.domain import Sphere, closed_domain
         from mi_ring.geometry.meshes import load_closed_mesh
-        from mi_ring.ring.saved import load_fit
+        from mi_ring.objects.ring_file import load_fit
 
         self.subdivisions = props.get("subdivisions", 5)
         if not isinstance(self.subdivisions, int) or self.subdivisions not in range(9):

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.rendering.plain_mesh import FACES, POSITIONS
+from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)

@@ -1,4 +1,4 @@
-"""Photographs of a surface, and their gradients: cameras, lights, shading, edges, and the seam to torch.
+"""Photographs of a surface and their gradients: cameras, light, edges, and the seam to torch.
 
-May import: mitsuba, drjit, numpy, torch; foreign, images, nets, ring, geometry.
+May import: mitsuba, drjit, numpy, torch; foreign, images, nets, objects, scene, geometry.
 """

@@ -14,15 +14,14 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mi_ring.images import blur
-from mi_ring.nets.brdfnet import COOK_TORRANCE, Parameter
-from mi_ring.rendering.edges import Edges
-from mi_ring.rendering.indirect import BOUNCES, render_indirect
-from mi_ring.rendering.lights import place_lamp
+from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
+from mi_ring.rendering.edge_selection import Edges
+from mi_ring.rendering.image_formation import render_maps, render_photographs
+from mi_ring.rendering.indirect_light import BOUNCES, render_indirect
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pictures import render_maps, render_photographs
-from mi_ring.rendering.plain_mesh import FACES, POSITIONS
-from mi_ring.rendering.scenes import dressed, lamp_lights, lamps_of, parted, with_lamps
-from mi_ring.rendering.shading import shared_emitters
+from mi_ring.scene.assembly import dressed, lamp_lights, lamps_of, parted, with_lamps
+from mi_ring.scene.lights import place_lamp, shared_emitters
+from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
 WIDTH, SPP = 32, 16  #: of interreflection [px], which varies slowly, and its paths per pixel
 USUAL = 1e-3, 1e4  #: radii [scene units] that are drawn as they are
@@ -43,10 +42,10 @@ def to_torch(array) -> Tensor:
 class Surface:
     """The `shapenet` shape of a loaded scene, as something that torch tensors are written to.
 
-    With a `Ring` it is a shape of its own, with the BSDF that the ring's parameters are those of, in a scene of its own
-    that shares all other objects with the given one and leaves that as it is. Without, it is the given shape itself.
-    Other shapes and top-level emitters of the scene take part in every picture but are not changed; a `table` does so
-    only by the light that it reflects onto the others.
+    With a `FittedObject` it is a shape of its own, with the BSDF that the ring's parameters are those of, in a scene of
+    its own that shares all other objects with the given one and leaves that as it is. Without, it is the given shape
+    itself. Other shapes and top-level emitters of the scene take part in every picture but are not changed; a `table`
+    does so only by the light that it reflects onto the others.
 
     `unit` is how many scene units are one of `scene`'s. Areas and their squares must be numbers in float32: a ring
     alone that is tiny or enormous is drawn in units of about its radius, unless it is to be drawn `as_it_is`.
@@ -116,7 +115,7 @@ class Surface:
             place_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
     def show(self, ring, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Write a `Ring` at domain points (V, 3) with these triangles, where the flow has them at `time` in [0, 1]."""
+        """Write a `FittedObject` at domain points (V, 3) with triangles, at this `time` of the flow, in [0, 1]."""
         with torch.no_grad():
             self.set_faces(faces)
             s = s.to(ring.center.device)
@@ -255,7 +254,7 @@ class Surroundings:
     """What reaches the camera from a surface by other ways than from its photograph's light at once; small pictures."""
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
-    which: list[int]  #: harmonics of `mi_ring.rendering.rooms`
+    which: list[int]  #: harmonics of `mi_ring.rendering.spherical_harmonics`
     harmonics: Tensor  #: (n, N, h, w, 3) of a room whose radiance is one of these harmonics
     free: Tensor  #: the same as the large picture has it, as if nothing were in the way of the light
     alpha: Tensor  #: (N, h, w) coverage

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.rendering.lights import Lights, cone
+from mi_ring.rendering.photograph_lights import Lights, cone
 from mi_ring.rendering.pinhole import camera_ray
-from mi_ring.rendering.rooms import shown
+from mi_ring.rendering.spherical_harmonics import shown
 
 LANES = 2**22  #: rays at once where memory is to be bounded: about a gigabyte
 
@@ -30,7 +30,9 @@ class Photographs:
     colocated: bool  #: is every light at its camera's centre? Then nothing that is seen is in shadow
     falloff: object = None  #: Float, one per photograph: exponent of its flash's cone; None if all shine to all sides
     distortion: object = None  #: Float, one per photograph: its lens' as `Camera` has it; None if no lens has any
-    room: np.ndarray | None = None  #: light of the room as in `mi_ring.rendering.rooms`, (BASIS, 3); None if it is dark
+    room: np.ndarray | None = (
+        None  #: light of the room as in `mi_ring.rendering.spherical_harmonics`, (BASIS, 3); None if it is dark
+    )
     dark: bool = False  #: have they no lights of their own, which are 0 strong?
     before: int = 0  #: how many others come before them, rendered elsewhere: random numbers are as if all were together
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering.lights import Light
+from mi_ring.scene.lights import Light
 
 Format = Literal["exr", "png16", "png8"]
 

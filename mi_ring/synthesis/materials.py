@@ -14,7 +14,7 @@ from mi_ring.capture.scenefile import move_names
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.images import read_image
-from mi_ring.rendering.elements import load_element
+from mi_ring.scene.xml_elements import load_element
 
 COLOURS = "vertex_color"  #: name of the mesh attribute that has the colours of the mesh's file
 COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: what a mesh with colours is made of

@@ -12,10 +12,10 @@ from mi_ring.capture.scenefile import Element, emitter_element, table_element
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
-from mi_ring.photogrammetry.board import DOTS, page
-from mi_ring.rendering.elements import load_element
-from mi_ring.rendering.lights import Light
-from mi_ring.rendering.plain_mesh import mesh_of
+from mi_ring.photogrammetry.marker_sheet import DOTS, page
+from mi_ring.scene.lights import Light
+from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis.materials import COLOURS, Pattern
 from mi_ring.synthesis.tracing import Shot, Window, averaged, covered, flashed_along, radiance_along, rays_of
 

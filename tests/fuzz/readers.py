@@ -39,14 +39,14 @@ from mi_ring.importers.reading import has_alpha, image_size, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.captures import told_before
+from mi_ring.metrics.capture_findings import told_before
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured import CELLS, Network, Table
-from mi_ring.ring.ring import Ring
-from mi_ring.ring.saved import load_fit, ring_state
-from mi_ring.synthesis.capture import Production
-from mi_ring.synthesis.config import SynthesizeConfig
+from mi_ring.rendering.measured_brdf import CELLS, Network, Table
+from mi_ring.synthesis.options import SynthesizeConfig
+from mi_ring.synthesis.path_traced_capture import Production
 from mi_ring.system.files import write_state
 
 SIZE = W, H = 7, 5  #: of pictures [px]
@@ -282,13 +282,15 @@ def scene(folder: Path) -> Reader:
     return Reader([path], read)
 
 
-def small_ring() -> Ring:
+def small_ring() -> FittedObject:
     """With a domain of its own."""
     from mi_ring.geometry.domain import Domain
 
     torch.manual_seed(0)
     ball = trimesh.creation.icosphere(subdivisions=1)
-    return Ring([1.0, 2.0, 3.0], 2.5, domain=Domain(ball.vertices, ball.faces), steps=2, subdivisions=2, up=[0, 0, 1.0])
+    return FittedObject(
+        [1.0, 2.0, 3.0], 2.5, domain=Domain(ball.vertices, ball.faces), steps=2, subdivisions=2, up=[0, 0, 1.0]
+    )
 
 
 def ring(folder: Path) -> Reader:

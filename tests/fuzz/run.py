@@ -46,7 +46,8 @@ ROOM = 2 * 2**30  #: bytes that a case may ask for
 LIFE = 50_000  #: cases of a process, which Mitsuba's objects outlive
 ALIKE = 3  #: findings of one kind of which the files are kept
 GUIDING = (
-    "mi_ring.importers", "mi_ring.capture", "mi_ring.ring.saved", "mi_ring.images", "mi_ring.photogrammetry.folder",
+    "mi_ring.importers", "mi_ring.capture", "mi_ring.objects.ring_file", "mi_ring.images",
+    "mi_ring.photogrammetry.folder",
     "mi_ring.foreign", "tifffile", "zipfile", "json", "csv",
 )  # fmt: skip
 

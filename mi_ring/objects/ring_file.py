@@ -1,0 +1,146 @@
+"""`ring.pt`: a reconstructed object as a file, its networks by their registered names."""
+
+import io
+import math
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from mi_ring.errors import InputError
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets import resnet  # noqa: F401  (registers it)
+from mi_ring.nets.registry import architecture_of, build
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.system.files import is_sealed
+from mi_ring.version import __version__
+
+FORMAT = 4  #: version of the file
+FINEST, MOST_STEPS = 8, 10_000  #: level, Euler steps
+ADVICE = "give the results folder of a fit, or its ring.pt"
+
+
+def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
+    """What `ring.pt` holds, to be written by `write_state`. Raises ValueError for networks that are not registered."""
+    domain = None
+    if not isinstance(ring.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
+        domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
+    return {
+        "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
+        "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
+        "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
+        "up": ring.up, "metres": ring.metres, "material_at": ring.material_at,
+    }  # fmt: skip
+
+
+def ring_of(state: dict) -> FittedObject:
+    """The inverse of `ring_state`.
+
+    Raises InputError for networks that are not registered here; KeyError, RuntimeError, TypeError or ValueError for
+    what no `ring_state` can be.
+    """
+    domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
+    for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
+        require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
+    ring = FittedObject(
+        torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
+        subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
+        ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
+        material_at=sys.intern(state.get("material_at", "domain")),  # as that of a fit anew, so that files are equal
+    )  # fmt: skip
+    ring.load_state_dict(state["networks"])
+    require_sound(ring)
+    return ring
+
+
+def require_sound(ring: FittedObject) -> None:
+    """Raise ValueError for an object that no fit has."""
+    for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
+        require(bool(value.isfinite().all()), f"{name} is not finite")
+    require(float(ring.radius) > 0, f"the radius is {float(ring.radius):.4g}")
+    require(type(ring.subdivisions) is int and 0 <= ring.subdivisions <= FINEST, f"level {ring.subdivisions}")
+    steps = getattr(ring.shape_net, "steps", 1)
+    require(type(steps) is int and 1 <= steps <= MOST_STEPS, f"{steps} steps")
+    require(ring.metres is None or 0 < ring.metres < math.inf, f"a unit of {ring.metres} m")
+    require(ring.ground is None or ring.ground.shape == (2, 3), "ground is no place and normal")
+    require(ring.up is None or (len(ring.up) == 3 and all(map(math.isfinite, ring.up))), "up is no direction")
+    require(isinstance(ring.bsdf, str), "the BSDF is no XML")
+    require(ring.material_at in ("domain", "surface"), f"a material at {ring.material_at}")
+    points, faces = ring.domain.points, ring.domain.faces
+    require(points.shape[1:] == faces.shape[1:] == (3,) and bool(np.isfinite(points).all()), "the domain is no mesh")
+    require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")
+    closed = trimesh.Trimesh(points, faces, process=False, validate=False).is_watertight
+    require(closed, "the domain is no closed surface")
+
+
+def require(condition: bool, otherwise: str) -> None:
+    """Raise ValueError unless it holds."""
+    if not condition:
+        raise ValueError(otherwise)
+
+
+def migrated(state: dict) -> dict:
+    """The state of a file of format 3, which mi_ring 0.1 wrote, as of today."""
+    return state | {
+        "format": FORMAT, "shape_net": {"name": "shapenet", "arguments": {"steps": state["steps"]}},
+        "brdf_net": {"name": "brdfnet", "arguments": {"parameters": state["parameters"]}},
+        "subdivisions": state["config"].get("subdivisions", 6),
+    }  # fmt: skip
+
+
+def read_state(path: Path, kind: str, advice: str) -> dict:
+    """What `write_state` wrote. Raises InputError if there is no such file, if it is damaged or not of this `kind`.
+
+    Files of before had no seal; they have but the checks of zip files.
+    """
+    try:
+        content = path.read_bytes()
+        whole = is_sealed(content)
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        if isinstance(state, dict) and state.pop("sealed", False) and not whole:
+            raise ValueError("the seal is broken")
+        if not whole:
+            require_intact(content)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+    except Exception as error:  # what torch makes of other bytes is of any kind
+        # Its words are advice to load files that may run anything.
+        raise InputError(f"{path}: not {kind}, or damaged; {advice}") from error
+    if not isinstance(state, dict):
+        raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")
+    return state
+
+
+def require_intact(content: bytes) -> None:
+    """Raise ValueError if a part of a zip file is not as it was, as far as that tells."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if damaged := archive.testzip():
+            raise ValueError(f"{damaged} is damaged")
+
+
+def load_fit(path: str | Path) -> FittedObject:
+    """The object of a fit: from its results folder, or from a `ring.pt`.
+
+    Raises InputError if there is none, if it was written by a newer mi_ring or by one that is too old, and if its
+    networks are not registered here.
+    """
+    path = Path(path)
+    path = path / "ring.pt" if path.is_dir() else path
+    state = read_state(path, "a saved fit", ADVICE)
+    if "format" not in state or "networks" not in state:
+        raise InputError(f"{path}: not a saved fit; {ADVICE}")
+    version = state["format"]
+    if version not in (3, FORMAT):
+        raise InputError(f"{path}: format version {version}, of mi_ring {state.get('mi_ring', '0.1 or older')}; this "
+                         f"one, {__version__}, reads versions 3 and {FORMAT}")  # fmt: skip
+    try:
+        return ring_of(migrated(state) if version == 3 else state)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (AttributeError, IndexError, KeyError, TypeError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: damaged, or of other networks than it says ({error!r})") from error

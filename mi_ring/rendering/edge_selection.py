@@ -1,0 +1,170 @@
+"""Edges of meshes along which a photograph jumps and whose motion shading does not see: outlines, creases, shadows."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.errors import SceneError
+from mi_ring.rendering.edge_curves import CURVES, ROOT, Curve, outline_of
+
+SMOOTH, CREASE, BORDER = 0, 1, 2  # edges of a mesh where the normals of both sides agree or differ, or where it ends
+SAMPLES, SAMPLES_IN_ALL = 4, 2048  #: per edge of a mesh, and at least of all edges together, were all of them seen
+
+
+class Edges:
+    """The edges of all shapes of a scene, and which of them an eye sees as outlines.
+
+    An eye is a function of the photograph (UInt32) that returns (Vector3f, Bool): a point and True, or the direction
+    toward an eye that is infinitely far away and False. It may be attached.
+
+    Raises SceneError for a kind of shape whose outline is not known.
+    """
+
+    def __init__(self, scene):
+        self.shapes = list(scene.shapes())
+        # Mitsuba's rectangle is a mesh as well, whose vertices are not attached to its `to_world`.
+        self.others = [shape for shape in self.shapes if shape.class_name() in CURVES]
+        self.meshes = [shape for shape in self.shapes if shape not in self.others]
+        for shape in self.meshes:
+            if not shape.is_mesh():
+                raise SceneError(
+                    f'photometric: no gradients with shape "{shape.id()}", a {shape.class_name()}: '
+                    f"use meshes or {', '.join(CURVES)}"
+                )
+        # While they are held, no other array can have their indices.
+        self.buffers = [mesh.faces_buffer() for mesh in self.meshes]
+        meshes_faces = [np.array(buffer).reshape(-1, 3) for buffer in self.buffers]
+        vertices, triangles = 0, 0  # of the meshes before
+        corners, tables = [np.zeros((0, 3))], [np.zeros((5, 0))]
+        for mesh, faces in zip(self.meshes, meshes_faces):
+            corners.append(faces + vertices)
+            tables.append(edge_table(mesh, faces) + np.array([[vertices, vertices, triangles, triangles, 0]]).T)
+            vertices += mesh.vertex_count()
+            triangles += len(faces)
+        self.corners = mi.UInt32(np.concatenate(corners).astype(np.uint32).ravel())
+        table = np.concatenate(tables, 1).astype(np.uint32)
+        self.v0, self.v1, self.f0, self.f1, self.kind = (mi.UInt32(row) for row in table)
+
+    @classmethod
+    def of(cls, scene, known: "Edges | None" = None) -> "Edges":
+        """The edges of a scene: `known`, if they are still those."""
+        if known is not None and list(scene.shapes()) == known.shapes:
+            now = (mesh.faces_buffer() for mesh in known.meshes)
+            if all(a.index == b.index for a, b in zip(now, known.buffers)):
+                return known
+        return cls(scene)
+
+    def positions(self):
+        """Vertices of all meshes, one after another (Float), attached."""
+        buffers = [mesh.vertex_positions_buffer() for mesh in self.meshes]
+        return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
+
+    def fronts(self, eye, views):
+        """Which triangles show their front to the eye: Bool, all triangles of photograph 0, those of 1, …"""
+        count = dr.width(self.corners) // 3
+        lane = dr.arange(mi.UInt32, count * views)
+        where, finite = eye(lane // count)
+        corner = dr.gather(mi.Point3u, self.corners, lane % count)
+        positions = dr.detach(self.positions())
+        a, b, c = (dr.gather(mi.Point3f, positions, index) for index in corner)
+        front = dr.dot(dr.cross(b - a, c - a), where - dr.select(finite, a, 0)) > 0
+        dr.eval(front)
+        return front
+
+    def sides(self, fronts, lanes=None, views=1):
+        """(edge, do its first and its second triangle show their fronts?) of these lanes, or of all `views`."""
+        count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
+        lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
+        view, edge = lane // count, lane % count
+        first, second = (
+            dr.gather(mi.Bool, fronts, view * triangles + dr.gather(mi.UInt32, f, edge)) for f in (self.f0, self.f1)
+        )
+        return edge, first, second
+
+    def sample(self, lanes, seed, before=0, shadow=False) -> Curve:
+        """Stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
+        count = dr.width(self.kind)
+        each = max(SAMPLES, SAMPLES_IN_ALL // count)
+        local = dr.arange(mi.UInt32, dr.width(lanes) * each)
+        each = dr.opaque(mi.UInt32, each)  # it changes: no part of the kernel
+        chosen = dr.gather(mi.UInt32, lanes, local // each)
+        lane = (chosen + dr.opaque(mi.UInt32, before * count)) * each + local % each
+        t = (mi.Float(local % each) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / mi.Float(each)
+        positions, edge = self.positions(), chosen % count
+        a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
+        piece = dr.detach(b - a) / mi.Float(each)
+        p = a * (1 - t) + b * t  # dr.lerp would add its two gradients of `a` in an order that is not always the same
+        return Curve(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
+
+    def middle(self, edge):
+        """The centre of the two triangles at an edge, detached."""
+        positions, corners = dr.detach(self.positions()), mi.Point3f(0)
+        for face in (self.f0, self.f1):
+            for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
+                corners += dr.gather(mi.Point3f, positions, vertex) / 6
+        return corners
+
+    def outlines(self, eye, views, seed, before=0):
+        """(curves, fronts): what may be an outline or a crease to the eye of each of so many photographs."""
+        curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
+        fronts = None
+        if self.meshes:
+            fronts = self.fronts(eye, views)
+            edge, first, second = self.sides(fronts, views=views)
+            kind = dr.gather(mi.UInt32, self.kind, edge)
+            lanes = dr.compress((first != second) | (kind != SMOOTH))
+            if dr.width(lanes):
+                curves.append(self.sample(lanes, seed, before))
+        return curves, fronts
+
+    def shadow_casters(self, light, views, seed, seen, before=0):
+        """(casters, terminators): what may cast the edge of a shadow, and where one may begin on a shape itself.
+
+        `light` is an eye; `seen` are the `fronts` of the cameras. Casters are the outlines that the light sees.
+        Terminators are those edges of meshes among them that a camera sees from the front on both sides: the triangle
+        that turns away from the light is black even where interpolated normals still face it.
+        """
+        casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
+        terminators = []
+        if self.meshes:
+            edge, first, second = self.sides(self.fronts(light, views), views=views)
+            kind = dr.gather(mi.UInt32, self.kind, edge)
+            lanes = dr.compress((first != second) | (kind == BORDER))
+            if dr.width(lanes):
+                casters.append(self.sample(lanes, seed, before))
+                edge, first, second = self.sides(seen, lanes)
+                both = dr.compress(first & second & (dr.gather(mi.UInt32, self.kind, edge) == SMOOTH))
+                if dr.width(both):
+                    lanes = dr.gather(mi.UInt32, lanes, both)
+                    terminators.append(self.sample(lanes, seed + 1, before, shadow=True))
+        return casters, terminators
+
+
+def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
+    """Edges of a mesh: (5, E), the vertices v0 and v1, the triangles that hold (v0, v1) and (v1, v0), and the kind."""
+    weld = np.arange(mesh.vertex_count())
+    table = paired(faces, weld)
+    if (table[4] == BORDER).any():  # perhaps only a seam, where vertices are there twice
+        positions = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
+        weld = np.unique(positions, axis=0, return_inverse=True)[1].ravel()
+        table = paired(faces, weld)
+    if not mesh.has_vertex_normals():
+        table[4] = np.maximum(table[4], CREASE)
+    return table
+
+
+def paired(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
+    """`edge_table` with smooth normals; vertices of equal `weld` (V,) are the same point."""
+    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
+    triangle = np.repeat(np.arange(len(faces)), 3)
+    a, b = weld[start], weld[end]
+    key = np.minimum(a, b) * len(weld) + np.maximum(a, b)
+    order = np.lexsort((a > b, key))
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))  # of each group of half-edges at the same place
+    size = np.diff(first, append=len(order))
+    h0 = order[first]
+    h1 = order[np.minimum(first + 1, len(order) - 1)]
+    pair = (size == 2) & (a[h0] == b[h1]) & (a[h1] == b[h0])
+    seam = (start[h0] != end[h1]) | (end[h0] != start[h1])
+    kind = np.where(pair, np.where(seam, CREASE, SMOOTH), BORDER)
+    return np.stack([start[h0], end[h0], triangle[h0], np.where(pair, triangle[h1], triangle[h0]), kind])

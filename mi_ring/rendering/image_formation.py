@@ -1,0 +1,51 @@
+"""Photographs of a scene in one launch, each under its own light: radiance, coverage, maps."""
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_ring.rendering.direct_light import next_2d, trace
+from mi_ring.rendering.edge_gradients import boundaries
+from mi_ring.rendering.photographs import center_rays, pixel_rays
+
+
+def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
+    """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, attached.
+
+    Box-filtered linear radiance. Without `edges` the gradient is that of shading between the edges. `pixels`: only this
+    range (first, last + 1) of them, counted through all photographs; not together with `edges`.
+    """
+    ray, view = pixel_rays(photographs, spp, seed, pixels)
+    lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.lanes_before(spp, pixels[0] if pixels else 0)
+    channels = trace(scene, ray, view, photographs, shadows, next_2d(seed, dr.width(ray), lane))
+    dr.schedule(channels)  # together: block_sum would otherwise render once per channel
+    channels = [dr.block_sum(c, spp) / spp for c in channels]
+    if edges is None:
+        return channels
+    width, height = photographs.size
+    for where, view, step, active in boundaries(scene, photographs, edges, seed, shadows):
+        pixel = view * (width * height) + mi.UInt32(where.y) * width + mi.UInt32(where.x)
+        for k, value in enumerate(step):
+            motion = dr.zeros(mi.Float, dr.width(channels[k]))
+            dr.scatter_add(motion, value, pixel, active)
+            channels[k] += motion
+    return channels
+
+
+def render_maps(scene, photographs, attributes, pixels=None):
+    """Normals, and mesh attributes (channels by name) of the shapes that have them, at the centres of pixels.
+
+    Returns Floats of N·H·W pixels: [nx, ny, nz, first attribute, …], normals in world space, zero where there is none;
+    of this range (first, last + 1) of `pixels` or of all.
+    """
+    si = scene.ray_intersect(center_rays(photographs, pixels)[0])
+    maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]
+    for name, channels in attributes.items():
+        values = [mi.Float(0)] * channels
+        for shape in scene.shapes():
+            if shape.is_mesh() and shape.has_attribute(name):
+                here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+                one = channels == 1
+                found = [shape.eval_attribute_1(name, si, here)] if one else shape.eval_attribute_3(name, si, here)
+                values = [dr.select(here, new, old) for new, old in zip(found, values)]
+        maps += values
+    return maps

@@ -1,4 +1,0 @@
-"""A reconstructed object: both networks with their domain and normalisation, and its material, edited or exchanged.
-
-May import: numpy, torch, trimesh; nets, geometry, system.
-"""

@@ -1,0 +1,89 @@
+"""The lights of a scene: point lights and directional ones as numbers and as Mitsuba's emitters."""
+
+from typing import Literal, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+LAMPS = "PointLight", "DirectionalEmitter"  #: classes of emitters that `Light` is one of
+
+
+class Light(NamedTuple):
+    """The light of one photograph, or a lamp, in the world."""
+
+    kind: Literal["point", "directional"]
+    vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
+    rgb: np.ndarray  #: (3,) intensity [W/sr], or irradiance [W/m²]
+
+
+def place_of(emitter):
+    """Where a lamp is, attached: (Vector3f, True), or (direction toward it, False) if it is infinitely far away.
+
+    None for lamps that are neither: area lights, environment maps.
+    """
+    params = mi.traverse(emitter)
+    match emitter.class_name():
+        case "PointLight":
+            return mi.Vector3f(params["position"]), True
+        case "SpotLight":
+            m = params["to_world"].matrix
+            return mi.Vector3f(m[0, 3], m[1, 3], m[2, 3]), True
+        case "DirectionalEmitter":
+            m = params["to_world"].matrix
+            return -mi.Vector3f(m[0, 2], m[1, 2], m[2, 2]), False
+
+
+def light_of(emitter) -> Light:
+    """One of `LAMPS` as numbers."""
+    where, finite = place_of(emitter)
+    vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
+    return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
+
+
+def emitter_of(light: Light) -> mi.Emitter:
+    """A light as an emitter of Mitsuba."""
+    vector = light.vector.tolist()
+    where = {"position": vector} if light.kind == "point" else {"direction": vector}
+    strength = "intensity" if light.kind == "point" else "irradiance"
+    return mi.load_dict({"type": light.kind, **where, strength: {"type": "rgb", "value": light.rgb.tolist()}})
+
+
+def place_lamp(emitter, place, strength) -> None:
+    """Change an emitter that `emitter_of` has made: its position, or the unit direction toward it, and its RGB.
+
+    All may be attached.
+    """
+    params = mi.traverse(emitter)
+    if emitter.class_name() == "PointLight":
+        params["position"], params["intensity.value"] = mi.Point3f(place), strength
+    else:
+        frame = mi.Frame3f(-mi.Vector3f(place))
+        rows = [[frame.s[k], frame.t[k], frame.n[k], 0] for k in range(3)]
+        params["to_world"] = mi.Transform4f(mi.Matrix4f(*rows, [0, 0, 0, 1]))
+        params["irradiance.value"] = strength
+    params.update()
+
+
+def strength_of(emitter):
+    """The RGB of a point light or of a directional one, attached."""
+    name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
+    return mi.Color3f(mi.traverse(emitter)[name])
+
+
+def shared_emitters(scene, rooms: bool = False) -> list:
+    """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own.
+
+    Without `rooms`, which `Photographs` hold, none of `room` either.
+    """
+    return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
+
+
+def is_flash(emitter) -> bool:
+    """Is it a `flash`, whatever the variant that its class belongs to?"""
+    return getattr(emitter, "of_photographs", False)
+
+
+def is_room(emitter) -> bool:
+    """Is it a `room`, whatever the variant that its class belongs to?"""
+    return getattr(emitter, "of_rooms", False)

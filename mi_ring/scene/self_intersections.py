@@ -1,0 +1,40 @@
+"""Triangles of a mesh that cross others: where a surface runs through itself."""
+
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.scene.plain_mesh import scene_of
+
+STEP = 1e-6  #: past a triangle that was met, for a mesh of size 1: more than what float32 rounds off
+
+
+def crossing_triangles(vertices, faces) -> np.ndarray:
+    """Which triangles (F,) bool of a mesh without seams, vertices (V, 3) and faces (F, 3), cross another.
+
+    Two triangles cross where an edge of one pierces the other: all edges are traced as rays. Those that share a vertex
+    with the edge are not pierced by it; triangles that overlap in one plane do not count.
+    """
+    vertices, faces = np.asarray(vertices, float), np.asarray(faces)
+    low, high = vertices.min(0), vertices.max(0)
+    vertices = (vertices - (low + high) / 2) / (high - low).max()  # for float32
+    scene, crossing = scene_of(vertices, faces), np.zeros(len(faces), bool)
+    # Each edge once, and the triangles that have it.
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, edge_of = np.unique(sides, axis=0, return_inverse=True)
+    pierces = np.zeros(len(edges), bool)
+    origin, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    along, reached = along / np.maximum(length, 1e-30)[:, None], np.zeros(len(edges))
+    lanes = np.flatnonzero(length > 0)
+    while len(lanes):
+        start = origin[lanes] + along[lanes] * reached[lanes, None]
+        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*along[lanes].T.astype(np.float32)))
+        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))
+        hit = scene.ray_intersect_preliminary(ray)
+        valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))
+        lanes, t, triangle = lanes[valid], t[valid], triangle[valid]
+        apart = (faces[triangle][:, :, None] != edges[lanes][:, None]).all((1, 2))
+        crossing[triangle[apart]] = pierces[lanes[apart]] = True
+        reached[lanes] += t + STEP
+        lanes = lanes[reached[lanes] < length[lanes]]
+    return crossing | pierces[edge_of].reshape(-1, 3).any(1)

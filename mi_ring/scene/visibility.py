@@ -1,0 +1,85 @@
+"""What the photographs show of a surface, and what none of them does."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import torch
+
+from mi_ring.geometry.camera import Camera
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.plain_mesh import mesh_of
+
+STEP = 1e-5  #: off the surface that a ray leaves, for a mesh of size 1: more than what float32 rounds off
+
+
+class View(NamedTuple):
+    """From where a photograph sees, and which of its pixels say something."""
+
+    camera: Camera
+    valid: np.ndarray | None  #: (H, W) uint8, 0 where it shows nothing; None if all of it shows something
+
+
+class Visibility:
+    """Which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one view shows.
+
+    A view shows a point that faces its camera, lies within its frame at a pixel that says something, and is not hidden
+    by the mesh itself.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> None:
+        self.vertices = np.asarray(vertices, float)
+        low, high = self.vertices.min(0), self.vertices.max(0)
+        self.middle, self.size = (low + high) / 2, (high - low).max()
+        self.mesh = mesh_of((self.vertices - self.middle) / self.size, faces)  # for float32
+        self.scene = mi.load_dict({"type": "scene", "mesh": self.mesh})
+        # Photographs that differ in their light alone show the same.
+        keys = [(*(np.asarray(part).tobytes() for part in v.camera), id(v.valid)) for v in views]
+        self.views = list(dict(zip(keys, views)).values())
+
+    def of_vertices(self) -> np.ndarray:
+        """Which of its vertices (V,) bool, by the smooth normals there."""
+        return self.of(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
+
+    def of(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Which of these points (N, 3) [scene units] of the surface, with unit normals (N, 3), (N,) bool."""
+        points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
+        seen = np.zeros(len(points), bool)
+        start = (points - self.middle) / self.size + STEP * normals
+        for view in self.views:
+            eye = view.camera.position - points
+            lanes = np.flatnonzero(~seen & ((normals * eye).sum(1) > 0))
+            lanes = lanes[shown(view, points[lanes])]
+            if not len(lanes):  # Dr.Jit traces no empty arrays
+                continue
+            along = (view.camera.position - self.middle) / self.size - start[lanes]
+            distance = np.linalg.norm(along, axis=1, keepdims=True)
+            origin, direction = (mi.Vector3f(*a.T.astype(np.float32)) for a in (start[lanes], along / distance))
+            ray = mi.Ray3f(mi.Point3f(origin), direction)
+            ray.maxt = mi.Float(distance[:, 0].astype(np.float32))
+            seen[lanes] = ~np.array(self.scene.ray_test(ray))
+        return seen
+
+
+def shown(view: View, points: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) [scene units] are in front of the camera and at a pixel that says something, (N,) bool."""
+    pixels, depth = view.camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < view.camera.size).all(1)
+    if view.valid is not None:
+        column, row = pixels[inside].astype(int).T
+        inside[inside] = view.valid[row, column] > 127
+    return inside
+
+
+def seen_of(ring: FittedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Which domain points (V, 3) become a part of the object that a view shows, (V,) bool; `faces` (F, 3) join them.
+
+    And the share of the object's area that no view shows.
+    """
+    with torch.no_grad():
+        vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()
+    seen = Visibility(vertices, faces, views).of_vertices()
+    a, b, c = vertices[faces].transpose(1, 0, 2).astype(float)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return seen, float((areas * (~seen)[faces].mean(1)).sum() / areas.sum())

@@ -1,0 +1,95 @@
+"""A small capture of the package's own making: flash photographs of a pot, path traced by stock Mitsuba."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.interpolate import CubicSpline
+
+from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.scene.lights import Light
+from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.synthesis.stage import Stage
+from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.viewpoints import GOLDEN, look_at
+from mi_ring.system.progress import progress
+
+CENTER, HEIGHT = np.array([40.0, -15.0, 110.0]), 80.0  #: of the pot [mm]; y is up
+VIEWS, SIZE, FOCAL = 28, 192, 400.0  #: photographs, their pixels and focal length [px]
+DISTANCE = 230.0  #: from the camera to the pot [mm]
+FLASH = np.array([18.0, 12.0, 0.0])  #: beside the lens: to the left and above [mm]
+SPP, DEPTH = 64, 4  #: paths per pixel, and the longest
+BRIGHTNESS = 0.9  #: linear radiance of a white surface that faces the flash, in the pictures
+
+#: Radius and height of the pot, in its height: foot, belly, shoulder, neck, lip, and a top that is closed.
+PROFILE = np.array([
+    (0.0, -0.5), (0.19, -0.49), (0.19, -0.43), (0.24, -0.33), (0.36, -0.1), (0.31, 0.14), (0.18, 0.28), (0.16, 0.36),
+    (0.23, 0.46), (0.16, 0.49), (0.0, 0.46),
+])  # fmt: skip
+
+
+class Object(NamedTuple):
+    """A mesh with colours."""
+
+    vertices: np.ndarray  #: (V, 3) [mm]
+    faces: np.ndarray  #: (F, 3)
+    colours: np.ndarray  #: (V, 3)
+
+
+def pot(level: int = 6) -> Object:
+    """A closed pot: a profile turned about y, fluted, flattened and leaning a little."""
+    sphere = trimesh.creation.icosphere(subdivisions=level)
+    x, y, z = sphere.vertices.T
+    t, angle = np.arccos(np.clip(-y, -1, 1)) / np.pi, np.arctan2(z, x)  # along the profile, from the foot up; around it
+    along = np.append(0, np.cumsum(np.linalg.norm(np.diff(PROFILE, axis=0), axis=1)))
+    # At both ends the profile is level and its radius straight: no tips.
+    radius, height = (
+        CubicSpline(along / along[-1], values, bc_type=((order, 0.0), (order, 0.0)))(t)
+        for values, order in zip(PROFILE.T, (2, 1))
+    )
+    radius *= 1 + 0.05 * np.cos(7 * angle + 9 * height) * np.exp(-(((height + 0.1) / 0.18) ** 2))
+    place = np.stack([radius * np.cos(angle) + 0.06 * height, height, 0.92 * radius * np.sin(angle)], 1)
+    mixed = 0.5 + 0.5 * np.tanh(6 * np.sin(5 * np.pi * height + 5 * radius * np.sin(2 * angle)))[:, None]
+    colours = mixed * [0.55, 0.16, 0.08] + (1 - mixed) * [0.12, 0.3, 0.42]
+    return Object(CENTER + HEIGHT * place, sphere.faces, colours)
+
+
+def cameras() -> list[Camera]:
+    """From all around, evenly: points of a Fibonacci spiral."""
+    result = []
+    for k in range(VIEWS):
+        y = 1 - 2 * (k + 0.5) / VIEWS
+        turn = k * GOLDEN
+        direction = np.array([np.cos(turn) * np.sqrt(1 - y * y), y, np.sin(turn) * np.sqrt(1 - y * y)])
+        up = np.array([0.0, 1.0, 0.0] if abs(y) < 0.9 else [1.0, 0.0, 0.0])
+        to_world = look_at(CENTER + DISTANCE * direction, CENTER, up)
+        result.append(Camera(to_world, np.full(2, FOCAL), np.full(2, SIZE / 2), (SIZE, SIZE)))
+    return result
+
+
+def write_example(folder: Path, spp: int = SPP) -> None:
+    """Write scene.xml, images/, masks/ and truth/mesh.ply into a folder that is there."""
+    vertices, faces, colours = pot()
+    mesh = mesh_of(vertices, faces)
+    mesh.add_attribute("vertex_color", 3, colours.ravel().tolist())
+    glaze = {"type": "principled", "roughness": 0.45, "specular": 0.6,
+             "base_color": {"type": "mesh_attribute", "name": "vertex_color"}}  # fmt: skip
+    mesh.set_bsdf(mi.load_dict(glaze))
+    for name in ("images", "masks", "truth"):
+        (folder / name).mkdir()
+    mesh.write_ply(str(folder / "truth" / "mesh.ply"))
+    stage, elements = Stage(mesh, vertices), list[Element]()
+    for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
+        position = camera.position + camera.to_world[:3, :3] @ FLASH
+        light = Light("point", position, np.full(3, np.pi * BRIGHTNESS * DISTANCE**2))
+        name, shot = f"{k:03}", Shot(camera)
+        picture = stage.radiance(shot, light, spp, k, DEPTH)
+        write_image(to_bytes(linear_to_srgb(picture)), folder / "images" / f"{name}.png")
+        write_image(to_bytes(stage.coverage(shot)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
+        files = f"images/{name}.png", f"masks/{name}.png"
+        elements.append(photograph_element(name, files[0], camera, light, files[1], calibrated=True))
+    (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
