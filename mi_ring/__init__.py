@@ -47,6 +47,7 @@ _API = {
     "ShapeNet": "nets.shape_net", "Flow": "nets.shape_net", "BRDFNet": "nets.brdf_net", "MaterialNet": "nets.brdf_net",
     "register_network": "nets.registry", "plain_autograd": "nets.mlp",
     "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
+    "Lighting": "fitting.lighting", "choose_lighting": "fitting.light_selection",
 }  # fmt: skip
 
 __all__ = [

@@ -1,18 +1,14 @@
-"""Cameras, lights, room and camera curve as unknowns: what a fit refines besides surface and material.
+"""Calibration as a fit refines it: the unknowns of cameras and lights with their values, and the light of the room.
 
-The paper refines calibration together with the shape (its Table 3). Gauges, what no photograph can tell: brightness
-against albedo, but for interreflection (the logarithms of `power` and `gain` have the mean zero in each colour, and
-`scale` takes the reflectance along); where the whole is, how it is turned and how large it is, which only the priors
-hold; focal length against distance, likewise; the cone of a flash against vignetting, nearly, where it is beside the
-lens. A room that is alike from all sides is in the world's axes and in the camera's: it counts as the world's. One
-fixed in the camera looks like a flash that is elsewhere, and like another reflectance: it is refined only where the
-scene has one.
+The paper refines calibration together with the shape (its Table 3). Room light that is the same from all sides has no
+axes of its own: it counts as fixed in the world. Room light fixed in the camera looks like a flash elsewhere, or like
+another reflectance. It is refined only if the scene has some.
 """
 
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,65 +17,43 @@ from torch import Tensor, nn
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
+from mi_ring.fitting.camera_response import CameraResponse
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.curve import Curve
-from mi_ring.fitting.lamps import Lamps
-from mi_ring.fitting.room_light import Room
-from mi_ring.geometry.camera import Camera, distortion_range, straightening
-from mi_ring.geometry.rotations import quarter_turns, rotations
+from mi_ring.fitting.light_tensors import LightTensors
+from mi_ring.fitting.rig import Estimate, Rig, Views
+from mi_ring.fitting.room_light import RoomLight
+from mi_ring.fitting.schedule import Rate, Stepper
+from mi_ring.fitting.unknowns import UNKNOWNS, Unknown, centred
+from mi_ring.geometry.camera import Camera, straightening
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
-from mi_ring.scene.assembly import has_table, lamp_lights, lamps_of
+from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
-#: What is refined together, and the standard deviation of each unknown: of its prior, and the unit of its steps.
-UNKNOWNS: dict[str, dict[str, float]] = {
-    "cameras": {
-        "turn": 0.01,  # about each axis of the camera [rad]
-        "move": 0.005,  # along each axis of the camera [median distance from the cameras to the object]
-    },
-    "focal": {"focal": 0.01},  # logarithm, one for each lens
-    "principal": {"principal": 0.01},  # along both axes of the picture, one for each lens [focal lengths]
-    "distortion": {"distortion": 0.05},  # first radial one, for each lens
-    "light": {"light": 0.1},  # along each axis [the same distance]; of distant ones [rad]
-    "power": {"power": 0.1},  # logarithm, of each photograph and colour
-    "falloff": {"falloff": 1.0},  # exponent of the cosine about the flash's axis
-    "vignetting": {"vignetting": 1.0},  # exponent of the cosine about the lens'
-    "curve": {"curve": 0.2},  # logarithm of the exponent
-    "contrast": {"contrast": 0.2},  # logarithm of how steep the curve's S is
-    "gain": {"gain": 0.1},  # logarithm, of each photograph and colour
-    "scale": {"scale": 0.7},  # logarithm of the power of all lights together
-    "ambient": {},  # `Room`
-    "lamps": {
-        "lamp": 0.1,  # of those of the scene, as `light`
-        "strength": 0.5,  # logarithm, of each lamp and colour
-    },
-}
-#: What is refined by default; `scale`, too, where it must be wrong. Of a flash what is beside the lens: one ahead looks
-#: like a darker surface. Not `curve`: it looks like another, and takes light and room along (docs/phone.md).
+#: What `--refine auto` stands for; `scale` is added where the lights' intensities cannot be true. Of a flash it refines
+#: the place beside the lens: a flash farther ahead looks like a darker surface. Not `curve`: it looks like another
+#: reflectance, too (docs: phone captures).
 AUTO = "light", "power", "ambient"
-#: What is unknown under each `Config.light` that is.
-NOBODY_KNOWS = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
-OF_ONE = {"cameras", "power", "gain"}  #: what is another in each photograph; steps of their own find it
-#: What is of the photographs' own lights, which an unknown environment takes the place of.
-OF_LIGHTS = {"light", "power", "falloff", "scale"}
-VAGUE = 3.0  #: times as wide are priors, and steps, of where lights are that nobody has measured
-RIGID = 0.02  #: how much the place of a flash may vary in the camera's axes [the same distance]
-START = 0.2  #: progress of the fit when refinement begins
-LIT = 0.15  #: and when that of the room's light does
-RATE = 0.1  #: of Adam, in standard deviations an iteration
+#: What is refined under each kind of unknown light.
+UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
+#: All options with values in a calibration, in order.
+OPTIONS = [*dict.fromkeys(unknown.option for unknown in UNKNOWNS.values())]
+OPTIONS.insert(OPTIONS.index("lamps"), "ambient")
+START = 0.2  #: progress of the fit at which refinement begins
+ROOM_START = 0.15  #: and at which that of the room's light begins
+RATE = 0.1  #: Adam's learning rate [standard deviations]
 
 
-def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ...]:
-    """Names of what a fit refines: as `Config.refine` says, `auto` by what the capture says of itself.
+def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
+    """The options of `--refine` that a fit refines; `auto` depends on what the capture says about itself.
 
-    `albedo`: the object's, by the lights' intensities.
+    `light`: kind of the `Lighting`. `albedo`: the object's, according to the lights' intensities.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
-    unknown = NOBODY_KNOWS.get(config.light)
+    unknown = UNDER_UNKNOWN_LIGHT.get(light)
     if unknown or capture.photographs.dark:
         names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
@@ -88,263 +62,185 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
-    return tuple(name for name in UNKNOWNS if name in names and (name != "lamps" or lamps_of(capture.scene)))
+    return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
 
 
-def overall(refined: Sequence[str], albedo: float) -> float:
-    """The factor of the lights' power that `scale` begins with: 1, or what makes an impossible albedo a usual one."""
+def initial_power(refined: Sequence[str], albedo: float) -> float:
+    """Initial factor of all lights' strengths: 1, or what turns an impossible albedo into a usual one for `scale`."""
     return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0
 
 
-class Calibrated(NamedTuple):
-    """Cameras and lights of all P photographs."""
-
-    cameras: Tensor  #: (P, 3, 4) camera-to-world
-    intrinsics: Tensor  #: (P, 4) fx, fy, cx, cy [px]
-    places: Tensor  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
-    strengths: Tensor  #: (P, 3) intensities, of distant ones irradiances
-    falloff: Tensor  #: (P,) exponents of flashes' cones
-    distortion: Tensor  #: (P,) first radial ones of the lenses
-
-
 class Calibration(nn.Module):
-    """The unknowns, each in units of its prior's standard deviation: zero where the capture is right."""
-
-    base: Calibrated
+    """The values of the unknowns, each in units of its prior's standard deviation: 0 where the capture is right."""
 
     def __init__(
-        self, capture: Capture, refined: Sequence[str], center: np.ndarray, exposure: float, power: float = 1.0,
-        fitted: np.ndarray | None = None, frames: Collection[str] = ("world",), guessed: bool = False,
-        ahead: bool = True,
-    ) -> None:  # fmt: skip
-        """`refined`: of `UNKNOWNS`; `center` (3,): of the object; `exposure`: its radiance, where the curve stays.
+        self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
+    ) -> None:
+        """`refined`: options of `--refine`. `frames`: axes in which the room's light is fixed.
 
-        `power`: a factor of what the capture says of the lights' intensities, to begin with; `fitted`: indices of the
-        photographs that are not kept out, by default all; `frames`: axes in which a room's light is fixed; `guessed`:
-        has nobody measured where the lights are? `ahead`: may a flash be found along its camera's axis, too?
+        Raises InputError if `falloff` is refined without a flash that moves with the camera.
         """
         super().__init__()
-        self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
-        cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
-        to_world = np.stack([camera.to_world[:3] for camera in cameras])
-        intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
-        cones = np.array([sensor.cone for sensor in capture.sensors])
-        distortion = np.array([camera.distortion for camera in cameras])
-        #: Does any lens have a distortion, or one that is to be found?
-        self.bent = bool(distortion.any()) or "distortion" in refined
-        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, distortion
-        self.base = Calibrated(*(torch.from_numpy(array).float() for array in arrays))
-        self.center = torch.from_numpy(np.asarray(center)).float()
-        self.finite = torch.from_numpy(lights.is_finite())[:, None]
-        self.distance = float(np.median(np.linalg.norm(to_world[:, :, 3] - center, axis=1)))
-        inside = torch.einsum("pji,pj->pi", self.base.cameras[:, :, :3], self.base.places - self.base.cameras[:, :, 3])
-        #: (P, 3, 3) turns of the cameras' axes, of photographs that are held on their side
-        self.held = quarter_turns(inside, RIGID * self.distance)
-        level = (self.held.mT @ inside[..., None])[..., 0]
-        self.level = level.mean(0)  #: (3,) where the flash is in the axes of a camera that is held upright
-        #: (P, 3) where the lights are in the cameras' axes if they are one flash that moves with the camera, else None
-        spread = float((level.amax(0) - level.amin(0)).max())
-        self.flash = inside if self.finite.all() and spread < RIGID * self.distance and not guessed else None
-        self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  # components of `light`
-        if "falloff" in refined and self.flash is None:
-            raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
-                             "falloff is for a flash that does; leave it out")  # fmt: skip
-        self.lamps = Lamps.of(lamp_lights(capture.scene) if "lamps" in refined else [])  #: unknown
-        self.sizes = [sensor.size for sensor in capture.sensors]
-        self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
-        self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
-        self.gains = torch.from_numpy(np.stack([sensor.gain for sensor in capture.sensors])).float()
-        kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
-        lenses = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
-        relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
-        places = np.unique(relative.round(6), axis=0, return_inverse=True)[1].ravel()
-        places = places if self.flash is None else np.zeros_like(places)
-        self.lens, self.place = torch.from_numpy(lenses), torch.from_numpy(places)
-        count = len(cameras)
-        self.fitted = torch.arange(count) if fitted is None else torch.from_numpy(fitted)
-        shapes = {"turn": (count, 3), "move": (count, 3), "focal": (int(lenses.max()) + 1,),
-                  "principal": (int(lenses.max()) + 1, 2), "distortion": (int(lenses.max()) + 1,),
-                  "falloff": (), "vignetting": (),
-                  "light": (int(places.max()) + 1, 3), "power": (count, 3), "gain": (count, 3),
-                  "curve": (), "contrast": (), "scale": (),
-                  "lamp": self.lamps.places.shape, "strength": self.lamps.places.shape}  # fmt: skip
-        vague = dict.fromkeys(("light", "lamp"), VAGUE if guessed else 1.0)
-        self.widths = {name: width * vague.get(name, 1.0)
-                       for group in self.refined for name, width in UNKNOWNS[group].items()}  # fmt: skip
-        for name in self.widths:
-            self.register_parameter(name, nn.Parameter(torch.zeros(shapes[name])))
+        self.refined, self.rig = tuple(refined), rig
+        self.unknowns: dict[str, Unknown] = {n: u for n, u in UNKNOWNS.items() if u.option in refined}
+        if "falloff" in refined and rig.flash is None:
+            raise InputError(f"{rig.path}: emitter: the lights do not move with the cameras, but --refine falloff "
+                             "is for a flash that does; leave it out")  # fmt: skip
+        self.bent = bool(rig.views.distortion.any()) or "distortion" in refined  #: Is there any lens distortion?
+        self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
+        for name, unknown in self.unknowns.items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
         given = capture.photographs.room
-        room = torch.zeros(BASIS, 3) if given is None else power * torch.from_numpy(given).float()
-        self.room = Room(room, exposure, frames, capture.photographs.dark and not shared_emitters(capture.scene))
+        room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
+        alone = capture.photographs.dark and not shared_emitters(capture.scene)
+        self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
-        """An unknown in its own unit; 0 if it is none."""
+        """An unknown in its own unit; 0 if it is not refined."""
         return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
 
-    def forward(self) -> Calibrated:
-        """Cameras and lights as they are by now."""
-        cameras, intrinsics, places, strengths, falloff, distortion = self.base
-        if "cameras" in self.refined:
-            turned = cameras[:, :, :3] @ rotations(self.value("turn"))
-            moved = cameras[:, :, 3:] + cameras[:, :, :3] @ (self.value("move") * self.distance)[..., None]
-            cameras = torch.cat([turned, moved], 2)
-        if "focal" in self.refined:
-            factor = self.value("focal").exp()[self.lens, None]
-            intrinsics = torch.cat([intrinsics[:, :2] * factor, intrinsics[:, 2:]], 1)
-        if "principal" in self.refined:
-            shift = self.value("principal")[self.lens] * intrinsics[:, :2]
-            intrinsics = torch.cat([intrinsics[:, :2], intrinsics[:, 2:] + shift], 1)
-        if self.bent:
-            now = intrinsics.detach()
-            least, most = distortion_range(now[:, :2], now[:, 2:], torch.tensor(self.sizes))
-            if "distortion" in self.refined:
-                distortion = distortion + self.value("distortion")[self.lens]
-            distortion = distortion.clamp(0.999 * least, 0.999 * most)
-        offset = (self.free * self.value("light")).expand(int(self.place.max()) + 1, 3)[self.place]
-        if self.flash is not None:
-            moved = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
-            places = cameras[:, :, 3] + (cameras[:, :, :3] @ moved)[..., 0]
-        else:
-            places = Lamps(places, self.finite, strengths).moved(offset, self.distance).places
-        scale = self.value("scale").detach()  # the reflectance is as much less: only `bounced` tells of it
-        strengths = strengths * (scale + self.centred("power")).exp()
-        return Calibrated(cameras, intrinsics, places, strengths, falloff + self.value("falloff"), distortion)
+    def estimate(self) -> Estimate:
+        """Cameras, lights and response with the current values."""
+        now = self.rig.estimate()
+        for name, unknown in self.unknowns.items():
+            now = unknown.apply(now, self.value(name), self.rig)
+        return now
 
-    def lamps_now(self) -> Lamps:
-        """The lamps of the scene as they are by now."""
-        factor = self.first_power * (self.value("strength") + self.value("scale").detach()).exp()
-        return self.lamps._replace(strengths=factor * self.lamps.strengths).moved(self.value("lamp"), self.distance)
+    def forward(self, scale: int = 1) -> Views:
+        """Cameras and lights with the current values, for photographs `scale` times smaller."""
+        views = self.rig.views_of(self.estimate(), self.bent)
+        return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
+
+    def lamps(self) -> LightTensors:
+        """The scene's own lamps with the current values."""
+        return self.rig.lamps_of(self.estimate())
 
     def lamp_tensors(self) -> list[Tensor]:
-        """What `bridge.render` takes as `lamps`: nothing if these stay as they are."""
+        """Places and strengths of the lamps for the renderer; empty if they are not refined."""
         if "lamps" not in self.refined:
             return []
-        now = self.lamps_now()
+        now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
+
+    def solves_room(self, progress: float) -> bool:
+        """Is the room's light solved for at this progress? From the start if there is no other light."""
+        return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
     @torch.no_grad()
     def relight(self, surface: bridge.Surface) -> None:
-        """Light a surface by the lamps of the scene as they are by now."""
+        """Light a surface by the scene's lamps with their current values."""
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
 
-    def centred(self, name: str) -> Tensor:
-        """(P, 3) `power` or `gain`, logarithms of factors, of mean 0; 0 of photographs that are kept out."""
-        found = self.value(name).expand(len(self.lens), 3)
-        result = torch.zeros_like(found)
-        result[self.fitted] = found[self.fitted] - found[self.fitted].mean(0)
-        return result
-
-    def scaled(self, scale: int) -> Calibrated:
-        """For photographs `scale` times smaller."""
-        calibrated = self()
-        return calibrated._replace(intrinsics=calibrated.intrinsics / scale)
-
     @property
-    def reflecting(self) -> float:
-        """The factor of the reflectance that keeps directly lit surfaces as bright as they are, whatever `scale` is."""
+    def albedo_factor(self) -> float:
+        """Factor of the albedo that keeps directly lit surfaces as bright as they are, whatever `scale` is."""
         return math.exp(-float(self.value("scale").detach()))
 
     @property
-    def strengthened(self) -> float:
-        """The factor of the power of all lights that has been found."""
-        return self.first_power / self.reflecting
+    def power(self) -> float:
+        """Factor of all lights' strengths that was found."""
+        return self.rig.power / self.albedo_factor
 
-    def bounced(self, interreflection: Tensor) -> Tensor:
-        """Light that has bounced between surfaces, attached to `scale`.
+    def indirect(self, light: Tensor) -> Tensor:
+        """Interreflection (n, H, W, 3), attached to `scale`.
 
-        All other unknowns keep it as it is: it is one more reflection by a surface that is darker by as much as lights
-        are stronger.
+        Stronger lights mean a darker surface. Each further bounce loses one factor of the albedo.
         """
-        scale = self.value("scale").to(interreflection)
-        return interreflection * (scale.detach() - scale).exp()
+        scale = self.value("scale").to(light)
+        return light * (scale.detach() - scale).exp()
 
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """(N, H, W, 1) of the angles between the optical axis and the rays of photographs, `scale` times smaller."""
-        width, height = (size // scale for size in self.sizes[index[0]])
-        at = self.scaled(scale)
-        fx, fy, cx, cy = (at.intrinsics[index].detach().T)[..., None, None]
+        """(N, H, W, 1) cosines between the optical axis and the rays of photographs, `scale` times smaller."""
+        width, height = (size // scale for size in self.rig.sizes[index[0]])
+        views = self(scale)
+        fx, fy, cx, cy = (views.intrinsics[index].detach().T)[..., None, None]
         x = (torch.arange(width) + 0.5 - cx) / fx
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
         if self.bent:
-            distance2 = distance2 * straightening(at.distortion[index].detach()[:, None, None], distance2) ** 2
+            distance2 = distance2 * straightening(views.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
-    @property
-    def curve_now(self) -> Curve:
-        """What lens and curve make of radiance by now."""
-        exponent, contrast, vignetting = (
-            self.value(name) if name in self.widths else None for name in ("curve", "contrast", "vignetting")
-        )
-        gain = self.centred("gain").detach().exp() if "gain" in self.widths else None
-        return Curve(exponent, contrast, vignetting, self.gammas, self.dimmed, self.exposure, self.gains, gain)
+    def response(self) -> CameraResponse:
+        """The camera response with the current values."""
+        return self.estimate().response
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """`Curve.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
-        curve = self.curve_now
-        return curve.recorded(radiance, index, self.cosines(index, scale) if curve.shading else None)
+        """`CameraResponse.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
+        response = self.response()
+        return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """The inverse of `recorded`, without gradients."""
-        curve = self.curve_now
-        return curve.linear(recorded, index, self.cosines(index, scale) if curve.shading else None)
+        response = self.response()
+        return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
-    def as_found(self, photographs: Photographs, calibrated: Sequence[Tensor]) -> Photographs:
-        """Photographs with cameras and lights as `calibrated`, and the room as it is by now; without gradients."""
-        room = self.roomlight().double().numpy(force=True)
-        return replace(bridge.calibrated(photographs, calibrated), room=room if room.any() else None)
+    def refined_photographs(self, photographs: Photographs, views: Sequence[Tensor]) -> Photographs:
+        """Photographs with these cameras and lights, and the current room light; without gradients."""
+        room = self.room_harmonics().double().numpy(force=True)
+        return replace(bridge.calibrated(photographs, views), room=room if room.any() else None)
 
-    def roomlight(self) -> Tensor:
-        """(BASIS, 3) harmonics of the room's light as they are by now; what a scene says goes with `scale`."""
+    def room_harmonics(self) -> Tensor:
+        """(BASIS, 3) current harmonics of the room light; if only the scene says them, `scale` applies to them."""
         harmonics = self.room.harmonics
-        return harmonics if "ambient" in self.refined else harmonics / self.reflecting
+        return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
 
+    @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """(3,) a room's light on the object, mean over all directions, by that of the flash where it faces it.
+        """(3,) the room's mean irradiance relative to the flash's on a surface that faces it.
 
-        Where there is none, its mean radiance.
+        Without a flash: the room's mean radiance.
         """
-        with torch.no_grad():
-            now = self()
-            distance2 = torch.where(self.finite, (now.places - self.center).square().sum(-1, keepdim=True), 1.0)
-            mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
-            own = (now.strengths / distance2).median(0).values
-            return mean / own if bool((own > 0).all()) else mean / math.pi
+        now = self()
+        distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
+        mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
+        own = (now.strengths / distance2).median(0).values
+        return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
-        """Half the mean over the photographs of the squares, of the unknowns in their standard deviations."""
-        return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.lens)
+        """Half the sum of squares of all unknowns, in standard deviations, divided by the number of photographs."""
+        return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
-    def optimizers(self) -> list[torch.optim.Optimizer]:
-        """Adam, whose groups say when they begin, for all but what is `OF_ONE`; none if nothing is left to find."""
-        found = [UNKNOWNS[group] for group in self.refined if group not in OF_ONE]
-        groups = [{"params": [getattr(self, name) for name in names], "initial_lr": RATE, "start": START}
-                  for names in found if names]  # fmt: skip
-        return [torch.optim.Adam(groups, lr=RATE)] if groups else []
+    def optimizers(self, decay: float) -> list[Stepper]:
+        """Adam for all unknowns but those of single photographs, which have solvers of their own."""
+        groups: dict[str, list[Tensor]] = {}
+        for name, unknown in self.unknowns.items():
+            if unknown.per != "photograph":
+                groups.setdefault(unknown.option, []).append(getattr(self, name))
+        if not groups:
+            return []
+        adam = torch.optim.Adam([{"params": group} for group in groups.values()], lr=RATE)
+        return [Stepper(adam, [Rate(RATE, decay, START)] * len(groups))]
 
-    def unknown(self, name: str) -> tuple[Tensor, Tensor]:
-        """An unknown of all photographs as it is, to be changed in place, and as the capture says."""
-        if name == "ambient":
-            return self.room.harmonics, self.room.given
-        return getattr(self, name), torch.zeros_like(getattr(self, name))
+    def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
+        """Of each unknown of an option: its tensor, to be changed in place, and its value as the capture says."""
+        if option == "ambient":
+            return [(self.room.harmonics, self.room.given)]
+        own = [getattr(self, name) for name, unknown in self.unknowns.items() if unknown.option == option]
+        return [(tensor, torch.zeros_like(tensor)) for tensor in own]
 
+    @torch.no_grad()
     def applied(self, capture: Capture) -> Capture:
-        """The capture with cameras, lights and curve as they are by now."""
-        with torch.no_grad():
-            matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in self())
-            gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
-            contrast, gains = float(self.value("contrast").exp()), self.centred("gain").double().exp().numpy()
-        # The curve's fixed point is the exposure here, full scale in a scene file.
-        level = self.exposure ** ((1 - gamma) / gamma)
+        """The capture with the current cameras, lights and response."""
+        estimate = self.estimate()
+        views, lamps = self.rig.views_of(estimate, self.bent), self.rig.lamps_of(estimate)
+        matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in views)
+        gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
+        contrast = float(self.value("contrast").exp())
+        # The curve keeps the exposure here, and full scale in a scene file.
+        level = self.rig.exposure ** ((1 - gamma) / gamma)
         cameras = []
         for k, sensor in enumerate(capture.sensors):
             to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
             cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size, distortion[k]))
-        lights = Lamps(torch.from_numpy(places), self.finite, torch.from_numpy(level * strengths)).lights()
-        now, room = self.lamps_now(), None
-        lamps = now._replace(strengths=level * now.strengths).lights() if "lamps" in self.refined else None
+        lights = LightTensors(torch.from_numpy(places), self.rig.finite, torch.from_numpy(level * strengths)).lights()
+        refined = lamps._replace(strengths=level * lamps.strengths).lights() if "lamps" in self.refined else None
+        room: Any = None
         if "ambient" in self.refined or capture.photographs.room is not None:
-            room = self.roomlight().double().numpy(force=True) * level
-        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast, gains, lamps)
+            room = self.room_harmonics().double().numpy(force=True) * level
+        gains = centred(self.value("gain"), self.rig).double().exp().numpy() if "gain" in self.refined else 1.0
+        return with_calibration(
+            capture, cameras, lights, gamma, room, falloff.tolist(), vignetting, contrast, gains, refined
+        )

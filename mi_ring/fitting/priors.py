@@ -67,12 +67,12 @@ def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
 
 def normal_variation(it: Iteration) -> Tensor:
     """Over that of a sphere of the object's size."""
-    return variation_of_normals(it.vertices, it.faces) / (8 * math.pi * it.fit.ring.radius)
+    return variation_of_normals(it.prediction.vertices, it.batch.faces) / (8 * math.pi * it.context.model.ring.radius)
 
 
 def material_variation(it: Iteration) -> Tensor:
     """Per radius of the object. The shape does not follow it."""
-    return variation_per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
+    return variation_per_radius(it, columns_of(it.prediction.material, it.context.model.ring.brdf_net))
 
 
 def albedo_variation(it: Iteration) -> Tensor:
@@ -81,8 +81,8 @@ def albedo_variation(it: Iteration) -> Tensor:
     Of how much is reflected by its mean: half as much in twice the light is the same. Of what has an upper end (a
     roughness) the logits: as shares they would vary less near its ends.
     """
-    net = it.fit.ring.brdf_net
-    values = columns_of(it.material, net)
+    net = it.context.model.ring.brdf_net
+    values = columns_of(it.prediction.material, net)
     ends = torch.tensor([math.isfinite(p.high) for p in net.bsdf_parameters for _ in range(p.channels)])
     values = torch.where(ends.to(values.device), values.logit(FAINT), values / values.mean(0).clamp(min=FAINT))
     return variation_per_radius(it, values)
@@ -90,9 +90,9 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 def variation_per_radius(it: Iteration, values: Tensor) -> Tensor:
     """How fast values (V, n) at the vertices change over the surface, in the mean, times the object's radius."""
-    return it.fit.ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
+    return it.context.model.ring.radius * variation_of_values(it.prediction.vertices.detach(), it.batch.faces, values)
 
 
 def material_rank(it: Iteration) -> Tensor:
     """Of the material at all vertices."""
-    return number_of_bases(columns_of(it.material, it.fit.ring.brdf_net))
+    return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

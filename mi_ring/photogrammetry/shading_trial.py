@@ -64,6 +64,6 @@ def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress
         fit = Fit(capture, SETTINGS)
         for _ in progress(fit, "a trial fit", fit.iterations):
             pass
-    fit.surface.show(fit.ring, *fit.ring.domain.sample(SETTINGS.subdivisions))
-    drawn = (bridge.draw(fit.surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
+    surface = fit.renderer.showing(fit.model, SETTINGS.subdivisions)
+    drawn = (bridge.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]
