@@ -14,7 +14,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture, require_scene
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, parse_options
-from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure
+from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
 from mi_ring.fitting.checkpoint import read_checkpoint, resumed
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.light_selection import choose_lighting
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
         costs = None
         if config.minutes and not state:
             config, costs = planned(choice, fit, started)
-            fit.replan(config)
+            replan(fit, config)
         options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
         prepare = partial(results.prepare_folder, folder, config.scene, options)
         processes.on_first(lambda: prepare(config.resume))

@@ -21,7 +21,7 @@ from mi_ring.capture.decoding import decode, recorded
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import validation
-from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotations
+from mi_ring.calibration.calibration import UNKNOWNS, Calibration, refined_of, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.images import linear_to_srgb

@@ -13,7 +13,7 @@ from conftest import photographed_ellipsoid
 from test_bridge import OFF_CAMERA, Setting, tensor
 
 import mi_ring
-from mi_ring.fitting.calibration import Calibration, refined_of
+from mi_ring.calibration.calibration import Calibration, refined_of
 from mi_ring.fitting.covariance import deviations
 from mi_ring.fitting.light_selection import Trials, brightest
 from mi_ring.fitting.lighting import Lighting, lit, moved

@@ -17,7 +17,7 @@ from mi_ring import export
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import light_selection, priors
-from mi_ring.fitting.calibration import Calibration, refined_of
+from mi_ring.calibration.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table

@@ -13,7 +13,7 @@ from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, m
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, room_element, room_elements, scene_bytes
-from mi_ring.fitting.room_light import Room
+from mi_ring.calibration.room_light import Room
 from mi_ring.rendering import bridge, indirect_light
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs

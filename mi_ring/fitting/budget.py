@@ -44,6 +44,12 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
     return costs
 
 
+def replan(fit: Fit, config: Config) -> None:
+    """Change stages, iterations, level or regulariser of a fit that has not begun."""
+    fit.problem = fit.optimisation.problem = replace(fit.problem, config=config)
+    fit.ring.subdivisions, fit.schedule = config.subdivisions, fit.plan(config)
+
+
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
     """The stages of fits with these settings, from the start of this one."""
     return [stage for config in configs for stage in fit.plan(config).stages]

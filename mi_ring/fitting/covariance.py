@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mi_ring.fitting.calibration import Calibration
+from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.losses import perceived
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem

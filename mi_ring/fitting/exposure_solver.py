@@ -7,8 +7,9 @@ do not depend on the size of an error, ended 2.1 % off where powers were off by 
 import torch
 from torch import Tensor
 
-from mi_ring.fitting.calibration import START, Calibration
+from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.refinement import START
 from mi_ring.fitting.schedule import Rate, Stepper
 
 RATE = Rate(0.5, 0.1, START)  #: share of a comparison by which an estimate moves

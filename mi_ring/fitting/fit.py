@@ -3,7 +3,6 @@
 import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.iteration import Context, Iteration
 from mi_ring.fitting.lighting import AMBIGUOUS, Lighting
-from mi_ring.fitting.mask_refinement import REFINED_AT, Masks, find_masks, with_masks
+from mi_ring.fitting.mask_refinement import find_masks, with_masks
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.optimisation import Optimisation
 from mi_ring.fitting.problem import Problem
@@ -29,7 +28,6 @@ from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.start import require_settings, starting_ring
 from mi_ring.fitting.terms import Loss, TermLike
 from mi_ring.fitting.validation import validate
-from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
@@ -39,7 +37,6 @@ from mi_ring.output.fit_result import FitResult
 from mi_ring.rendering import bridge
 from mi_ring.system.machine import release_memory
 
-LOG_EVERY = 5  #: iterations between entries of the log
 PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: parts of a fit with a state of their own
 
 
@@ -65,37 +62,32 @@ class Fit:
         state: dict[str, Any] | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
         config = config or Config()
-        self.loss = Loss(terms, config.weights)
-        self.callbacks = list(callbacks)
+        self.loss, self.callbacks = Loss(terms, config.weights), list(callbacks)
         require_settings(capture, config)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         lighting = Lighting(*state["lighting"]) if state else lighting or Lighting.of(capture, config)
         if config.deterministic:
             recompute_normals(capture.scene)
-        self.problem = problem = Problem.of(capture, config, lighting)
+        self.problem = Problem.of(capture, config, lighting)
         torch.manual_seed(config.seed)
-        ring = ring_of(state["ring"]) if state else starting_ring(problem, networks)
-        if self.loss.needs_velocity and not hasattr(ring.shape_net, "velocity"):
-            raise InputError(f"networks: {type(ring.shape_net).__name__}: has no velocity, which the term of that "
-                             "name needs; give it one, or the term the weight 0")  # fmt: skip
-        self.model = Model(problem, ring.to(problem.device))
-        near = not isinstance(ring.domain, Sphere)  # a hull or a mesh
+        ring = ring_of(state["ring"]) if state else starting_ring(self.problem, networks)
+        self.loss.require_velocity(ring.shape_net)
+        self.model = Model(self.problem, ring.to(self.problem.device))
         settling = lighting.kind in AMBIGUOUS and self.loss.weight("settling") > 0
-        self.plan: Callable[[Config], Schedule] = lambda config: Schedule.of(config, near, settling)
+        self.plan: Callable[[Config], Schedule] = lambda config: Schedule.of(config, self.model.starts_near, settling)
         self.schedule = self.plan(config)
-        self.sampler, self.renderer = Sampler(problem), Renderer(problem, ring)
-        self.optimisation = Optimisation(problem, self.model, near, self.loss.terms)
-        self.regulariser = RegulariserStrength()
-        self.capture = problem.capture  #: with the masks that are used now
-        self.course = Course()
+        self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, ring)
+        self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
+        self.regulariser, self.course = RegulariserStrength(), Course()
+        self.capture = self.problem.capture  #: with the masks that are used now
         if state:
-            self.restore(state)
-        self.fix_surface()
+            self.restore(copy.deepcopy(state))
+        self.optimisation.settle(self.schedule, self.iteration)
 
     def __iter__(self) -> Iterator[Iteration]:
         """The iterations that are left, each when it is done."""
-        while self.course.iteration < self.iterations:
+        while self.iteration < self.iterations:
             yield self.step()
 
     def run(self) -> FittedObject:
@@ -106,21 +98,21 @@ class Fit:
 
     def step(self) -> Iteration:
         """One iteration. Raises InputError if the fit diverges, RuntimeError if no iteration is left."""
-        if self.course.iteration >= self.iterations:
+        if self.iteration >= self.iterations:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
-        self.refine_masks()
-        batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.course.iteration)
+        if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
+            self.refine_masks()
+        batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
         observation = self.sampler.observe(self.problem, self.capture, batch)
         prediction = self.renderer.predict(self.problem, self.model, batch)
         it = Iteration(batch, observation, prediction, self.context())
         loss = self.loss(it)
         self.optimisation.step(loss, it)
-        self.model.update_albedo()
         it.prediction = prediction.detached()
         self.regulariser.note(it)
         self.course.iteration += 1
-        self.fix_surface()
+        self.optimisation.settle(self.schedule, self.iteration)
         self.course.seconds += time.perf_counter() - started
         self.finish(it)
         return it
@@ -131,16 +123,10 @@ class Fit:
         if it.number == it.stage.last:
             release_memory()  # what comes next has other sizes
         if last and len(self.problem.held_out):
-            self.course.validation = validate(self.problem, self.model, self.renderer, self.final_level)
-        if it.number % LOG_EVERY == 0 or last:
-            self.course.log.append(self.log_entry(it))
+            self.course.validation = validate(self.problem, self.model, self.renderer, self.schedule.final_level)
+        self.course.record(it, self.optimisation.learning_rate, self.regulariser, last)
         for callback in self.callbacks:
             callback(it)
-
-    def replan(self, config: Config) -> None:
-        """Change stages, iterations, level or regulariser of a fit that has not begun."""
-        self.problem = self.optimisation.problem = replace(self.problem, config=config)
-        self.ring.subdivisions, self.schedule = config.subdivisions, self.plan(config)
 
     def context(self) -> Context:
         """What terms and solvers may know at this iteration."""
@@ -148,35 +134,11 @@ class Fit:
         return Context(config, self.capture, self.model, self.schedule, problem.exposure, problem.lighting.plain > 0,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
-    def log_entry(self, it: Iteration) -> dict[str, Any]:
-        """A line of the log. Terms of the loss are unweighted."""
-        return {
-            "iteration": it.number, "seconds": round(self.course.seconds, 3), "loss": it.loss, **it.terms,
-            "weights": it.weights, "learning_rate": self.optimisation.learning_rate,
-            "stage": self.schedule.stages.index(it.stage) + 1, "vertices": len(it.batch.points),
-            "crossing": self.regulariser.crossing, "unexplained": self.regulariser.unexplained,
-        }  # fmt: skip
-
-    def fix_surface(self) -> None:
-        """Fix the surface during the settling stage, and forget the room's light at its start."""
-        last, calibration = self.schedule.stages[-1], self.model.calibration
-        self.model.fix_surface(last.settles and last.first <= self.course.iteration < last.last)
-        if last.settles and self.course.iteration == last.first and calibration:
-            calibration.room.forget()
-            self.optimisation.guard.keep()  # so that a retreat does not bring it back
-
     def refine_masks(self) -> None:
-        """Find masks anew when that is due."""
-        due = [int(progress * self.schedule.shaping) for progress in REFINED_AT]
-        if "masks" in self.problem.config.refine and self.course.iteration in due:
-            parts = self.capture, self.problem, self.model, self.renderer, self.final_level
-            self.use_masks(self.problem.processes.on_first(lambda: find_masks(*parts)))
-
-    def use_masks(self, masks: Masks) -> None:
-        """Continue with these masks in place of the capture's."""
-        if masks:
-            self.course.masks = self.course.masks | masks
-            self.capture = with_masks(self.capture, masks)
+        """Find masks anew."""
+        parts = self.capture, self.problem, self.model, self.renderer, self.schedule.final_level
+        self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
+        self.capture = with_masks(self.problem.capture, self.course.masks)
 
     @property
     def ring(self) -> FittedObject:
@@ -193,11 +155,6 @@ class Fit:
         """Number of all iterations."""
         return self.schedule.iterations
 
-    @property
-    def final_level(self) -> int:
-        """Level of the icosphere in the last stage."""
-        return self.schedule.stages[-1].level
-
     def calibrated(self) -> Capture:
         """The capture with cameras, lights and response as refined so far."""
         return self.model.calibrated(self.capture)
@@ -210,8 +167,8 @@ class Fit:
         """
         capture = self.calibrated()
         photograph = capture.photograph(k, -(-capture.sensors[k].size[0] // width))
-        surface = self.renderer.showing(self.model, level)
-        rgb, _ = bridge.draw(surface, photograph, spp, shadows=capture.shadows, indirect=self.ring.indirect)
+        rgb, _ = bridge.draw(self.renderer.showing(self.model, level), photograph, spp, shadows=capture.shadows,
+                             indirect=self.ring.indirect)  # fmt: skip
         return rgb[0].numpy()
 
     def result(self) -> FitResult:
@@ -220,28 +177,25 @@ class Fit:
                          list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
     def save(self, folder: str | Path) -> None:
-        """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and the others into a folder.
+        """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and more into a folder; move earlier results aside.
 
-        Earlier results there are moved aside. Raises InputError if a file cannot be written, ValueError for networks
-        that are not registered.
+        Raises InputError if a file cannot be written, ValueError for networks that are not registered.
         """
         results.save(Path(folder), self.result())
 
     def state(self) -> dict[str, Any]:
         """What another `Fit` of the same capture needs to continue, for `torch.save`."""
-        calibration = self.model.calibration
         return copy.deepcopy({  # the next iteration changes it
             "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
-            "calibration": calibration and calibration.state_dict(), "course": vars(self.course),
-            **{name: getattr(self, name).state() for name in PARTS},
+            "calibration": self.model.calibration and self.model.calibration.state_dict(),
+            "course": vars(self.course), **{name: getattr(self, name).state() for name in PARTS},
         })  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from the `state()` of a fit with the same ring and lighting."""
-        state = copy.deepcopy(state)
         if self.model.calibration:
             self.model.calibration.load_state_dict(state["calibration"])
         for name in PARTS:
             getattr(self, name).restore(state[name])
         self.course = Course(**state["course"])
-        self.use_masks(self.course.masks)
+        self.capture = with_masks(self.problem.capture, self.course.masks)

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
+from mi_ring.calibration.unknowns import OWN_LIGHTS, UNKNOWNS
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.lighting import Lighting, exposures, moved, require_compatible, unlit
 from mi_ring.fitting.problem import held_out_photographs
-from mi_ring.fitting.unknowns import OWN_LIGHTS, UNKNOWNS
 from mi_ring.rendering.spherical_harmonics import COUNT, directions_of, harmonics_in
 from mi_ring.system.progress import progress
 

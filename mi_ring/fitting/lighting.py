@@ -12,11 +12,11 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from torch import Tensor
 
+from mi_ring.calibration.unknowns import OWN_LIGHTS
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.unknowns import OWN_LIGHTS
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, without_environment
 from mi_ring.scene.assembly import lamp_lights
 from mi_ring.scene.lights import Light, shared_emitters

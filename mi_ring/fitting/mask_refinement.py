@@ -20,7 +20,6 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import bridge
 from mi_ring.system.progress import progress
 
-REFINED_AT = 0.5, 0.75  #: progress of the fit at which masks are found anew
 LARGEST = 512  #: largest side of the pictures in which they are found [px]
 BAND = 0.04  #: how far the surface may be off, relative to the object's size
 PLAUSIBLE = 0.8  #: overlap with the surface's coverage below which a mask is not used
@@ -74,5 +73,7 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
         whole = cv2.resize(255 * mask.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
         return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
 
+    if not masks:
+        return capture
     readers = {k: partial(enlarged, mask, capture.sensors[k].size) for k, mask in masks.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

@@ -4,10 +4,12 @@ import math
 
 from torch import nn
 
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.calibration import Calibration, initial_power, refined_of
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.rig import Rig
+from mi_ring.fitting.refinement import initial_power, refined_of
+from mi_ring.geometry.domain import Sphere
 from mi_ring.objects.fitted_object import FittedObject
 
 
@@ -29,6 +31,9 @@ class Model(nn.Module):
                       lamps="lamps" in refined)  # fmt: skip
             self.calibration = Calibration(problem.capture, refined, rig, problem.room_frames)
             self.calibration.room.to(problem.device)
+        self.starts_near = not isinstance(
+            ring.domain, Sphere
+        )  #: Does the fit start near the object, from hull or mesh?
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:

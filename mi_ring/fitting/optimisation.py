@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.exposure_solver import ExposureSolver
@@ -15,11 +16,13 @@ from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import NanGuard
 from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import START
 from mi_ring.fitting.room_solver import RoomSolver
-from mi_ring.fitting.schedule import Rate, Stepper, learning_rate
+from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.terms import Term
 from mi_ring.system.machine import has_fast_bfloat16
 
+CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
 CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped, lest it diverges
 
 
@@ -47,19 +50,30 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
     return result
 
 
+def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
+    """Adam for the unknowns that several photographs share; those of single photographs have solvers."""
+    groups = calibration.shared_parameters()
+    if not groups:
+        return []
+    adam = torch.optim.Adam([{"params": group} for group in groups], lr=CALIBRATION_RATE)
+    return [Stepper(adam, [Rate(CALIBRATION_RATE, config.decay, START)] * len(groups))]
+
+
 class Optimisation:
     """All optimisers of a model with their learning rates, solvers of calibration, and the guard against NaN."""
 
-    def __init__(self, problem: Problem, model: Model, near: bool, terms: Mapping[str, Term]) -> None:
-        """`near`: the fit starts near the object. `terms`: of the loss."""
+    def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
+        """`terms`: of the loss."""
         self.problem, self.model = problem, model
         self.steppers = network_steppers(model.ring, problem.config, problem.device)
         self.solvers: list[RoomSolver | ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
         if calibration := model.calibration:
             self.solvers.append(RoomSolver(calibration))
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
-            self.solvers += [PoseSolver(calibration, near, terms)] if "cameras" in calibration.refined else []
-            self.steppers += calibration.optimizers(problem.config.decay)
+            self.solvers += (
+                [PoseSolver(calibration, model.starts_near, terms)] if "cameras" in calibration.refined else []
+            )
+            self.steppers += calibration_steppers(calibration, problem.config)
             self.steppers += [s.stepper() for s in self.solvers if isinstance(s, torch.optim.Optimizer)]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]
         self.guard = NanGuard(model, self.optimizers)
@@ -90,6 +104,15 @@ class Optimisation:
             option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
             path = self.problem.capture.path
             raise InputError(f"{path}: diverged at iteration {it.number - 1}; try a lower {option}")
+        self.model.update_albedo()
+
+    def settle(self, schedule: Schedule, iteration: int) -> None:
+        """Fix the surface during the settling stage, and forget the room's light at its beginning."""
+        fixed = schedule.surface_fixed(iteration)
+        self.model.fix_surface(fixed)
+        if fixed and iteration == schedule.shaping and self.model.calibration:
+            self.model.calibration.room.forget()
+            self.guard.keep()  # so that a retreat does not bring it back
 
     def backward(self, loss: Tensor, it: Iteration) -> None:
         """Gradients of the loss, summed over all processes."""

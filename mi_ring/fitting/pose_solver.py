@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import Calibration
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
 from mi_ring.fitting.schedule import Rate, Stepper

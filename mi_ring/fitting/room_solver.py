@@ -2,7 +2,7 @@
 
 import torch
 
-from mi_ring.fitting.calibration import Calibration
+from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.iteration import Iteration
 
 

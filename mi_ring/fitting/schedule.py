@@ -12,6 +12,7 @@ HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near t
 EXCHANGE = 0.4  #: iterations of the second stage that replace one of these; with the presets both take the same time
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
 RAMP = 0.05  #: progress during which a learning rate rises from 0, once it starts
+MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 
 
@@ -77,6 +78,20 @@ class Schedule:
     def shaping(self) -> int:
         """Number of iterations that shape the surface: all but those of the settling stage."""
         return self.stages[-1].first if self.stages[-1].settles else self.iterations
+
+    @property
+    def final_level(self) -> int:
+        """Level of the icosphere in the last stage."""
+        return self.stages[-1].level
+
+    def surface_fixed(self, iteration: int) -> bool:
+        """Is the surface fixed in an iteration, counted from 0?"""
+        last = self.stages[-1]
+        return last.settles and last.first <= iteration < last.last
+
+    def masks_due(self, iteration: int) -> bool:
+        """Are masks to be refined before an iteration, counted from 0?"""
+        return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
 
     def stage(self, iteration: int) -> Stage:
         """The stage of an iteration, counted from 0."""

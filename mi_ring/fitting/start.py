@@ -10,9 +10,9 @@ import torch
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import initial_power, refined_of
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import initial_power, refined_of
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdf_net import BRDFNet, MaterialNet

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from mi_ring.calibration.unknowns import Exposure, Found, centred
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.unknowns import Exposure, Found, centred
 
 
 @torch.no_grad()
@@ -23,7 +23,7 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
     assert calibration is not None
     rig, capture = calibration.rig, problem.capture
     several = bool(problem.lighting.lamps)
-    found = Found(rig, capture, refined, calibration.power, calibration.lamps(), several)
+    found = Found(rig, capture, refined, calibration.power_factor, calibration.lamps(), several)
     values = {name: calibration.value(name).double().numpy(force=True) for name in calibration.widths}
     unknowns: dict[str, dict[str, Any]] = {}
     for name, unknown in calibration.unknowns.items():

@@ -122,10 +122,12 @@ class Loss:
         """Weight of a term before its schedule; 0 if there is no such term."""
         return self.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
 
-    @property
-    def needs_velocity(self) -> bool:
-        """Is the paper's regulariser among the terms? It needs a Shape-Net with a velocity."""
-        return self.terms.get("velocity") is default_terms["velocity"] and self.weight("velocity") > 0
+    def require_velocity(self, shape_net: Flow) -> None:
+        """Raise InputError if the paper's regulariser is among the terms and Shape-Net has no velocity."""
+        needed = self.terms.get("velocity") is default_terms["velocity"] and self.weight("velocity") > 0
+        if needed and not hasattr(shape_net, "velocity"):
+            raise InputError(f"networks: {type(shape_net).__name__}: has no velocity, which the term of that name "
+                             "needs; give it one, or the term the weight 0")  # fmt: skip
 
     def __call__(self, it: Iteration) -> Tensor:
         """This process's part of the loss, a scalar. The iteration gets the loss, terms and weights of all processes.

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from mi_ring.calibration.unknowns import UNKNOWNS
 from mi_ring.capture.decoding import recorded
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.fitting.unknowns import UNKNOWNS
 from mi_ring.rendering import bridge
 
 COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared

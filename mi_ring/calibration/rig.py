@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.calibration.camera_response import CameraResponse
+from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.camera_response import CameraResponse
-from mi_ring.fitting.light_tensors import LightTensors
 from mi_ring.geometry.camera import distortion_range
 from mi_ring.geometry.rotations import quarter_turns
 from mi_ring.scene.assembly import lamp_lights

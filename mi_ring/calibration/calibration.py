@@ -14,60 +14,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mi_ring.calibration.camera_response import CameraResponse
+from mi_ring.calibration.light_tensors import LightTensors
+from mi_ring.calibration.rig import Estimate, Rig, Views
+from mi_ring.calibration.room_light import RoomLight
+from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
 from mi_ring.capture.calibrated import with_calibration
-from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.camera_response import CameraResponse
-from mi_ring.fitting.config import Config
-from mi_ring.fitting.light_tensors import LightTensors
-from mi_ring.fitting.rig import Estimate, Rig, Views
-from mi_ring.fitting.room_light import RoomLight
-from mi_ring.fitting.schedule import Rate, Stepper
-from mi_ring.fitting.unknowns import UNKNOWNS, Unknown, centred
 from mi_ring.geometry.camera import Camera, straightening
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
-from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
-#: What `--refine auto` stands for; `scale` is added where the lights' intensities cannot be true. Of a flash it refines
-#: the place beside the lens: a flash farther ahead looks like a darker surface. Not `curve`: it looks like another
-#: reflectance, too (docs: phone captures).
-AUTO = "light", "power", "ambient"
-#: What is refined under each kind of unknown light.
-UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
-#: All options with values in a calibration, in order.
+#: All options of `--refine` with values in a calibration, in order.
 OPTIONS = [*dict.fromkeys(unknown.option for unknown in UNKNOWNS.values())]
 OPTIONS.insert(OPTIONS.index("lamps"), "ambient")
-START = 0.2  #: progress of the fit at which refinement begins
-ROOM_START = 0.15  #: and at which that of the room's light begins
-RATE = 0.1  #: Adam's learning rate [standard deviations]
-
-
-def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
-    """The options of `--refine` that a fit refines; `auto` depends on what the capture says about itself.
-
-    `light`: kind of the `Lighting`. `albedo`: the object's, according to the lights' intensities.
-    """
-    names: set[str] = set(config.refine)
-    auto = "auto" in names and not capture.known
-    unknown = UNDER_UNKNOWN_LIGHT.get(light)
-    if unknown or capture.photographs.dark:
-        names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
-        names |= {"gain"} if auto and "power" not in names else set()
-    elif auto:
-        subtracted = {"ambient"} if all(sensor.ambient for sensor in capture.sensors) else set()
-        names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
-        if config.indirect and albedo >= 1 and not has_table(capture.scene):
-            names.add("scale")
-    return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
-
-
-def initial_power(refined: Sequence[str], albedo: float) -> float:
-    """Initial factor of all lights' strengths: 1, or what turns an impossible albedo into a usual one for `scale`."""
-    return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0
+ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light begins
 
 
 class Calibration(nn.Module):
@@ -138,7 +103,7 @@ class Calibration(nn.Module):
         return math.exp(-float(self.value("scale").detach()))
 
     @property
-    def power(self) -> float:
+    def power_factor(self) -> float:
         """Factor of all lights' strengths that was found."""
         return self.rig.power / self.albedo_factor
 
@@ -203,16 +168,13 @@ class Calibration(nn.Module):
         """Half the sum of squares of all unknowns, in standard deviations, divided by the number of photographs."""
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
-    def optimizers(self, decay: float) -> list[Stepper]:
-        """Adam for all unknowns but those of single photographs, which have solvers of their own."""
+    def shared_parameters(self) -> list[list[Tensor]]:
+        """Parameters of unknowns that several photographs share, grouped by option."""
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
             if unknown.per != "photograph":
                 groups.setdefault(unknown.option, []).append(getattr(self, name))
-        if not groups:
-            return []
-        adam = torch.optim.Adam([{"params": group} for group in groups.values()], lr=RATE)
-        return [Stepper(adam, [Rate(RATE, decay, START)] * len(groups))]
+        return list(groups.values())
 
     def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
         """Of each unknown of an option: its tensor, to be changed in place, and its value as the capture says."""

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.calibration.rig import Estimate, LightTensors, Rig
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.rig import Estimate, LightTensors, Rig
 from mi_ring.geometry.rotations import rotations
 
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
