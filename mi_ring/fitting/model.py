@@ -33,7 +33,7 @@ class Model(nn.Module):
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(
             ring.domain, Sphere
-        )  #: Does the fit start near the object, from hull or mesh?
+        )  #: from a hull or a mesh
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:

@@ -70,9 +70,8 @@ class Optimisation:
         if calibration := model.calibration:
             self.solvers.append(RoomSolver(calibration))
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
-            self.solvers += (
-                [PoseSolver(calibration, model.starts_near, terms)] if "cameras" in calibration.refined else []
-            )
+            if "cameras" in calibration.refined:
+                self.solvers.append(PoseSolver(calibration, model.starts_near, terms))
             self.steppers += calibration_steppers(calibration, problem.config)
             self.steppers += [s.stepper() for s in self.solvers if isinstance(s, torch.optim.Optimizer)]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]
