@@ -27,7 +27,7 @@ from mi_ring.fitting.lamps import Lamps
 from mi_ring.fitting.room_light import Room
 from mi_ring.geometry.camera import Camera, distortion_range, straightening
 from mi_ring.geometry.rotations import quarter_turns, rotations
-from mi_ring.rendering import bridge
+from mi_ring.rendering import bridge, prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.scene.assembly import has_table, lamp_lights, lamps_of
@@ -216,14 +216,14 @@ class Calibration(nn.Module):
         return self.lamps._replace(strengths=factor * self.lamps.strengths).moved(self.value("lamp"), self.distance)
 
     def lamp_tensors(self) -> list[Tensor]:
-        """What `bridge.render` takes as `lamps`: nothing if these stay as they are."""
+        """What `prediction.render` takes as `lamps`: nothing if these stay as they are."""
         if "lamps" not in self.refined:
             return []
         now = self.lamps_now()
         return [now.places.to(device()), now.strengths.to(device())]
 
     @torch.no_grad()
-    def relight(self, surface: bridge.Surface) -> None:
+    def relight(self, surface: prediction.Surface) -> None:
         """Light a surface by the lamps of the scene as they are by now."""
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
@@ -294,7 +294,7 @@ class Calibration(nn.Module):
     def as_found(self, photographs: Photographs, calibrated: Sequence[Tensor]) -> Photographs:
         """Photographs with cameras and lights as `calibrated`, and the room as it is by now; without gradients."""
         room = self.roomlight().double().numpy(force=True)
-        return replace(bridge.calibrated(photographs, calibrated), room=room if room.any() else None)
+        return replace(prediction.calibrated(photographs, calibrated), room=room if room.any() else None)
 
     def roomlight(self) -> Tensor:
         """(BASIS, 3) harmonics of the room's light as they are by now; what a scene says goes with `scale`."""

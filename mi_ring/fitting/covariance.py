@@ -15,7 +15,8 @@ from torch.nn import functional as F
 
 from mi_ring.fitting.calibration import UNKNOWNS, Calibration
 from mi_ring.fitting.terms import perceived
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
 
 if TYPE_CHECKING:
@@ -121,19 +122,19 @@ def compare(
 
     def calibrated() -> Photographs:
         calibration.relight(fit.surface)
-        return bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
+        return prediction.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
 
     def direct() -> tuple[Tensor, Tensor]:
         shadows = fit.config.shadows and fit.capture.shadows
-        return bridge.draw(fit.surface, calibrated(), SPP, shadows=shadows, in_the_way=False)
+        return prediction.draw(fit.surface, calibrated(), SPP, shadows=shadows, occlusion=False)
 
     lit, coverage = direct()
     bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
     if fit.ring.indirect or room.any():
-        around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
-                                     indirect=fit.ring.indirect, room=calibration.room.which)  # fmt: skip
+        around = GlobalIllumination.of(fit.surface, calibrated(), coverage.to(fit.device), 1, paths=SPP,
+                                     indirect=fit.ring.indirect, harmonics=calibration.room.which)  # fmt: skip
         bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
-        added = around.in_the_way if photographs.dark else around.room
+        added = around.occlusion if photographs.dark else around.room_light
         roomlight = added(room.to(fit.device)).cpu() if room.any() else roomlight
 
     def picture(lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0) -> Tensor:

@@ -40,7 +40,8 @@ from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.ring_file import ring_of
 from mi_ring.output import results
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.machine import autocast, device, release_memory
 
 LOG_EVERY = 5  #: iterations between entries of the log
@@ -115,7 +116,7 @@ class Fit:
         self.device = device()
         self.ring.to(self.device)
         self.shaping_parameters = [p for p in self.ring.shape_net.parameters() if p.requires_grad]
-        self.surface = bridge.Surface(scene, capture.shape, self.ring)
+        self.surface = Surface(scene, capture.shape, self.ring)
         self.optimizers = optimizers_of(self.ring, self.config, self.device)
         self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
         self.calibration: Calibration | None = None
@@ -222,7 +223,7 @@ class Fit:
         calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
         if self.calibration:
             photographs = self.calibration.as_found(photographs, calibration)
-        predicted, coverage = bridge.render(
+        predicted, coverage = prediction.render(
             self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
             shadows=config.shadows and self.capture.shadows, calibration=calibration,
             lamps=self.calibration.lamp_tensors() if self.calibration else [],
@@ -332,7 +333,7 @@ class Fit:
         """
         self.surface.show(self.ring, *self.ring.domain.sample(level))
         photograph = self.calibrated().photograph(k, -(-self.capture.sensors[k].size[0] // width))
-        rgb, _ = bridge.draw(self.surface, photograph, spp, shadows=self.capture.shadows, indirect=self.ring.indirect)
+        rgb, _ = prediction.draw(self.surface, photograph, spp, 0, self.capture.shadows, self.ring.indirect)
         return rgb[0].numpy()
 
     def save(self, folder: str | Path) -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mi_ring.fitting.processes import ALONE, Share
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.global_illumination import GlobalIllumination
 
 LATEST = 0.1  #: share of the newest picture, once there are so many
 
@@ -22,8 +22,8 @@ class Averages:
         #: By the photograph: how many pictures, and their average (h, w, 4) with the object's coverage.
         self.pictures: dict[int, tuple[int, Tensor]] = {}
 
-    def of(self, around: Surroundings, index: np.ndarray, share: Share | None = None) -> Surroundings:
-        """The same surroundings, with the average of their interreflection, of photographs `index` (N,) or a share."""
+    def of(self, around: GlobalIllumination, index: np.ndarray, share: Share | None = None) -> GlobalIllumination:
+        """The same light, with the average of their interreflection, of photographs `index` (N,) or a share."""
         share = share or Share(ALONE, len(index))
         averages = []
         pictures = share.gathered(torch.cat([around.radiance, around.alpha[..., None]], -1))

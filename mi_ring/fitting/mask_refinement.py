@@ -14,7 +14,7 @@ from torch import Tensor
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.grabcut import grabcut, overlap
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.system.progress import progress
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def find_outlines(fit: "Fit") -> dict[int, Tensor]:
         """Picture, coverage, and what surely is background."""
         scale = -(-max(capture.sensors[index[0]].size) // LONGEST)
         seen = capture.observe(index, scale)
-        _, coverage = bridge.draw(fit.surface, capture.photograph(index[0], scale), spp=4, shadows=False)
+        _, coverage = prediction.draw(fit.surface, capture.photograph(index[0], scale), spp=4, shadows=False)
         picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / fit.exposure)))
         background = np.zeros(picture.shape[:2], bool)
         if seen.valid is not None:

@@ -9,7 +9,7 @@ from torch import Tensor
 from mi_ring.capture.capture import Observation
 from mi_ring.fitting.calibration import LIT
 from mi_ring.fitting.processes import Share
-from mi_ring.rendering import bridge
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def with_surroundings(
     which = calibration.room.which if calibration and looking else photographs.harmonics
     if not (fit.ring.indirect or which):
         return predicted
-    around = bridge.surroundings(fit.surface, photographs, coverage, fit.new_seed(), room=which,
+    around = GlobalIllumination.of(fit.surface, photographs, coverage, fit.new_seed(), harmonics=which,
                                  indirect=fit.ring.indirect)  # fmt: skip
     if fit.ring.indirect and fit.surface.table is not None:
         around = fit.averages.of(around, index, share)
@@ -38,7 +38,7 @@ def with_surroundings(
                                  else around.interreflection)  # fmt: skip
     before = predicted.detach()
     if photographs.harmonics:
-        predicted = predicted + around.in_the_way(torch.from_numpy(photographs.room).to(predicted))
+        predicted = predicted + around.occlusion(torch.from_numpy(photographs.room).to(predicted))
     if calibration and looking:
         telling = seen.surely(coverage.detach()) & ~seen.clipped.any(-1)
         observed = calibration.linear(seen.rgb, index[share.part], scale)

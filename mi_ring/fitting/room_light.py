@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mi_ring.fitting.processes import ALONE, Share
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.spherical_harmonics import BASIS, ORDER, up_to
 
 MEMORY = 0.95  #: weight of what was seen before, by iteration: the surface was another
@@ -52,12 +52,12 @@ class Room(nn.Module):
 
     @torch.no_grad()
     def see(
-        self, around: Surroundings, predicted: Tensor, observed: Tensor, telling: Tensor, share: Share = WHOLE,
+        self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, telling: Tensor, share: Share = WHOLE,
         progress: float = 1.0,
     ) -> None:  # fmt: skip
         """Solve anew, with photographs (N, H, W, 3) as `observed` and as `predicted`; linear.
 
-        The latter with what `bridge.render` makes of the room as it is, as if nothing were in the way of its light.
+        The latter with what `prediction.render` makes of the room as it is, as if nothing were in the way of its light.
         `telling` (N, H, W): where they say something of the object; `share`: what they are of all photographs;
         `progress`: of the fit, in [0, 1].
         """
@@ -76,9 +76,9 @@ class Room(nn.Module):
 
         inside = torch.minimum(small(telling.float()[..., None])[..., 0], alpha) > SURELY
         missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
-        which, now = around.which, self.harmonics[around.which]
-        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.harmonics])  # (which, n, 3)
-        lit = torch.einsum("jnhwc,jc->nhwc", around.free, now)
+        which, now = around.harmonics, self.harmonics[around.harmonics]
+        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.transfer])  # (which, n, 3)
+        lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
         missing = missing + pooled(lit, coarser)[inside]
         scale = light + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now)

@@ -15,7 +15,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.errors import InputError
 from mi_ring.fitting.calibration import OF_ONE, UNKNOWNS
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 
 if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
@@ -48,7 +48,7 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
     shares = []
     for k in fit.held_out[:: -(-len(fit.held_out) // MOST)]:
         scale = -(-capture.sensors[k].size[0] // WIDTH)
-        rgb, coverage = bridge.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
+        rgb, coverage = prediction.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=fit.ring.indirect)  # fmt: skip
         seen, sensor = capture.observe([k], scale), capture.sensors[k]
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)

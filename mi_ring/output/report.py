@@ -26,7 +26,7 @@ from mi_ring.metrics.image_errors import comparable
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output import calibration_panel
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.system.command import scene_name
 from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
@@ -182,7 +182,7 @@ class Prediction(NamedTuple):
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
     coverage: np.ndarray  #: (H, W), in [0, 1]
-    maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
+    maps: dict[str, np.ndarray]  #: normals and material, as `prediction.maps`, smaller
 
 
 def scale_of(fit: Any, size: tuple[int, int]) -> int:
@@ -194,11 +194,11 @@ def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]
     """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
     size = capture.sensors[index[0]].size
     scale = scale_of(fit, size)
-    rgb, coverage = bridge.draw(
+    rgb, coverage = prediction.draw(
         fit.surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
     )
     small = capture.selected(index, max(scale, max(size) // PICTURE))
-    maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
+    maps = prediction.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
     return [
         Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
         for n in range(len(index))

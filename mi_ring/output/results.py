@@ -18,7 +18,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import seen_from_within
 from mi_ring.scene.assembly import lamp_lights
 from mi_ring.scene.lights import shared_emitters
@@ -115,7 +115,7 @@ def write_inputs(path: Path, fit: Any) -> None:
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for index in fit.capture.together(some):
         scale = max(1, max(fit.capture.sensors[index[0]].size) // cell)
-        _, covered = bridge.draw(fit.surface, fit.capture.selected(index, scale), spp=4, shadows=False)
+        _, covered = prediction.draw(fit.surface, fit.capture.selected(index, scale), spp=4, shadows=False)
         for k, observed, coverage in zip(index, fit.capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
             picture = Image.fromarray(to_bytes(linear_to_srgb(observed.numpy()) * 0.65 + tint))
