@@ -20,7 +20,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Sphere
 from mi_ring.nets.mlp import SLOPE
 from mi_ring.nets.shape_net import ShapeNet
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photographs import pixel_rays
 from mi_ring.system import machine
 
@@ -93,7 +93,7 @@ def rendering(running: Fit, level: int) -> str:
         dr.sync_thread()
 
     def gradients():
-        rgb, coverage = bridge.render(surface, photographs, vertices, material, spp=1)
+        rgb, coverage = prediction.render(surface, photographs, vertices, material, spp=1)
         (rgb.sum() + coverage.sum()).backward()
 
     def write():
@@ -104,7 +104,7 @@ def rendering(running: Fit, level: int) -> str:
     parts = {
         "write the vertices, rebuild the tree of triangles": write,
         "trace one ray per pixel, no more": trace,
-        "a picture: rays, rays to the light, shading": lambda: bridge.draw(surface, photographs, spp=1),
+        "a picture: rays, rays to the light, shading": lambda: prediction.draw(surface, photographs, spp=1),
         "a picture with all gradients: all of the above, edges, and back": gradients,
     }
     times = zip(parts, median_seconds(*parts.values()))

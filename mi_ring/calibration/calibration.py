@@ -23,9 +23,10 @@ from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera, straightening
-from mi_ring.rendering import bridge
+from mi_ring.rendering import bridge, prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
@@ -92,7 +93,7 @@ class Calibration(nn.Module):
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
     @torch.no_grad()
-    def relight(self, surface: bridge.Surface) -> None:
+    def relight(self, surface: Surface) -> None:
         """Light a surface by the scene's lamps with their current values."""
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
@@ -145,7 +146,7 @@ class Calibration(nn.Module):
     def refined_photographs(self, photographs: Photographs, views: Sequence[Tensor]) -> Photographs:
         """Photographs with these cameras and lights, and the current room light; without gradients."""
         room = self.room_harmonics().double().numpy(force=True)
-        return replace(bridge.calibrated(photographs, views), room=room if room.any() else None)
+        return replace(prediction.calibrated(photographs, views), room=room if room.any() else None)
 
     def room_harmonics(self) -> Tensor:
         """(BASIS, 3) current harmonics of the room light; if only the scene says them, `scale` applies to them."""

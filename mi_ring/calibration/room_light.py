@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.spherical_harmonics import BASIS, ORDER, up_to
 
 MEMORY = 0.95  #: factor per iteration of earlier normal equations, which belong to an earlier surface
@@ -50,7 +50,7 @@ class RoomLight(nn.Module):
 
     @torch.no_grad()
     def solve(
-        self, around: Surroundings, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
+        self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations and solve them.
@@ -74,9 +74,9 @@ class RoomLight(nn.Module):
 
         inside = torch.minimum(small(counted.float()[..., None])[..., 0], alpha) > OBJECT
         missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
-        which, now = around.which, self.harmonics[around.which]
-        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.harmonics])  # (which, n, 3)
-        lit = torch.einsum("jnhwc,jc->nhwc", around.free, now)
+        which, now = around.harmonics, self.harmonics[around.harmonics]
+        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.transfer])  # (which, n, 3)
+        lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
         missing = missing + pooled(lit, coarser)[inside]
         scale = light + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now)

@@ -16,8 +16,10 @@ from mi_ring.fitting.losses import perceived
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
 
 COMPARED_WIDTH, SPP = 96, 8  #: largest width [px] and samples per pixel of the pictures that are compared
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
@@ -100,7 +102,7 @@ class Comparison:
 
     problem: Problem
     model: Model
-    surface: bridge.Surface
+    surface: Surface
     index: np.ndarray
     scale: int
 
@@ -110,7 +112,7 @@ class Comparison:
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
         views = [tensor.to(self.problem.device) for tensor in calibration(self.scale)]
-        return bridge.calibrated(replace(photographs, room=room), views)
+        return prediction.calibrated(replace(photographs, room=room), views)
 
     @property
     def calibration(self) -> Calibration:
@@ -121,7 +123,7 @@ class Comparison:
     def direct(self) -> tuple[Tensor, Tensor]:
         """Radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
         shadows = self.problem.config.shadows and self.problem.capture.shadows
-        return bridge.draw(self.surface, self.photographs(), SPP, shadows=shadows, in_the_way=False)
+        return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
         """Radiance (n, H, W, 3) by interreflection and by the room's light."""
@@ -130,10 +132,10 @@ class Comparison:
         room = calibration.room_harmonics()
         if ring.indirect or room.any():
             photographs = self.photographs()
-            around = bridge.surroundings(self.surface, photographs, coverage.to(self.problem.device), 1, spp=SPP,
-                                         indirect=ring.indirect, room=calibration.room.which)  # fmt: skip
+            around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
+                                         indirect=ring.indirect, harmonics=calibration.room.which)  # fmt: skip
             bounced = around.interreflection.cpu() if ring.indirect else bounced
-            added = around.in_the_way if photographs.dark else around.room
+            added = around.occlusion if photographs.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
         return bounced, room_light
 

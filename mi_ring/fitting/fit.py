@@ -34,7 +34,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_of, ring_state
 from mi_ring.output import results
 from mi_ring.output.fit_result import FitResult
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.system.machine import release_memory
 
 PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: parts of a fit with a state of their own
@@ -167,7 +167,7 @@ class Fit:
         """
         capture = self.calibrated()
         photograph = capture.photograph(k, -(-capture.sensors[k].size[0] // width))
-        rgb, _ = bridge.draw(self.renderer.showing(self.model, level), photograph, spp, shadows=capture.shadows,
+        rgb, _ = prediction.draw(self.renderer.showing(self.model, level), photograph, spp, shadows=capture.shadows,
                              indirect=self.ring.indirect)  # fmt: skip
         return rgb[0].numpy()
 

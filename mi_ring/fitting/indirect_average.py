@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.global_illumination import GlobalIllumination
 
 LATEST = 0.1  #: weight of the newest picture, once there are so many
 
@@ -23,8 +23,12 @@ class IndirectAverage:
         self.pictures: dict[int, tuple[int, Tensor]] = {}
 
     def add(
-        self, new: Surroundings, index: np.ndarray, gathered: Callable[[Tensor], Tensor], part: slice = slice(None)
-    ) -> Surroundings:
+        self,
+        new: GlobalIllumination,
+        index: np.ndarray,
+        gathered: Callable[[Tensor], Tensor],
+        part: slice = slice(None),
+    ) -> GlobalIllumination:
         """Add pictures and return them with the average instead of their own interreflection.
 
         `index` (N,): photographs of all processes. `gathered`: brings pictures of all processes together; `part`: of

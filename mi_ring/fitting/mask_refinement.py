@@ -17,7 +17,7 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.system.progress import progress
 
 LARGEST = 512  #: largest side of the pictures in which they are found [px]
@@ -43,7 +43,7 @@ def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Rende
         """Picture, coverage of the surface, and pixels that are certainly background."""
         scale = -(-max(capture.sensors[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
-        _, coverage = bridge.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
+        _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
         picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / problem.exposure)))
         background = np.zeros(picture.shape[:2], bool)
         if seen.valid is not None:

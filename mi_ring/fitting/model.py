@@ -31,9 +31,7 @@ class Model(nn.Module):
                       lamps="lamps" in refined)  # fmt: skip
             self.calibration = Calibration(problem.capture, refined, rig, problem.room_frames)
             self.calibration.room.to(problem.device)
-        self.starts_near = not isinstance(
-            ring.domain, Sphere
-        )  #: from a hull or a mesh
+        self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:

@@ -12,9 +12,10 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.sampler import Batch
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.rendering import bridge
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.machine import autocast
 
 
@@ -27,7 +28,9 @@ class Prediction:
     rgb: Tensor  #: (n, H, W, 3) radiance as the camera records it, decoded like the photographs
     coverage: Tensor  #: (n, H, W) of the object, in [0, 1]
     views: Photographs  #: cameras and lights of these photographs, as refined so far
-    other_light: Surroundings | None  #: interreflection and room light in small pictures, where they were rendered
+    other_light: (
+        GlobalIllumination | None
+    )  #: interreflection and room light in small pictures, where they were rendered
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
 
     def detached(self) -> "Prediction":
@@ -40,11 +43,11 @@ class Renderer:
     """Renders a scene with the fitted object in it."""
 
     def __init__(self, problem: Problem, ring: FittedObject) -> None:
-        self.surface = bridge.Surface(problem.scene, problem.capture.shape, ring)
+        self.surface = Surface(problem.scene, problem.capture.shape, ring)
         self.autocast: Callable[[], Any] = autocast(problem.config.precision, problem.device)
         self.average = IndirectAverage()
 
-    def showing(self, model: Model, level: int) -> bridge.Surface:
+    def showing(self, model: Model, level: int) -> Surface:
         """The surface of a model at this level of the icosphere, under its lamps, to be drawn without gradients."""
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
@@ -61,7 +64,7 @@ class Renderer:
         refined = [t.to(problem.device) for t in calibration(batch.scale)] if calibration else []
         if calibration:
             views = calibration.refined_photographs(views, refined)
-        linear, coverage = bridge.render(
+        linear, coverage = prediction.render(
             self.surface, views, vertices, material, spp=config.spp, seed=batch.seed(),
             shadows=config.shadows and problem.capture.shadows, calibration=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
@@ -72,7 +75,7 @@ class Renderer:
             linear = linear + (calibration.indirect(bounced) if calibration else bounced)
         without_room = linear.detach()
         if other and views.harmonics:
-            linear = linear + other.in_the_way(torch.from_numpy(views.room).to(linear))
+            linear = linear + other.occlusion(torch.from_numpy(views.room).to(linear))
         rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
         return Prediction(vertices, material, rgb, coverage, views, other, without_room)
 
@@ -86,14 +89,14 @@ class Renderer:
 
     def other_light(
         self, problem: Problem, model: Model, batch: Batch, views: Photographs, coverage: Tensor
-    ) -> Surroundings | None:
+    ) -> GlobalIllumination | None:
         """Interreflection and room light in the photographs; None if neither is part of the prediction."""
         calibration = model.calibration
         solving = calibration is not None and calibration.solves_room(batch.progress)
         harmonics = calibration.room.which if calibration and solving else views.harmonics
         if not (model.ring.indirect or harmonics):
             return None
-        other = bridge.surroundings(self.surface, views, coverage, batch.seed(), room=harmonics,
+        other = GlobalIllumination.of(self.surface, views, coverage, batch.seed(), harmonics=harmonics,
                                     indirect=model.ring.indirect)  # fmt: skip
         if model.ring.indirect and self.surface.table is not None:
             other = self.average.add(other, batch.all_photographs, batch.gathered, batch.share.part)

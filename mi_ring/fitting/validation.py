@@ -16,7 +16,7 @@ from mi_ring.capture.decoding import recorded
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 
 COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared
 #: Options that are refined for single photographs, and so are unknown of those that are held out.
@@ -33,7 +33,7 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
     for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
         sensor = capture.sensors[k]
         scale = -(-sensor.size[0] // COMPARED_WIDTH)
-        rgb, coverage = bridge.draw(surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
+        rgb, coverage = prediction.draw(surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=model.ring.indirect)  # fmt: skip
         seen = capture.observe([k], scale)
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.rendering import bridge
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
 
 
@@ -17,7 +17,7 @@ class FitResult:
     """A fit, finished or not, with all that its files say about it."""
 
     ring: FittedObject
-    surface: bridge.Surface  #: of the ring, to draw it
+    surface: Surface  #: of the ring, to draw it
     given: Capture  #: the photographs with calibration as before the fit
     capture: Capture  #: the same with calibration as refined
     settings: dict[str, Any]  #: as `Config.settings` returns them
@@ -37,7 +37,7 @@ class FitResult:
     room_frames: Collection[str] | None  #: axes of the room light in the scene file; None: as in the given scene
     lamps: Sequence[Light] | None  #: lamps for the scene file; None: as in the given scene
 
-    def drawn(self, level: int) -> bridge.Surface:
+    def drawn(self, level: int) -> Surface:
         """The surface at this level of the icosphere, ready to be drawn."""
         self.surface.show(self.ring, *self.ring.domain.sample(level))
         return self.surface

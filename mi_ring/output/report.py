@@ -27,7 +27,8 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.calibration_panel import held_out_text, panel
 from mi_ring.output.fit_result import FitResult
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
 from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
@@ -179,7 +180,7 @@ class Prediction(NamedTuple):
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
     coverage: np.ndarray  #: (H, W), in [0, 1]
-    maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
+    maps: dict[str, np.ndarray]  #: normals and material, as `prediction.maps` returns them, smaller
 
 
 def scale_of(result: FitResult, size: tuple[int, int]) -> int:
@@ -187,16 +188,16 @@ def scale_of(result: FitResult, size: tuple[int, int]) -> int:
     return -(-size[0] // result.width)
 
 
-def predicted(result: FitResult, surface: bridge.Surface, index: np.ndarray) -> list[Prediction]:
+def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Prediction]:
     """Predictions of photographs `index`, all of one size."""
     capture, ring = result.capture, result.ring
     size = capture.sensors[index[0]].size
     scale = scale_of(result, size)
-    rgb, coverage = bridge.draw(
+    rgb, coverage = prediction.draw(
         surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=ring.indirect, paths=4
     )
     small = capture.selected(index, max(scale, max(size) // PICTURE))
-    maps = bridge.maps(surface, small, ring.brdf_net.bsdf_parameters)
+    maps = prediction.maps(surface, small, ring.brdf_net.bsdf_parameters)
     return [
         Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
         for n in range(len(index))

@@ -18,8 +18,9 @@ from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.fit_result import FitResult
 from mi_ring.output.ply import write_mesh
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import seen_from_within
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.visibility import View
 from mi_ring.system.command import scene_name
@@ -102,7 +103,7 @@ def read_log(folder: Path) -> list[dict]:
     return entries
 
 
-def write_inputs(path: Path, capture: Capture, start: bridge.Surface) -> None:
+def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
     """inputs.png: the start surface drawn over photographs, in green. Wrong masks or poses show at once."""
     some = capture.spread()
     columns = min(10, len(some))
@@ -111,7 +112,7 @@ def write_inputs(path: Path, capture: Capture, start: bridge.Surface) -> None:
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for index in capture.together(some):
         scale = max(1, max(capture.sensors[index[0]].size) // cell)
-        _, covered = bridge.draw(start, capture.selected(index, scale), spp=4, shadows=False)
+        _, covered = prediction.draw(start, capture.selected(index, scale), spp=4, shadows=False)
         for k, observed, coverage in zip(index, capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
             picture = Image.fromarray(to_bytes(linear_to_srgb(observed.numpy()) * 0.65 + tint))

@@ -12,7 +12,7 @@ from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_ele
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.photogrammetry.reduced_photographs import View
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
 
@@ -65,5 +65,5 @@ def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress
         for _ in progress(fit, "a trial fit", fit.iterations):
             pass
     surface = fit.renderer.showing(fit.model, SETTINGS.subdivisions)
-    drawn = (bridge.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
+    drawn = (prediction.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]
