@@ -70,27 +70,18 @@ def normal_variation(it: Iteration) -> Tensor:
     return variation_of_normals(it.vertices, it.faces) / (8 * math.pi * it.fit.ring.radius)
 
 
-def material_variation(it: Iteration) -> Tensor:
-    """Per radius of the object. The shape does not follow it."""
-    return variation_per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
-
-
 def albedo_variation(it: Iteration) -> Tensor:
-    """The same, but for what is had for nothing where the light is found for the material.
+    """How fast the material changes over the surface, in the mean, times the object's radius.
 
-    Of how much is reflected by its mean: half as much in twice the light is the same. Of what has an upper end (a
-    roughness) the logits: as shares they would vary less near its ends.
+    Reflectances are divided by their mean: half the reflectance in twice the light looks the same. A parameter with an
+    upper bound (a roughness) enters by its logit: as a share it would vary less near its bounds. The shape gets no
+    gradient.
     """
-    net = it.fit.ring.brdf_net
+    ring, net = it.fit.ring, it.fit.ring.brdf_net
     values = columns_of(it.material, net)
     ends = torch.tensor([math.isfinite(p.high) for p in net.bsdf_parameters for _ in range(p.channels)])
     values = torch.where(ends.to(values.device), values.logit(FAINT), values / values.mean(0).clamp(min=FAINT))
-    return variation_per_radius(it, values)
-
-
-def variation_per_radius(it: Iteration, values: Tensor) -> Tensor:
-    """How fast values (V, n) at the vertices change over the surface, in the mean, times the object's radius."""
-    return it.fit.ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
+    return ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
 
 
 def material_rank(it: Iteration) -> Tensor:

@@ -17,6 +17,7 @@ from mi_ring.nets.shape_net import Flow
 
 DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: the difference that is too large, and from which progress on
 PATTERNED = 0.1  #: weight of the variation of a material that varies, by that of one that hardly does
+BLUR = 0.06  #: of silhouettes at the start: standard deviation, as a share of the photograph's width
 REGULARISED_POINTS = 512  #: of the flow's paths, drawn anew in each iteration
 
 
@@ -106,7 +107,7 @@ def rgb(it: Iteration) -> Tensor:
 def outline_blur(it: Iteration) -> float:
     """Standard deviation [px] of the blur of silhouettes: it shrinks, to a pixel for the last fifth of the fit."""
     width = it.fit.capture.sensors[it.index[0]].size[0] / it.scale
-    return max(1.0, it.fit.config.blur * (1 - it.progress / 0.8) * width)
+    return max(1.0, BLUR * (1 - it.progress / 0.8) * width)
 
 
 def mask(it: Iteration) -> Tensor | None:
@@ -172,6 +173,5 @@ default_terms: dict[str, Term] = {
     "calibration": Term(calibration),
     "settling": Term(settling, schedule=plainness),
     "normal_variation": Term(priors.normal_variation),
-    "material_variation": Term(priors.material_variation),
     "material_rank": Term(priors.material_rank),
 }
