@@ -17,7 +17,7 @@ from mi_ring.system.command import scene_name
 
 CHOICES = [
     "", "--seed 1", "--seed 2", "--domain sphere", "--velocity-decay 0.03", "--weights.mask 2", "--weights.mask 10",
-    "--blur 0", "--loss l2", "--loss l1", "--loss log", "--batch 4", "--batch 16", "--steps 5", "--steps 8",
+    "--loss l2", "--loss l1", "--loss log", "--batch 4", "--batch 16", "--steps 5", "--steps 8",
     "--steps 20", "--optimizer adam", "--decay 0.3", "--decay 0.03", "--precision bfloat16",
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Print, as Markdown with machine and date, what the flow costs by number of steps and solver.
+"""Print, as Markdown with machine and date, what the flow costs by number of Euler steps.
 
     python benchmarks/steps.py [--level 5]
 
@@ -12,11 +12,10 @@ import time
 
 from accuracy import alone, peak_memory, processor, table
 
-CASES = [(1, "euler"), (3, "euler"), (10, "euler"), (20, "euler"), (40, "euler"), (3, "midpoint"), (3, "rk4"),
-         (3, "dopri5")]  # fmt: skip
+CASES = 1, 3, 10, 20, 40
 
 
-def cost(level: int, steps: int, solver: str) -> tuple[int, float, float]:
+def cost(level: int, steps: int) -> tuple[int, float, float]:
     """Vertices, seconds and GiB."""
     from mi_ring.geometry.domain import Sphere
     from mi_ring.nets.shape_net import ShapeNet
@@ -27,7 +26,7 @@ def cost(level: int, steps: int, solver: str) -> tuple[int, float, float]:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     s, _ = Sphere().sample(level)
-    net = ShapeNet(steps, solver)
+    net = ShapeNet(steps)
     net(s[:100]).sum().backward()  # what is needed for the first time only
     before, started = peak_memory(), time.process_time()
     net(s).sum().backward()
@@ -39,11 +38,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--level", type=int, default=5)
     level, rows = parser.parse_args().level, []
-    for steps, solver in CASES:
-        vertices, seconds, memory = alone(cost, level, steps, solver)
-        rows.append([f"{solver}", str(steps), f"{seconds:.1f}", f"{memory:.2f}"])
+    for steps in CASES:
+        vertices, seconds, memory = alone(cost, level, steps)
+        rows.append([str(steps), f"{seconds:.1f}", f"{memory:.2f}"])
     print(f"{processor()}; {datetime.date.today()}; {vertices:,} vertices\n")
-    print(table(["solver", "T", "s", "GiB"], rows))
+    print(table(["T", "s", "GiB"], rows))
 
 
 if __name__ == "__main__":

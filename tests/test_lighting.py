@@ -354,8 +354,7 @@ def test_a_map_shows_the_radiance_of_harmonics():
     np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)
 
 
-@pytest.mark.parametrize("material_at", ["domain", "surface"])
-def test_light_and_material_settle_where_the_surface_is(material_at, in_an_environment):
+def test_light_and_material_settle_where_the_surface_is(in_an_environment):
     """At the end under an unknown environment: the surface, which is of one material, stays as it is; the light is what
     photographs say from then on, and the material varies less than it did when it made up for errors of the surface."""
 
@@ -365,7 +364,7 @@ def test_light_and_material_settle_where_the_surface_is(material_at, in_an_envir
         return vertices, float((material["diffuse"].std(0) / material["diffuse"].mean(0)).mean())
 
     capture = mi_ring.load_capture(in_an_environment)
-    config = mi_ring.Config.preset("fast", **TINY, light="environment", material_at=material_at)
+    config = mi_ring.Config.preset("fast", **TINY, light="environment")
     lighting = Lighting("environment", plain=0.01)  # of one material, but not for long
     fit = mi_ring.Fit(capture, config, lighting=lighting)
     *_, shaping, settling = fit.stages

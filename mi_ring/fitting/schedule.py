@@ -13,6 +13,7 @@ EXCHANGE = 0.4  #: iterations of the second stage that replace one of these; wit
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
 RAMP = 0.05  #: progress during which a learning rate rises from 0, once it starts
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
+INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 
 
@@ -46,7 +47,6 @@ class Schedule:
     """Stages, progress and what depends on progress."""
 
     stages: tuple[Stage, ...]
-    initial_blur: float  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 
     @classmethod
     def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
@@ -67,7 +67,7 @@ class Schedule:
         if settling:
             more = max(1, round(SETTLING * first))
             stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
-        return cls(tuple(stage for stage in stages if stage.last > stage.first), config.blur)
+        return cls(tuple(stage for stage in stages if stage.last > stage.first))
 
     @property
     def iterations(self) -> int:
@@ -103,7 +103,7 @@ class Schedule:
 
     def outline_blur(self, progress: float, width: float) -> float:
         """Standard deviation [px] of the silhouettes' blur in photographs of this width; at least one pixel."""
-        return max(1.0, self.initial_blur * (1 - progress / SHARP) * width)
+        return max(1.0, INITIAL_BLUR * (1 - progress / SHARP) * width)
 
 
 def learning_rate(rate: Rate, progress: float) -> float:

@@ -71,10 +71,10 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
         networks[1].set_parameters(parameters, scale)
     else:
-        networks = (shape_net_of(config.shape_net, config.steps, config.solver, config.encoding, config.frequencies),
+        networks = (shape_net_of(config.shape_net, config.steps, config.encoding, config.frequencies),
                     BRDFNet(scale, parameters, config.encoding, config.frequencies))  # fmt: skip
     ring = FittedObject(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                networks, capture.shape.ground, capture.shape.up, capture.shape.metres, config.material_at)  # fmt: skip
+                networks, capture.shape.ground, capture.shape.up, capture.shape.metres)  # fmt: skip
     require_networks(ring)
     return ring
 

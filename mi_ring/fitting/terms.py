@@ -92,7 +92,6 @@ default_terms: dict[str, Term] = {
     "calibration": Term(calibration),
     "settling": Term(settling, schedule=lambda it: 1.0 if it.context.one_material else PATTERNED),
     "normal_variation": Term(priors.normal_variation),
-    "material_variation": Term(priors.material_variation),
     "material_rank": Term(priors.material_rank),
 }
 WITHOUT_PHOTOGRAPHS = set(default_terms) - {"rgb", "mask"}  #: terms that do not compare with photographs
