@@ -65,7 +65,7 @@ class Renderer:
         if calibration:
             views = calibration.refined_photographs(views, refined)
         linear, coverage = prediction.render(
-            self.surface, views, vertices, material, spp=config.spp, seed=batch.seed(),
+            self.surface, views, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
             shadows=config.shadows and problem.capture.shadows, calibration=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
         )  # fmt: skip
@@ -96,7 +96,7 @@ class Renderer:
         harmonics = calibration.room.which if calibration and solving else views.harmonics
         if not (model.ring.indirect or harmonics):
             return None
-        other = GlobalIllumination.of(self.surface, views, coverage, batch.seed(), harmonics=harmonics,
+        other = GlobalIllumination.of(self.surface, views, coverage, batch.seeds["indirect"], harmonics=harmonics,
                                     indirect=model.ring.indirect)  # fmt: skip
         if model.ring.indirect and self.surface.table is not None:
             other = self.average.add(other, batch.all_photographs, batch.gathered, batch.share.part)

@@ -13,6 +13,9 @@ from mi_ring.fitting.processes import Share
 from mi_ring.fitting.schedule import Schedule, Stage
 from mi_ring.geometry.domain import Domain
 
+SEEDED = "renderer", "indirect", "regulariser"  #: get a seed in each batch
+PURPOSES = "photographs", "rotations", *SEEDED  #: of random generators
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -30,7 +33,7 @@ class Batch:
     all_photographs: np.ndarray  #: (N,) indices
     size: tuple[int, int]  #: of these photographs' files (width, height) [px]
     scale: int  #: photographs are compared this many times smaller
-    random: torch.Generator
+    seeds: dict[str, int]  #: of the renderer, of its indirect light, and of the regulariser
     share: Share  #: of this process
 
     @property
@@ -46,16 +49,17 @@ class Batch:
         """(N, …) for all photographs, from (n, …) for those of this process. Without gradients."""
         return self.share.gathered(tensor)
 
-    def seed(self) -> int:
-        """A seed for the renderer."""
-        return int(torch.randint(2**31, (), generator=self.random))
-
 
 class Sampler:
-    """Draws batches. Photographs come in random order, all of one size before one of them comes again."""
+    """Draws batches. Photographs come in random order, all of one size before one of them comes again.
+
+    Each purpose has a random generator of its own: what is switched off changes nothing else that is drawn.
+    """
 
     def __init__(self, problem: Problem) -> None:
-        self.random = torch.Generator().manual_seed(problem.config.seed)
+        first = torch.Generator().manual_seed(problem.config.seed)
+        seeds = torch.randint(2**62, (len(PURPOSES),), generator=first).tolist()
+        self.random = {name: torch.Generator().manual_seed(seed) for name, seed in zip(PURPOSES, seeds)}
         capture = problem.capture
         self.sizes = [capture.sensors[k].size for k in problem.fitted]
         self.alike = {size: np.intersect1d(index, problem.fitted) for size, index in capture.sizes.items()}
@@ -65,19 +69,21 @@ class Sampler:
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
         """The batch of an iteration, counted from 0."""
         stage = schedule.stage(iteration)
-        points, faces = domain.sample(stage.level, self.random if problem.config.resample else None)
+        points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
         everyone, size = self.draw_photographs(problem.config.batch)
+        seeds = {name: int(torch.randint(2**31, (), generator=self.random[name])) for name in SEEDED}
         share = problem.processes.share(len(everyone))
         return Batch(iteration + 1, schedule.progress(iteration), stage, points.to(problem.device), faces,
-                     everyone[share.part], everyone, size, -(-size[0] // stage.width), self.random, share)  # fmt: skip
+                     everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
 
     def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the next `count` photographs, or of all of one size if there are fewer, and that size."""
-        size = self.sizes[int(torch.randint(len(self.sizes), (), generator=self.random))]
+        random = self.random["photographs"]
+        size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
         count = min(count, len(alike))
         if len(waiting) < count:  # those that are left come last in the next round
-            order = alike[torch.randperm(len(alike), generator=self.random).numpy()].tolist()
+            order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
             waiting = waiting + [k for k in order if k not in waiting] + waiting
         self.waiting[size] = waiting[count:]
         return np.array(waiting[:count]), size
@@ -89,11 +95,12 @@ class Sampler:
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"random": self.random.get_state(), "waiting": self.waiting}
+        return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state()`. Raises ValueError if it has photographs that are not fitted here."""
         if not {k for some in state["waiting"].values() for k in some} <= {k for a in self.alike.values() for k in a}:
             raise ValueError("photographs that are not fitted")
-        self.random.set_state(state["random"])
+        for name, random in self.random.items():
+            random.set_state(state["random"][name])
         self.waiting = state["waiting"]

@@ -64,8 +64,9 @@ def velocity(it: Iteration) -> Tensor | None:
     if it.stage.settles:
         return None
     net = it.context.model.ring.shape_net
-    chosen = torch.randperm(len(it.batch.points), generator=it.batch.random)[:REGULARISED_POINTS]
-    steps = int(torch.randint(net.steps, (), generator=it.batch.random))
+    random = torch.Generator().manual_seed(it.batch.seeds["regulariser"])
+    chosen = torch.randperm(len(it.batch.points), generator=random)[:REGULARISED_POINTS]
+    steps = int(torch.randint(net.steps, (), generator=random))
     with torch.no_grad(), it.context.autocast():
         x = net.flow(it.batch.points[chosen], steps)
     field = net.velocity_of(steps) if isinstance(net, Flow) else net.velocity
