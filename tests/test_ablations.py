@@ -273,11 +273,12 @@ def test_the_command_takes_the_choices_and_others_those_of_the_file(small_captur
     ])  # fmt: skip
     choice = {f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | SMALL
     fit = Fit(capture, Config(**choice))
-    entry = [it.entry() for it in fit][-1]
+    list(fit)
+    entry = fit.course.log[-1]
     assert 1 <= entry["material_rank"] <= math.sqrt(5) and entry["weights"]["material_rank"] == 0.1
     run = tmp_path / "run"
     run.mkdir()
-    torch.save(ring_state(fit.ring, fit.config.settings()), run / "ring.pt")
+    torch.save(ring_state(fit.ring, fit.problem.config.settings()), run / "ring.pt")
     ring = load_fit(run)
     assert type(ring.shape_net) is ResNet
     assert ring.brdf_net.encoding.spacing == "octaves" and ring.shape_net.encoding.frequencies == 4

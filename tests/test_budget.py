@@ -96,7 +96,7 @@ SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "
 def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):
     """At 0.5 s an iteration 20 of 60 s are for pictures and results, and 80 iterations are left."""
     monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
-    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0, perf_counter=lambda: 0.0))
     call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
     with pytest.raises(InputError, match="is 0.5, too few for a fit of this capture on this machine; give 0.8 or more"):
         command.main([*call[:-1], "0.5"])  # 40 iterations, and what takes as long: 40 s, and a fifth more
