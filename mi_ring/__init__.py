@@ -70,8 +70,13 @@ __all__ = [
     "register_network",
 ]  # fmt: skip
 
+#: Names up to version 0.2, with the present ones.
+_RENAMED = {"Ring": "FittedObject", "ReflectanceMap": "MaterialNet"}
+
 
 def __getattr__(name: str) -> object:
+    if name in _RENAMED:
+        raise AttributeError(f"mi_ring.{name} is now mi_ring.{_RENAMED[name]}")
     if name not in _API:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_API[name]}"), name)
