@@ -14,7 +14,7 @@ from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.covariance import RECORDED
 from mi_ring.fitting.lighting import Lighting, exposures, moved, require_unknown, unlit
-from mi_ring.rendering.spherical_harmonics import COUNT, directions_of, harmonics_in
+from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ class Trials:
         if lighting == Lighting("environment") and fit.calibration:
             room = fit.calibration.room
             told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
-            self.environment = room.harmonics.numpy(force=True)[:COUNT], told.numpy(force=True)[:COUNT]
+            self.environment = room.harmonics.numpy(force=True)[:PER_FRAME], told.numpy(force=True)[:PER_FRAME]
         finite = [error for error in errors if math.isfinite(error)]  # a renderer has one now and then that is not
         self.errors[lighting] = float(np.mean(finite)) if finite else math.inf
         if not finite:
@@ -174,9 +174,9 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics
-    directions, _ = directions_of(ROWS)
-    lobes = shown * harmonics_in(directions)  # (harmonics, directions)
-    grey = shown * np.eye(COUNT)[:, :1]
+    directions, _ = envmap_directions(ROWS)
+    lobes = shown * world_harmonics(directions)  # (harmonics, directions)
+    grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
         """Strengths (n + 1, C) and what is left."""

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from mi_ring.fitting.processes import ALONE, Share
 from mi_ring.rendering.global_illumination import GlobalIllumination
-from mi_ring.rendering.spherical_harmonics import BASIS, ORDER, up_to
+from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER, harmonics_up_to
 
 MEMORY = 0.95  #: weight of what was seen before, by iteration: the surface was another
 RIDGE = 0.01  #: pull toward what the capture says, by the mean of what the photographs say of a harmonic
@@ -38,7 +38,7 @@ class Room(nn.Module):
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
-        free = up_to(ORDER if alone else USUAL, frames)
+        free = harmonics_up_to(MAX_ORDER if alone else USUAL, frames)
         self.which = sorted({*free, *given.abs().sum(1).nonzero()[:, 0].tolist()})
         self.register_buffer("given", given, persistent=False)
         self.register_buffer("harmonics", given.clone())
@@ -95,7 +95,7 @@ class Room(nn.Module):
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, which].mean(1)
         ridge = RIDGE * told[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
-            free = up_to(ORDER if self.alone and progress >= FINE else USUAL, self.frames)
+            free = harmonics_up_to(MAX_ORDER if self.alone and progress >= FINE else USUAL, self.frames)
             right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
             self.harmonics = self.given.clone()

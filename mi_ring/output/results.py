@@ -19,10 +19,10 @@ from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import prediction
-from mi_ring.rendering.spherical_harmonics import seen_from_within
+from mi_ring.rendering.spherical_harmonics import room_envmap
 from mi_ring.scene.assembly import lamp_lights
 from mi_ring.scene.lights import shared_emitters
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
@@ -146,7 +146,7 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     write_file(folder / "scene.xml", scene)
     if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
         # It is all the light there is.
-        radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
+        radiance = room_envmap(capture.photographs.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
     fit.surface.show(fit.ring, s, faces)
@@ -189,7 +189,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
     return names
 
 
-def viewed(ring: FittedObject, views: Sequence[View] | None = None) -> bytes | None:
+def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
     """The object for the report's viewer as GLB, where that is possible."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
