@@ -19,7 +19,7 @@ from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
@@ -83,7 +83,7 @@ def require_options(config: ExportConfig) -> None:
         raise InputError(f"{config.file}: is a file of the fit or of a capture; choose another name")
 
 
-def seen_from(run: Path) -> list[View] | None:
+def seen_from(run: Path) -> list[MaskedCamera] | None:
     """What each photograph of a fit can show; None where that cannot be read."""
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")

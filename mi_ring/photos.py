@@ -34,7 +34,7 @@ from mi_ring.photogrammetry.workflow import (
     shots,
     upright,
 )
-from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
 from mi_ring.system.files import locked, write_file
 from mi_ring.system.machine import in_threads
@@ -215,7 +215,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     # Only where the flash's power is known is the reflectance, too, of which Fresnel's depends.
     root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
-        harmonics = np.zeros((COUNT, 3))
+        harmonics = np.zeros((PER_FRAME, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:

@@ -10,7 +10,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.ambiguity import ambiguity
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering.spherical_harmonics import COUNT, seen_from_within
+from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
@@ -104,8 +104,8 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     plan.set_title("cameras, lights (•) and lamps (★) from above [scene units]", fontsize=9)
     for bars in others:
         if light is not None:
-            frame = "camera" if light[COUNT:].any() else "world"
-            radiance = seen_from_within(light, np.eye(4)).clip(min=0)
+            frame = "camera" if light[PER_FRAME:].any() else "world"
+            radiance = room_envmap(light, np.eye(4)).clip(min=0)
             bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
             bars.axis("off")
             bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)

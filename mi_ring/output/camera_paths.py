@@ -23,7 +23,7 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.surface import Surface
-from mi_ring.scene.assembly import assembled, is_table, own_emitters
+from mi_ring.scene.assembly import assembled, is_table, top_level_emitters
 from mi_ring.scene.lights import Light, is_flash, is_room
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.system.progress import progress
@@ -236,7 +236,7 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) ->
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
-    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
+    lamps = [e for e in top_level_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     return Surface(assembled([object_, *others], [light, *lamps]), object_, ring, in_scene_units=True)

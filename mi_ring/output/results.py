@@ -19,10 +19,10 @@ from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.fit_result import FitResult
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import prediction
-from mi_ring.rendering.spherical_harmonics import seen_from_within
+from mi_ring.rendering.spherical_harmonics import room_envmap
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import shared_emitters
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
@@ -141,7 +141,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     write_file(folder / "scene.xml", scene)
     if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
         # The room is the only light.
-        radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
+        radiance = room_envmap(capture.photographs.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)
     names = [capture.names[k] for k in result.held_out]
@@ -172,7 +172,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
     return names
 
 
-def viewed(ring: FittedObject, views: Sequence[View] | None = None) -> bytes | None:
+def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
     """The object as GLB for the report's viewer; None, with a printed line, if that fails."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:

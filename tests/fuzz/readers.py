@@ -44,7 +44,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured_brdf import CELLS, Network, Table
+from mi_ring.rendering.measured_brdf import CELLS, MerlNetwork, MerlTable
 from mi_ring.synthesis.options import SynthesizeConfig
 from mi_ring.synthesis.path_traced_capture import Production
 from mi_ring.system.files import write_state
@@ -328,13 +328,13 @@ def results(folder: Path) -> Reader:
 def merl(folder: Path) -> Reader:
     path = folder / "table.binary"
     path.write_bytes(np.array(CELLS, "<i4").tobytes() + b"\0" * 99)
-    return Reader([path], lambda: plugin_error(lambda: Table(path)))
+    return Reader([path], lambda: plugin_error(lambda: MerlTable(path)))
 
 
 def networks(folder: Path) -> Reader:
     path = folder / "networks.npz"
     test_merl.networks(path)
-    return Reader([path], lambda: plugin_error(lambda: Network(path, "one")))
+    return Reader([path], lambda: plugin_error(lambda: MerlNetwork(path, "one")))
 
 
 def synthesized(folder: Path) -> Reader:
