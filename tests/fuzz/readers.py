@@ -1,5 +1,6 @@
 """All that reads files of others, and small whole files for each; what a reader may raise is InputError alone."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -306,6 +307,12 @@ def checkpoint(folder: Path) -> Reader:
     return Reader([path], lambda: read_checkpoint(folder, config))
 
 
+def settings(folder: Path) -> Reader:
+    path = folder / "config.json"
+    path.write_text(json.dumps({"scene": "scene.xml", **Config(domain=("mesh", Path("a.ply"))).settings()}))
+    return Reader([path], lambda: Config.load(folder))
+
+
 def results(folder: Path) -> Reader:
     """What a fit and `check` look for in folders of results."""
     names = ("config.json", "log.jsonl", "calibration.json")
@@ -379,7 +386,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "middlebury": middlebury, "sfmdata-alicevision": alicevision, "sfmdata-openmvg": openmvg, "transforms": transforms,
     "neus": neus, "wildlight": wildlight, "iron": iron, "diligent-mv": diligent, "colmap-text": colmap_text,
     "colmap-binary": colmap_binary, "detect": detected, "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
-    "results": results, "merl-networks": networks, "synthesize": synthesized,
+    "results": results, "config.json": settings, "merl-networks": networks, "synthesize": synthesized,
     "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
     "stl": mesh(".stl"), "glb": mesh(".glb"),
     "png": picture("a.png", lambda path: photographs(path.parent, ["a.png"])),
