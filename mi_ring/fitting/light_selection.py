@@ -87,7 +87,7 @@ class Trials:
         self.errors: dict[Lighting, float] = {}  #: mean error of each
         self.found: dict[Lighting, Lighting] = {}  #: each with the lamps that its fit has found
         self.failures: list[InputError] = []  #: of fits that failed
-        #: harmonics (PER_FRAME, 3) that a fit under an environment has found, and the information about each (PER_FRAME,)
+        #: harmonics (PER_FRAME, 3) of the environment that a fit has found, and information about each (PER_FRAME,)
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
@@ -169,7 +169,7 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
 
     Colours are relative to the first lamp, which is white: its colour cannot be told from the object's. `harmonics`
-    (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares, together with constant
+    (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
     light: each direction in turn moves to its best place, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
