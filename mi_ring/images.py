@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from mi_ring.foreign import require_room
 from mi_ring.system.files import write_file
-from mi_ring.system.machine import threads_for_exr
+from mi_ring.system.machine import exr_threads
 
 #: Suffixes of photographs, lower case: those that everybody reads, and those that take packages of their own.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
@@ -162,7 +162,7 @@ def read_image(path: Path) -> np.ndarray:
     elif suffix == ".exr":
         width, height, channels = exr_size(path)
         require_room(path, 4 * width * max(height, EXR_CHUNK) * channels)
-        with threads_for_exr():
+        with exr_threads():
             pixels = np.array(mi.Bitmap(str(path)), copy=True)
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads those that end too early, grey from there on
         with opened(path) as image:
@@ -192,6 +192,6 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
-    with threads_for_exr() if kind == formats.OpenEXR else contextlib.nullcontext():
+    with exr_threads() if kind == formats.OpenEXR else contextlib.nullcontext():
         mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
     write_file(path, stream.raw_buffer())

@@ -130,13 +130,13 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
     try:
-        with command.going_on(), locked(config.out, "DIR"):
+        with command.resumable(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt as stop:
         # Native threads do not let themselves be ended; what they write is whole or not at all.
-        os._exit(command.status_of(stop))
+        os._exit(command.exit_status(stop))
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
 

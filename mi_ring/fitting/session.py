@@ -23,7 +23,7 @@ from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
 from mi_ring.system.command import SIGNALS
 from mi_ring.system.optional import installed
-from mi_ring.system.progress import outliving_readers, progress
+from mi_ring.system.progress import progress, tolerating_closed_output
 
 CHECKPOINT_SECONDS = 30.0
 WORTH_MEASURING = 60  #: iterations: shorter fits do without knowing how long theirs take
@@ -185,7 +185,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     """
     processes = fit.processes
     fitted_scene = processes.by_first(lambda: results.fitted_scene(fit, folder))
-    with heeding_signals() as heard, outliving_readers():
+    with heeding_signals() as heard, tolerating_closed_output():
 
         def interrupted() -> int:
             return processes.most(heard())

@@ -28,7 +28,7 @@ from mi_ring.output import calibration_panel
 from mi_ring.output.svg import svg_uri
 from mi_ring.rendering import bridge
 from mi_ring.system.command import scene_name
-from mi_ring.system.machine import in_turn
+from mi_ring.system.machine import pipelined
 from mi_ring.version import __version__
 
 REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
@@ -62,7 +62,7 @@ def report_html(
     """
     capture, ring = fit.calibrated(), fit.ring
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = in_turn(partial(predicted, fit, capture), partial(panels_of, fit, capture), some)
+    parts = pipelined(partial(predicted, fit, capture), partial(panels_of, fit, capture), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # Of many photographs those that are shown may all be kept out.
