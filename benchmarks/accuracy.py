@@ -77,7 +77,7 @@ def watch() -> dict[str, float]:
 
         return run
 
-    for part, cls in (("flow", shape_net._Flow), ("rendering", bridge._Render)):
+    for part, cls in (("flow", shape_net._EulerSteps), ("rendering", bridge._Render)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
     bridge.surroundings = timed("rendering", bridge.surroundings)
     for cls in (torch.optim.Adam, Muon):

@@ -137,12 +137,10 @@ def cpu_quota(root: Path) -> float:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
         group = root / next((line.split(":", 2)[2] for line in lines if line.startswith("0::")), "/").lstrip("/")
         groups = [folder for folder in (group, *group.parents) if folder.is_relative_to(root)]
-    version_2 = [[group / "cpu.max"] for group in groups]
-    version_1 = [
-        [root / name / f"cpu.cfs_{part}_us" for part in ("quota", "period")] for name in ("cpu", "cpu,cpuacct")
-    ]
+    sources = [[group / "cpu.max"] for group in groups]  # version 2, then version 1
+    sources += [[root / name / f"cpu.cfs_{x}_us" for x in ("quota", "period")] for name in ("cpu", "cpu,cpuacct")]
     limit = math.inf
-    for files in version_2 + version_1:
+    for files in sources:
         with contextlib.suppress(OSError, ValueError):  # there is no such file, or it says "max"
             time, period = map(int, " ".join(file.read_text() for file in files).split())
             limit = min(limit, time / period if time > 0 else math.inf)
