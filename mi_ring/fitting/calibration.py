@@ -25,7 +25,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.curve import Curve
 from mi_ring.fitting.lamps import Lamps
 from mi_ring.fitting.room_light import Room
-from mi_ring.geometry.camera import Camera, distortion_range, straightening
+from mi_ring.geometry.camera import Camera, distortion_range, undistortion_factor
 from mi_ring.geometry.rotations import quarter_turns, rotations
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
@@ -268,7 +268,7 @@ class Calibration(nn.Module):
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
         if self.bent:
-            distance2 = distance2 * straightening(at.distortion[index].detach()[:, None, None], distance2) ** 2
+            distance2 = distance2 * undistortion_factor(at.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
     @property
