@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_views
 from mi_ring.errors import InputError
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import gltf
 from mi_ring.output.ambiguity import ambiguity_of
@@ -97,7 +97,7 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)
-    dress(ring, config)
+    edit_material(ring, config)
     kind = config.file.suffix.lower()
     level = config.subdivisions
     if level is None:

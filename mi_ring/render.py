@@ -10,7 +10,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.objects.material_edits import dress
+from mi_ring.objects.material_edits import edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.output.camera_paths import RenderConfig, View, integrator_of, lit_surface, render_views, views_of
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
     require_options(config)
     ring = load_fit(config.run)
-    dress(ring, config)
+    edit_material(ring, config)
     capture = load_capture(config.scene, images=False)
     views = views_of(capture, ring, config)
     require_writable(views, capture, config)

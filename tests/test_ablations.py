@@ -31,7 +31,7 @@ from mi_ring.nets.mlp import plain_autograd
 from mi_ring.nets.resnet import ResNet, shape_net_of
 from mi_ring.nets.shape_net import SPEED, Flow, ShapeNet
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit, ring_of, ring_state
 from mi_ring.scene.self_intersections import crossing_triangles
 
@@ -252,7 +252,7 @@ def test_a_material_on_the_surface_moves_to_another_shape_as_it_was(tmp_path):
     torch.save(ring_state(other), tmp_path / "ring.pt")
     for material_at in ("domain", "surface"):
         ring = FittedObject([1.0, 2, 3], 5.0, networks=(wild(ShapeNet(3), 7), BRDFNet()), material_at=material_at)
-        dress(ring, MaterialOptions(material=tmp_path / "ring.pt"))
+        edit_material(ring, MaterialOptions(material=tmp_path / "ring.pt"))
         s, _ = Sphere().sample(1)
         with torch.no_grad():
             torch.testing.assert_close(ring.material(s), other.material(s))

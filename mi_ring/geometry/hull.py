@@ -156,7 +156,7 @@ class Hull:
         return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
 
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
-        """The closed surface of the largest piece [scene units], by marching cubes with `resolution` cells along its side."""
+        """The closed surface of the largest piece [scene units], by marching cubes; `resolution` is along its side."""
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)
