@@ -13,7 +13,7 @@ from mi_ring.system import llvm
 from mi_ring.system.command import run
 from mi_ring.version import __version__
 
-#: Modules of the package; the first line of each says what the command does and ends in how it is called.
+#: Modules of the package. The first line of each says what the command does and ends in how to call it.
 COMMANDS = (
     "example", "synthesize", "board", "photos", "convert", "check", "fit", "batch", "render", "export", "evaluate",
     "paper", "validate", "doctor",
@@ -21,7 +21,7 @@ COMMANDS = (
 
 
 def summary(name: str) -> tuple[str, str]:
-    """How a command is called, and what it does, by the first line of its module, which is not imported."""
+    """How to call a command and what it does, from the first line of its module, without importing that."""
     source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
     docstring = ast.get_docstring(ast.parse(source)) or ""
     sentence, _, call = docstring.split("\n")[0].partition("`python -m mi_ring.")
@@ -29,7 +29,7 @@ def summary(name: str) -> tuple[str, str]:
 
 
 def overview() -> str:
-    """The help of `mi-ring`: every command in two lines."""
+    """The help of `mi-ring`: two lines for each command."""
     lines = ["usage: mi-ring COMMAND …", ""]
     for usage, sentence in map(summary, COMMANDS):
         lines += [f"  {usage}", f"      {sentence}"]
@@ -40,7 +40,7 @@ def overview() -> str:
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int | None:
-    """Import a command and run it. Raises InputError where Mitsuba, which all but the doctor import, cannot be."""
+    """Import a command and run it. Raises InputError if Mitsuba cannot be imported; only `doctor` works without it."""
     if name != "doctor" and not llvm.has_atomic():
         raise InputError(str(llvm.missing()))
     return importlib.import_module(f"mi_ring.{name}").main(arguments)
