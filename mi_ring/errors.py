@@ -1,7 +1,9 @@
 """The errors for bad input, and the most frequent cause: a file that does not exist."""
 
+import math
 import os
 from pathlib import Path
+from typing import Any
 
 
 class InputError(ValueError):
@@ -29,3 +31,11 @@ def require_file(path: Path, wanted: str, field: str = "") -> None:
     if not is_file(path):
         what = "is a folder" if os.path.isdir(path) else "no such file"
         raise InputError(f"{path}: {field}{': ' if field else ''}{what}; give {wanted}")
+
+
+def require_range(options: Any, name: str, low: float, high: float = math.inf) -> None:
+    """Raise InputError unless the option of this name is within these limits or None."""
+    value = getattr(options, name)
+    if value is not None and not low <= value <= high:
+        limits = f"{low} to {high}" if high < math.inf else f"at least {low}"
+        raise InputError(f"--{name.replace('_', '-')}: is {value}, must be {limits}")
