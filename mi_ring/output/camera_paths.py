@@ -18,7 +18,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions
-from mi_ring.output.atlas import flowed
+from mi_ring.output.atlas import flow_points
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import LANES, Photographs
@@ -161,7 +161,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
     Also returns the middle (3,) of the object [scene units].
     """
     s = ring.domain.sample(3)[0].numpy()
-    points = np.concatenate([flowed(ring, s, time) for time in (0.0, 1.0)]).astype(float)
+    points = np.concatenate([flow_points(ring, s, time) for time in (0.0, 1.0)]).astype(float)
     points = ring.center.cpu().numpy() + float(ring.radius) * points
     middle = (points[len(s) :].min(0) + points[len(s) :].max(0)) / 2
     to_world = camera.to_world.astype(float)

@@ -1,6 +1,5 @@
 """glTF: a fitted object with metallic-roughness textures, as one GLB file."""
 
-import io
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
@@ -21,33 +20,34 @@ from mi_ring.scene.mesh_attributes import constants
 from mi_ring.scene.visibility import View, seen_of
 from mi_ring.scene.xml_elements import load_bsdf
 
-LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled`, but for glTF's
+LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled` that glTF lacks
 
 
 class Material(NamedTuple):
-    """Reflectances of N points in glTF's terms; what is linear is not encoded."""
+    """The material of N points as parameters of glTF; all are linear."""
 
-    base_color: np.ndarray  # (N, 3), linear, in [0, 1]
+    base_color: np.ndarray  # (N, 3), in [0, 1]
     metallic: np.ndarray  # (N,)
     roughness: np.ndarray  # (N,), the square root of the microfacet width
     specular: np.ndarray  # (N,), the weight of KHR_materials_specular
-    specular_color: float  # its factor of F₀
-    scale: float  # by which the reflectances were multiplied to stay within [0, 1]
+    specular_color: float  # the factor of F₀ in this extension
+    scale: float  # of the reflectances, so that they stay within [0, 1]
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
-    """A BSDF, Mitsuba's XML, with these parameters, (N, 3) or (N,) by name, in glTF's terms.
+    """The parameters of glTF for a BSDF, given as Mitsuba's XML, with parameters (N, 3) or (N,) by name.
 
     ``cooktorrance``: glTF's dielectric is (1 − F) c/π + F D V with Schlick's F between F₀ = min(0.04 k, 1) w and
-    F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25 F is w at all angles, and
+    F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25, F is w at all angles, and
 
         w = 4 ρᵞ,  c = π ρᵈ / (1 − w),  roughness = √r
 
-    make it ρᵈ + 4 ρᵞ D V, with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: G is Smith's product in ours,
-    correlated with height in glTF. c ≤ 1 and w ≤ 1 where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in
-    a hundred does not, the intensities of the lights were not true, and all ρ are scaled until it does.
+    make it ρᵈ + 4 ρᵞ D V, with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: ours is Smith's product, glTF's is
+    correlated with height. c ≤ 1 and w ≤ 1 hold where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in a
+    hundred does not, the lights' intensities were wrong, and all ρ are scaled.
 
-    ``diffuse`` is itself in glTF; ``principled`` without its further lobes nearly is. Raises InputError for others.
+    ``diffuse`` is exact in glTF, and ``principled`` without its other lobes nearly so. Raises InputError for other
+    BSDFs.
     """
     loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")
@@ -82,12 +82,12 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
 
 def require_expressible(ring: FittedObject) -> None:
-    """Raise InputError if the material of a ring cannot be told in glTF's terms: before the work of baking it."""
+    """Raise InputError if glTF cannot express the material of an object; call it before baking, which takes long."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """The material's images (H, W, 3 or 4) uint8, by the names that glTF has for them."""
+    """The textures of a material, (H, W, 3 or 4) uint8, by their names in glTF."""
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": linear_to_srgb(material.base_color),
@@ -98,23 +98,15 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
     return {name: to_bytes(image)[texels.index] for name, image in images.items()}
 
 
-def png(image: np.ndarray) -> bytes:
-    """An (H, W, 3 or 4) uint8 image."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
     views: Sequence[View] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The object as a GLB file with textures of `resolution` texels a side.
 
-    Positions are in scene units and in the scene's frame; with `metres`, the length of one, a node scales them to
-    glTF's, and with `up` (3,) it turns them so that this is its y. The parameters of the
-    BSDF are also there as they are, as vertex attributes (_DIFFUSE, …) and, what they mean, in the material's extras.
-    With `views` there is also _SEEN: 1 where one of them shows the object, 0 where none does.
+    Positions are in scene units and in the scene's frame. A node scales them to metres if `metres`, the length of a
+    scene unit, is given, and turns `up` (3,) to the y axis. The BSDF's own parameters are vertex attributes (_DIFFUSE,
+    …), which the material's extras describe. With `views`, _SEEN is 1 where a view shows the object, and 0 elsewhere.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
@@ -122,9 +114,9 @@ def glb(
     material = metallic_roughness(ring.bsdf, reflectances(ring, texels.s))
     exact, seen = reflectances(ring, atlas.s), None
     if views is not None:
-        s = np.zeros((atlas.whole.max() + 1, 3), np.float32)
-        s[atlas.whole] = atlas.s
-        seen = seen_of(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
+        s = np.zeros((atlas.uncut.max() + 1, 3), np.float32)
+        s[atlas.uncut] = atlas.s
+        seen = seen_of(ring, s, atlas.uncut[atlas.faces], views)[0][atlas.uncut]
     return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen, up)
 
 
@@ -132,7 +124,7 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """The GLB file of a mesh, its `textures` and its exact parameters at the vertices; `seen` (V,) bool."""
+    """The GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
     file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
     blob = bytearray()
 
@@ -156,7 +148,8 @@ def assemble_glb(
         return len(file.accessors) - 1
 
     def texture(name: str, kind: Any = pygltflib.TextureInfo) -> Any:
-        file.images.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=view(png(images[name]))))
+        content = view(encoded_picture(Image.fromarray(images[name])))
+        file.images.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=content))
         file.textures.append(pygltflib.Texture(sampler=0, source=len(file.images) - 1))
         return kind(index=len(file.textures) - 1)
 
