@@ -125,52 +125,42 @@ def assemble_glb(
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
-    file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
     blob = bytearray()
+    buffer_views: list[pygltflib.BufferView] = []
+    accessors: list[pygltflib.Accessor] = []
+    sources: list[pygltflib.Image] = []
 
     def view(content: bytes, target: int | None = None) -> int:
         blob.extend(b"\0" * (-len(blob) % 4))
         place = pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(content), target=target)
-        file.bufferViews.append(place)
+        buffer_views.append(place)
         blob.extend(content)
-        return len(file.bufferViews) - 1
+        return len(buffer_views) - 1
 
-    def accessor(array: np.ndarray, bounds: bool = False, target: int = pygltflib.ARRAY_BUFFER) -> int:
-        kind = pygltflib.UNSIGNED_INT if array.dtype == np.uint32 else pygltflib.FLOAT
-        columns = 1 if array.ndim == 1 else array.shape[1]
-        entry = pygltflib.Accessor(
-            bufferView=view(array.tobytes(), target), componentType=kind, count=len(array),
-            type=["", "SCALAR", "VEC2", "VEC3", "VEC4"][columns],
-        )  # fmt: skip
-        if bounds:
-            entry.min, entry.max = array.min(0).tolist(), array.max(0).tolist()
-        file.accessors.append(entry)
-        return len(file.accessors) - 1
+    def accessor(array: np.ndarray, target: int = pygltflib.ARRAY_BUFFER) -> int:
+        accessors.append(pygltflib.Accessor(
+            bufferView=view(array.tobytes(), target), count=len(array),
+            componentType=pygltflib.UNSIGNED_INT if array.dtype == np.uint32 else pygltflib.FLOAT,
+            type="SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
+        ))  # fmt: skip
+        return len(accessors) - 1
 
     def texture(name: str, kind: Any = pygltflib.TextureInfo) -> Any:
         content = view(encoded_picture(Image.fromarray(images[name])))
-        file.images.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=content))
-        file.textures.append(pygltflib.Texture(sampler=0, source=len(file.images) - 1))
-        return kind(index=len(file.textures) - 1)
+        sources.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=content))
+        return kind(index=len(sources) - 1)
 
-    attributes = pygltflib.Attributes(
-        POSITION=accessor(atlas.vertices.astype(np.float32), bounds=True),
-        NORMAL=accessor(atlas.normals.astype(np.float32)),
-        TANGENT=accessor(atlas.tangents.astype(np.float32)),
-        TEXCOORD_0=accessor(atlas.uv.astype(np.float32)),
-    )
-    for name, values in exact.items():
-        setattr(attributes, f"_{name.upper()}", accessor(values.astype(np.float32)))
-    if seen is not None:
-        attributes._SEEN = accessor(seen.astype(np.float32))
+    vertices = {"POSITION": atlas.vertices, "NORMAL": atlas.normals, "TANGENT": atlas.tangents, "TEXCOORD_0": atlas.uv}
+    vertices |= {f"_{name.upper()}": values for name, values in exact.items()}
+    vertices |= {} if seen is None else {"_SEEN": seen}
+    attributes = pygltflib.Attributes()
+    for name, values in vertices.items():
+        setattr(attributes, name, accessor(values.astype(np.float32)))
+    bounds, positions = accessors[0], atlas.vertices.astype(np.float32)
+    bounds.min, bounds.max = positions.min(0).tolist(), positions.max(0).tolist()
     indices = accessor(atlas.faces.astype(np.uint32).ravel(), target=pygltflib.ELEMENT_ARRAY_BUFFER)
-    file.samplers.append(pygltflib.Sampler(
-        magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
-        wrapS=pygltflib.CLAMP_TO_EDGE, wrapT=pygltflib.CLAMP_TO_EDGE,
-    ))  # fmt: skip
     specular = texture("specularTexture")
-    file.extensionsUsed.append("KHR_materials_specular")
-    file.materials.append(pygltflib.Material(
+    fitted = pygltflib.Material(
         name="fitted",
         pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
             baseColorTexture=texture("baseColorTexture"), metallicRoughnessTexture=texture("metallicRoughnessTexture")
@@ -182,16 +172,23 @@ def assemble_glb(
         extras={"mi_ring": {
             "bsdf": bsdf, "attributes": {name: f"_{name.upper()}" for name in exact}, "scale": material.scale,
         }},
-    ))  # fmt: skip
-    file.meshes.append(pygltflib.Mesh(primitives=[
-        pygltflib.Primitive(attributes=attributes, indices=indices, material=0)
-    ]))  # fmt: skip
-    extras = {"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"}
-    turn = None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist()
-    scale = [metres] * 3 if metres else None
-    file.nodes.append(pygltflib.Node(name="object", mesh=0, scale=scale, rotation=turn, extras=extras))
-    file.scenes.append(pygltflib.Scene(nodes=[0]))
-    file.scene = 0
-    file.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
+    )  # fmt: skip
+    node = pygltflib.Node(
+        name="object", mesh=0, scale=[metres] * 3 if metres else None,
+        rotation=None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist(),
+        extras={"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"},
+    )  # fmt: skip
+    sampler = pygltflib.Sampler(
+        magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
+        wrapS=pygltflib.CLAMP_TO_EDGE, wrapT=pygltflib.CLAMP_TO_EDGE,
+    )  # fmt: skip
+    file = pygltflib.GLTF2(
+        asset=pygltflib.Asset(version="2.0", generator="mi_ring"), scene=0, scenes=[pygltflib.Scene(nodes=[0])],
+        nodes=[node], materials=[fitted], extensionsUsed=["KHR_materials_specular"],
+        meshes=[pygltflib.Mesh(primitives=[pygltflib.Primitive(attributes=attributes, indices=indices, material=0)])],
+        textures=[pygltflib.Texture(sampler=0, source=k) for k in range(len(sources))], samplers=[sampler],
+        images=sources, accessors=accessors, bufferViews=buffer_views,
+        buffers=[pygltflib.Buffer(byteLength=len(blob))],
+    )  # fmt: skip
     file.set_binary_blob(bytes(blob))
     return b"".join(file.save_to_bytes())
