@@ -13,7 +13,7 @@ from torch import Tensor
 CHUNK = 8192  #: points that a thread computes at once, at most
 MAX_STORED = 20_000  #: points whose activations are stored; for more points, the backward pass computes them again
 
-_pool: tuple[int, ThreadPoolExecutor] | None = None  # one for the whole process: (threads, executor)
+_pool: tuple[int, int, ThreadPoolExecutor] | None = None  # of the process: (its id, threads, executor)
 _lock = threading.Lock()
 
 
@@ -71,7 +71,7 @@ def pool(threads: int) -> ThreadPoolExecutor:
     """The worker threads of this process, at least this number."""
     global _pool
     with _lock:
-        if _pool is None or _pool[0] < threads:
+        if _pool is None or _pool[0] != os.getpid() or _pool[1] < threads:  # a fork does not copy threads
             before = torch.get_num_threads()
             executor = ThreadPoolExecutor(threads, "mi_ring", initializer=use_one_thread)
             started = threading.Barrier(threads + 1)
@@ -83,21 +83,11 @@ def pool(threads: int) -> ThreadPoolExecutor:
                 raise
             started.wait()
             torch.set_num_threads(before)  # for all later threads, torch uses the number that a thread set last
-            _pool = threads, executor
-        return _pool[1]
+            _pool = os.getpid(), threads, executor
+        return _pool[2]
 
 
 def use_one_thread() -> None:
     """Let torch use one thread for what the current thread computes."""
     torch.get_num_threads()  # the first call copies the number of the process, which would undo the next line
     torch.set_num_threads(1)
-
-
-def forget_pool() -> None:
-    """Called in a forked process, to which worker threads are not copied."""
-    global _pool
-    _pool = None
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=forget_pool)

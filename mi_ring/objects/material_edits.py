@@ -40,9 +40,10 @@ def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
         other = load_fit(options.material)
         ring.bsdf, ring.material_at = other.bsdf, "domain"
         ring.brdf_net = other.brdf_net if other.material_at == "domain" else OnSurface(other.brdf_net, other.shape_net)
-        if not same_domain(ring, other):
-            here = SphericalMap(ring.domain, "--material: the shape")
-            there = SphericalMap(other.domain, f"{options.material}: --material")
+        a, b = ring.domain, other.domain
+        same = type(a) is type(b) and np.array_equal(a.points, b.points) and np.array_equal(a.faces, b.faces)
+        if not same:
+            here, there = SphericalMap(a, "--material: the shape"), SphericalMap(b, f"{options.material}: --material")
             ring.brdf_net = TransferredMaterial(ring.brdf_net, here, there)
         ring.indirect = ring.indirect and other.indirect
     gains: dict[str, ArrayLike] = {}
@@ -71,12 +72,6 @@ def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> l
     if not found:
         raise InputError(f"{option}: this material has no such parameter; it has {', '.join(parameters)}")
     return found
-
-
-def same_domain(a: FittedObject, b: FittedObject) -> bool:
-    """Are the networks of two objects functions on the same surface?"""
-    same = [np.array_equal(x, y) for x, y in ((a.domain.points, b.domain.points), (a.domain.faces, b.domain.faces))]
-    return type(a.domain) is type(b.domain) and all(same)
 
 
 class OnSurface(MaterialNet):

@@ -75,10 +75,8 @@ def assemble(
     (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
     sign = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
     along = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * sign[:, None]
-    tangents, signs = np.zeros((len(s), 3)), np.zeros(len(s))
-    for corner in faces.T:
-        np.add.at(tangents, corner, along)
-        np.add.at(signs, corner, sign)
+    incidence = trimesh.geometry.index_sparse(len(s), faces)  # (V, F): which triangles a vertex belongs to
+    tangents, signs = incidence @ along, incidence @ sign
     tangents -= (tangents * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(tangents, axis=1, keepdims=True)
     aside = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])  # for a zero derivative, any direction

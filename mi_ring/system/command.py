@@ -4,6 +4,7 @@ import ast
 import contextlib
 import difflib
 import io
+import itertools
 import math
 import os
 import re
@@ -67,27 +68,17 @@ def complaint_in(box: str) -> str:
         lines = [line.strip("│") for line in box.splitlines() if line.startswith("│")]
     else:
         lines = [line for line in box.splitlines() if line.strip()][2:]  # after the title and its rule
-    parts: list[list[str]] = [[]]
-    for line in lines:
-        if set(line.strip()) in ({"─"}, {"-"}):
-            parts.append([])
-        else:
-            parts[-1].append(line)
-    if names := missing_in(parts[0]):
+    groups = itertools.groupby(lines, lambda line: set(line.strip()) in ({"─"}, {"-"}))
+    parts = [list(group) for is_rule, group in groups if not is_rule] or [[]]
+    if parts[0] and parts[0][0].strip().startswith("Missing from "):  # their names are indented, their help is more so
+        indents = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
+        names = [line.split()[0] for line, indent in zip(parts[0][1:], indents) if indent == min(indents)]
         return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     parts = [[line.strip() for line in part if line.strip()] for part in parts]
     advice = {part[0]: part[1:] for part in parts[1:] if part}
     complaint = plain(" ".join(parts[0]) or " ".join(box.split()), " ".join(advice.get("Argument helptext:", [])))
     alike = [line for line in advice.get("Perhaps you meant:", []) if line.startswith("--")]
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
-
-
-def missing_in(lines: Sequence[str]) -> list[str]:
-    """The names of missing arguments, if the message is about those. They are indented, and their help is more so."""
-    if not (lines and lines[0].strip().startswith("Missing from ")):
-        return []
-    indents = [len(line) - len(line.lstrip()) for line in lines]
-    return [line.split()[0] for line, n in zip(lines[1:], indents[1:], strict=True) if n == min(indents[1:])]
 
 
 def plain(complaint: str, help_text: str) -> str:
@@ -114,10 +105,8 @@ def plain(complaint: str, help_text: str) -> str:
             found = " ".join(ast.literal_eval(wrong[2] or "[]"))
         shown = re.match(r"--\S+ \[(.*?\.\.\.\])\]", help_text)
         return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {shown[1] if shown else 'as --help says'}"
-    for kind, error in (
-        ("whole number", r"invalid literal for int\(\) .*"),
-        ("number", "could not convert string to float"),
-    ):
+    errors = {"whole number": r"invalid literal for int\(\) .*", "number": "could not convert string to float"}
+    for kind, error in errors.items():
         complaint = re.sub(rf"^Error parsing (\S+): {error}: '(.*)'", rf"\1: is \2; must be a {kind}", complaint)
     return re.sub(r"^Error parsing \w+Config: ", "", complaint)  # errors that the dataclass itself raises
 

@@ -70,19 +70,12 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
                     os.replace(path, keep)
             os.replace(partial, path)
             if durable:
-                sync_folder(path.parent)
+                with contextlib.suppress(OSError):  # on Windows, and on some file systems
+                    folder = os.open(path.parent, os.O_RDONLY)
+                    os.fsync(folder)
+                    os.close(folder)
         finally:
             partial.unlink(missing_ok=True)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the file names in a folder survive a power cut."""
-    with contextlib.suppress(OSError):  # on Windows, and on some file systems
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
@@ -128,26 +121,8 @@ def quoted(content: bytes) -> list[str]:
 
 
 @contextlib.contextmanager
-def waiting_lock(folder: Path) -> Iterator[None]:
-    """Within it no other process makes this folder. If one does, print that and wait for it.
-
-    The lock file beside the folder stays: if it were removed, a waiting process would hold the lock of another file.
-    """
-    with writing(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder.with_name(f".{folder.name}.lock"))
-        try:
-            acquired = lock.acquire(timeout=0)
-        except filelock.Timeout:
-            print(f"waiting for {folder}, which another process makes", flush=True)
-            acquired = lock.acquire()
-    with acquired:
-        yield
-
-
-@contextlib.contextmanager
-def locked(folder: Path, field: str = "--out") -> Iterator[None]:
-    """Within it no other process of ours writes into this folder. Raises InputError if one does already.
+def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
+    """Within it no other process of ours writes into this folder. If one does, raise InputError, or `wait` for it.
 
     The lock file is beside the folder, so that the folder may be moved. The lock ends with the process.
     """
@@ -157,15 +132,21 @@ def locked(folder: Path, field: str = "--out") -> Iterator[None]:
         raise InputError(f"{folder}: {field}: is a file; give a folder, which is made if it is not there")
     require_place(place, field)  # otherwise filelock would report that another process holds the lock
     with writing(f"{folder}: {field}"):
+        lock = filelock.FileLock(file)
         try:
-            acquired = filelock.FileLock(file).acquire(timeout=0)
+            acquired = lock.acquire(timeout=0)
         except filelock.Timeout:
-            raise InputError(
-                f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
-            ) from None
+            if not wait:
+                raise InputError(
+                    f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
+                ) from None
+            print(f"waiting for {folder}, which another process makes", flush=True)
+            acquired = lock.acquire()
     with acquired:
         try:
             yield
         finally:
-            if os.name == "posix":  # Windows cannot remove an open file; there filelock removes it
+            # A process that waits has opened this file; it must not lock a file that is removed. Windows cannot remove
+            # an open file; there filelock removes it.
+            if os.name == "posix" and not wait:
                 file.unlink(missing_ok=True)
