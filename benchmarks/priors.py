@@ -22,7 +22,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.geometry.domain import carried, gpytoolbox
+from mi_ring.geometry.domain import gpytoolbox, transfer_points
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
@@ -98,7 +98,7 @@ def errors(fit: Fit, folder: Path) -> list[float]:
     result = [float(np.degrees(np.arccos(cosines.clip(-1, 1))).mean())]
     for name in ("diffuse", "specular", "roughness"):
         values = material[name].reshape(len(truth.vertices), -1)
-        wanted = carried(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
+        wanted = transfer_points(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
         given = found[name].numpy().reshape(len(s), -1)
         result.append(float(np.abs(given - wanted).mean() / values.mean()))
     return result

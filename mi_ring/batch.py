@@ -18,7 +18,7 @@ from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import cores, set_variant
 from mi_ring.system.optional import need
-from mi_ring.system.progress import outliving_readers, progress
+from mi_ring.system.progress import progress, tolerating_closed_output
 
 OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives them itself
 
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(f"options of fits, after --: {error}") from None
     need("ray", "mi-ring batch")
     set_variant("llvm_ad_rgb")
-    with locked(config.out / "batch"), outliving_readers(), command.going_on():
+    with locked(config.out / "batch"), tolerating_closed_output(), command.resumable():
         todo = waiting(jobs, fit.masks)
         show(jobs, config.out, True)
         with noting_the_end(todo, jobs, config.out):

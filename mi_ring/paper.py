@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     if config.materials:
         what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
     seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
-    with command.going_on(), locked(out):
+    with command.resumable(), locked(out):
         said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
         failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)

@@ -108,7 +108,7 @@ def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
     handler = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt) as stop:
         batch.main(arguments)
-    assert command.status_of(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
+    assert command.exit_status(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
     said = capsys.readouterr()
     assert "wrong: failed: " in said.out and said.err.endswith("interrupted; the same command goes on\n")
     page = (job.folder.parent / "index.html").read_text()

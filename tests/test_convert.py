@@ -324,7 +324,7 @@ def test_a_model_that_keeps_its_reader_busy_for_ever_is_refused(colmap, tmp_path
     content = bytearray(path.read_bytes())
     content[5] = 1
     path.write_bytes(content)
-    monkeypatch.setattr(foreign, "PATIENCE", 3.0)
+    monkeypatch.setattr(foreign, "READ_SECONDS", 3.0)
     with pytest.raises(InputError, match="not a COLMAP model, or damaged"):
         convert.main(["colmap", str(path.parent), str(tmp_path / "scan.xml"), "--images", str(colmap / "images")])
     assert not (tmp_path / "scan.xml").exists()

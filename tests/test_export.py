@@ -114,9 +114,9 @@ def bilinear(image, uv):
 
 def closed(opened) -> trimesh.Trimesh:
     """The mesh of an atlas before it was cut."""
-    vertices = np.zeros((opened.whole.max() + 1, 3))
-    vertices[opened.whole] = opened.vertices
-    return trimesh.Trimesh(vertices, opened.whole[opened.faces], process=False)
+    vertices = np.zeros((opened.uncut.max() + 1, 3))
+    vertices[opened.uncut] = opened.vertices
+    return trimesh.Trimesh(vertices, opened.uncut[opened.faces], process=False)
 
 
 def normals_at(ring, s):
@@ -229,7 +229,7 @@ def test_charts_do_not_overlap_and_lose_nothing(ring, baked):
     corners = opened.uv[opened.faces]
     area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 2
     assert abs(len(texels.s) / RESOLUTION**2 - area) < 0.01 * area  # a texel in two triangles would count once
-    assert len(opened.faces) == 20 * 4**3 and opened.whole.max() + 1 == 10 * 4**3 + 2
+    assert len(opened.faces) == 20 * 4**3 and opened.uncut.max() + 1 == 10 * 4**3 + 2
     assert closed(opened).is_watertight and closed(opened).euler_number == 2
 
 
@@ -249,7 +249,7 @@ def test_there_are_no_seams(ring, baked):
     assert colour.std((0, 1)).min() > 0.02
     sides = {}
     for a, b in np.concatenate([opened.faces[:, [k, (k + 1) % 3]] for k in range(3)]):
-        sides.setdefault(frozenset(opened.whole[[a, b]]), []).append((a, b))
+        sides.setdefault(frozenset(opened.uncut[[a, b]]), []).append((a, b))
     seams = [pair for pair in sides.values() if len({frozenset(edge) for edge in pair}) > 1]
     assert len(seams) > 20
     one, two = (bilinear(colour, np.array([opened.uv[list(pair[k])].mean(0) for pair in seams])) for k in (0, 1))

@@ -99,6 +99,6 @@ def test_where_a_mask_says_nothing_it_does_not_cut_the_hull(lens_capture):
     turned[:3, 3] += camera.to_world[:3, 0]
     other = Silhouette(np.full((H, W), 255, np.uint8), camera._replace(to_world=turned), "other")
     for known, left in ((None, False), (valid, True)):
-        hull = Hull([Silhouette(mask, camera, "cut", known), other, other], "test", wrong=0)
+        hull = Hull([Silhouette(mask, camera, "cut", known), other, other], "test", outliers=0)
         depth = hull.depth(torch.as_tensor(towards, dtype=torch.float32))
         assert (depth[0] > 0) == left and depth[1] > 0

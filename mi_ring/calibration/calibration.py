@@ -22,7 +22,7 @@ from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera, straightening
+from mi_ring.geometry.camera import Camera, undistortion_factor
 from mi_ring.rendering import bridge, prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
@@ -125,7 +125,7 @@ class Calibration(nn.Module):
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
         if self.bent:
-            distance2 = distance2 * straightening(views.distortion[index].detach()[:, None, None], distance2) ** 2
+            distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
     def response(self) -> CameraResponse:

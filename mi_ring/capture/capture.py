@@ -17,7 +17,7 @@ from mi_ring.capture.decoding import decode, is_linear, shade
 from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import NoParallax, nearest_point
-from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
+from mi_ring.geometry.hull import MAX_MASKS, MAX_WIDTH, Hull, Silhouette, evenly_spaced, shrink_mask, small_silhouette
 from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.scene.visibility import MaskedCamera
@@ -108,7 +108,7 @@ class Capture:
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
-        return evenly(len(self), most)
+        return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
         """Photographs `index`, at most so many at a time and all of one size: what one launch renders."""
@@ -218,7 +218,7 @@ class Capture:
             if mask is not None:
                 once.setdefault((mask, sensor.camera.to_world.tobytes()), k)
         all_ = list(once.values())
-        chosen = [all_[i] for i in evenly(len(all_), len(all_) if most is None else most)]
+        chosen = [all_[i] for i in evenly_spaced(len(all_), len(all_) if most is None else most)]
         return [
             small_silhouette(Silhouette(self.masks[k], self.sensors[k].camera, self.outline(k), self.valid[k]))
             for k in chosen
@@ -232,7 +232,7 @@ class Capture:
     @functools.cached_property
     def hull(self) -> Hull | None:
         """The visual hull of the masks, if there are any and they are seen from more than one side."""
-        silhouettes = self.silhouettes(MOST)
+        silhouettes = self.silhouettes(MAX_MASKS)
         try:
             return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
         except NoParallax:
@@ -261,7 +261,7 @@ def views_of(sensors: Sequence, valid: Pixels) -> list[MaskedCamera]:
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
-            small[reader] = shrink_mask(valid[k], WIDTH)
+            small[reader] = shrink_mask(valid[k], MAX_WIDTH)
     found = [small[reader] for reader in valid.readers]
     return [
         MaskedCamera(sensor.camera.shrunk(scale), mask) for sensor, (mask, scale) in zip(sensors, found, strict=True)

@@ -15,7 +15,7 @@ from mi_ring.experiments.slices import ANGLES
 from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.surfaces import hits, load_true_mesh
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
@@ -119,7 +119,7 @@ def swapped(done: list[Outcome]) -> Figure:
             assert material.made
             ring = load_fit(shape.made.folder)
             if material is not shape:
-                dress(ring, MaterialOptions(material=material.made.folder))
+                edit_material(ring, MaterialOptions(material=material.made.folder))
             cells.append(predicted(shape, ring)[0])
         rows.append((title_of(shape), cells))
     return grid(rows, [f"material: {title_of(outcome)}" for outcome in done])

@@ -27,7 +27,7 @@ from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
 from mi_ring.synthesis.options import SynthesizeConfig, require_options
 from mi_ring.synthesis.path_traced_capture import SETTINGS, claim, write_capture
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import in_turn, partial_path, read_json, write_file, writing
+from mi_ring.system.files import locked, partial_path, read_json, write_file, writing
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: of a checkout
 ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made of
@@ -52,7 +52,7 @@ class Recipe:
 
         Raises InputError if there can be none.
         """
-        with in_turn(self.folder_in(captures)):  # other experiments may make the same
+        with locked(self.folder_in(captures), wait=True):  # other experiments may make the same
             return self.make(captures)
 
     def make(self, captures: Path) -> Path:

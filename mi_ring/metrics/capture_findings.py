@@ -10,7 +10,7 @@ from scipy import ndimage, stats
 
 from mi_ring.capture.brightness_masks import dark_threshold
 from mi_ring.capture.capture import Capture
-from mi_ring.geometry.hull import WIDTH, shrink_mask
+from mi_ring.geometry.hull import MAX_WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
@@ -87,7 +87,8 @@ def measure(
     for k, (sensor, name, to_light, away, received) in enumerate(of_each):
         to_camera = sensor.camera.position - center
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
-        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(sensor.size) // WIDTH))[:4])
+        scale = -(-max(sensor.size) // MAX_WIDTH)
+        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], scale)[:4])
         image = rgb.max(-1)
         inside = mask > 0.5 if masked else image > 0.02 * image.max()
         outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
@@ -160,7 +161,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # those of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
-        if not strays and capture.hull and max(sensor.size[0] for sensor in capture.sensors) <= WIDTH:
+        if not strays and capture.hull and max(sensor.size[0] for sensor in capture.sensors) <= MAX_WIDTH:
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
@@ -223,6 +224,6 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 def drop_empty(capture: Capture) -> list[str]:
     """Forget masks with nothing in them and return the names of their photographs."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
-    empty = [k for k in given if not (shrink_mask(capture.masks[k], WIDTH)[0] > 127).any()]
+    empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     capture.masks = capture.masks.replaced(dict.fromkeys(empty))
     return [capture.names[k] for k in empty]

@@ -1,4 +1,4 @@
-"""A scene for Mitsuba without mi_ring: textures and stock plugins alone."""
+"""A scene for Mitsuba without mi_ring: textures and stock plugins only."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -21,9 +21,9 @@ from mi_ring.system.files import write_file
 
 
 def first_photograph(run: Path) -> tuple[Any, np.ndarray | None]:
-    """The first photograph of a fit, as its scene.xml has it, and the room of that.
+    """The first photograph in a fit's scene.xml, and the light of the room.
 
-    Raises InputError if there is none, or if nothing of what lights it can be exported.
+    Raises InputError if there is no such file, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
@@ -39,20 +39,20 @@ def write_scene(
     path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any,
     room: np.ndarray | None,
 ) -> list[Path]:  # fmt: skip
-    """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone.
+    """Write a scene with the textured object and a photograph's camera and light; returns the paths of its files.
 
-    If that has none, the light of its `room` (BASIS, 3).
+    If the photograph has no light, the scene has the light of the `room` (BASIS, 3).
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
     params = mi.traverse(mesh)
-    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's know of the seams
+    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's own have seams
     params.update()
     files.append(path.with_name(f"{path.stem}_object.ply"))
     write_ply(mesh, files[-1])
 
     def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray) -> None:
-        """A texture (N, 3) or (N,) of the texels."""
+        """Add a texture with values (N, 3) or (N,) at the texels."""
         files.append(path.with_name(f"{path.stem}_{name}.exr"))
         write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
         texture = ElementTree.SubElement(parent, "texture", name=name, type="bitmap")
@@ -86,7 +86,7 @@ def write_scene(
     light = Lights.of([photograph])[0]
     scene.append(perspective_element(photograph.camera, atlas.vertices))
     if light.rgb.any():
-        scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
+        scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # reflectances are scaled
     elif room is not None:
         files.append(path.with_name(f"{path.stem}_environment.exr"))
         radiance = room_envmap(room, photograph.camera.to_world).clip(min=0) / scale

@@ -30,7 +30,7 @@ from mi_ring.output.svg import svg_uri
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
-from mi_ring.system.machine import in_turn
+from mi_ring.system.machine import pipelined
 from mi_ring.version import __version__
 
 REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
@@ -63,7 +63,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = in_turn(partial(predicted, result, surface), partial(panels_of, result), some)
+    parts = pipelined(partial(predicted, result, surface), partial(panels_of, result), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # All photographs on the page may be held-out ones.
