@@ -13,7 +13,7 @@ import torch
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection.fits import fit_to_the_end
-from mi_ring.collection.jobs import Job, Record, written
+from mi_ring.collection.jobs import Job, Record, modified
 from mi_ring.errors import InputError
 from mi_ring.experiments.experiment import NOT_RUN, Asked, Experiment, Made, Outcome, Row, Run, require_distinct
 from mi_ring.experiments.measures import COURSE, POINTS, evaluated
@@ -73,7 +73,7 @@ def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome
             if not wanted:
                 return Outcome(run)
             print(f"fitting: {folder}", flush=True)
-            job.note(replace(job.record, tries=0))  # interrupts of the user's are no deaths
+            job.save(replace(job.record, tries=0))  # interrupts of the user's are no deaths
             record = (
                 watched(run, job, fingerprint, made)
                 if run.watched
@@ -110,8 +110,8 @@ def threads(asked: Asked) -> tuple[str, ...]:
 def measured(run: Run, made: Made) -> list[Row]:
     """The rows of a finished fit; those of before if it is the same."""
     measure: Callable[[Run, Made], list[Row]] = run.measure or evaluated
-    of = {"measure": measure.__name__, "spp": made.asked.spp, "written": written(made.folder / "ring.pt"),
-          "compared": [[str(file.resolve()), written(file)] for file in run.recipe.compared(made.captures)],
+    of = {"measure": measure.__name__, "spp": made.asked.spp, "written": modified(made.folder / "ring.pt"),
+          "compared": [[str(file.resolve()), modified(file)] for file in run.recipe.compared(made.captures)],
           "exactly": installed("igl")}  # fmt: skip
     before = read_json(made.folder / NUMBERS)
     if not (isinstance(before, dict) and before.get("of") == of):
@@ -141,8 +141,8 @@ def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
             pass
         fit.save(job.folder)
     write_file(job.folder / COURSE, json.dumps(rows))
-    ring = written(job.folder / "ring.pt")
-    return job.note(replace(job.record, state="done", done=fingerprint, written=ring))
+    ring = modified(job.folder / "ring.pt")
+    return job.save(replace(job.record, state="done", done=fingerprint, written=ring))
 
 
 def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) -> None:

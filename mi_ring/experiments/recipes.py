@@ -15,7 +15,7 @@ import numpy as np
 from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import move_names, recalibrated_xml, scene_bytes
-from mi_ring.collection.jobs import written
+from mi_ring.collection.jobs import modified
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
@@ -205,7 +205,7 @@ class Derived(Recipe):
     def make(self, captures: Path) -> Path:
         scene = self.source.made(captures)
         changes = {k: v for k, v in vars(self).items() if k not in ("name", "source")}
-        of = {"scene": str(scene.resolve()), "written": written(scene), **changes}
+        of = {"scene": str(scene.resolve()), "written": modified(scene), **changes}
         return filled(self.folder_in(captures), lambda folder: self.write(scene, folder, captures), of)
 
     def truth(self, captures: Path) -> Path:
@@ -273,5 +273,5 @@ class DiligentObject(Recipe):
         files = [source.truth, self.folder / "Calib_Results.mat"]  # all that are read
         files += [file for kind in ("*.png", "light_*.txt") for file in self.folder.glob(f"view_*/{kind}")]
         of = {"folder": str(self.folder.resolve()), "fill_holes": self.fill_holes,
-              "written": {file.relative_to(self.folder).as_posix(): written(file) for file in files}}  # fmt: skip
+              "written": {file.relative_to(self.folder).as_posix(): modified(file) for file in files}}  # fmt: skip
         return filled(self.folder_in(captures), lambda out: write_scene(replace(source, scene=out / "scene.xml")), of)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
-from mi_ring.collection.jobs import written
+from mi_ring.collection.jobs import modified
 from mi_ring.errors import InputError, require_file
 from mi_ring.experiments.recipes import Recipe, filled
 from mi_ring.foreign import load_npz
@@ -53,7 +53,7 @@ class SingleView(Recipe):
         return [self.file]
 
     def make(self, captures: Path) -> Path:
-        of = {"file": str(self.file.resolve()), "written": written(self.file)}
+        of = {"file": str(self.file.resolve()), "written": modified(self.file)}
         return filled(self.folder_in(captures), self.write, of)
 
     def write(self, folder: Path) -> None:
