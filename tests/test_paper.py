@@ -47,9 +47,9 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.synthesis.object_on_table import shape_of
 from mi_ring.synthesis.options import SynthesizeConfig
 from mi_ring.synthesis.path_traced_capture import settings_of
-from mi_ring.synthesis.stage import shape_of
 from mi_ring.system import machine
 
 ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
@@ -424,7 +424,7 @@ def test_places_of_the_second_material_are_where_it_is_seen():
     config = SynthesizeConfig(Path(), Path(), "diffuse reflectance=0,0,0", "diffuse reflectance=1,1,1", bands=5)
     black, white = (load_material(str(m), "", False) for m in (config.material, config.second))
     pattern = pattern_of("stripes", np.asarray(ball.vertices), 5, 1, "")
-    scene = mi.load_dict({"type": "scene", "ball": shape_of(ball, None, pattern.of(black, white), pattern)})
+    scene = mi.load_dict({"type": "scene", "ball": shape_of(ball, None, pattern.blend(black, white), pattern)})
     points = ball.triangles_center
     out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))

@@ -39,4 +39,4 @@ def second_at(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) 
     black, white = (mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": v}}) for v in (0.0, 1.0))
     si = dr.zeros(mi.SurfaceInteraction3f, len(points))
     si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv[2:].T)), mi.Vector3f(0, 0, 1)
-    return np.array(pattern.of(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi
+    return np.array(pattern.blend(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi
