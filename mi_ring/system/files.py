@@ -8,6 +8,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -175,3 +176,22 @@ def locked(folder: Path, field: str = "--out") -> Iterator[None]:
         if os.name == "posix":  # elsewhere a file that is open cannot be removed, and filelock removes it itself
             file.unlink(missing_ok=True)
         lock.release()
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder`. At the end it is renamed to `folder`, which must then be missing or empty.
+
+    After an error nothing is left of it. Raises InputError if something in it cannot be written.
+    """
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            yield growing
+            growing.chmod(0o755)
+            with contextlib.suppress(FileNotFoundError):
+                folder.rmdir()
+            os.replace(growing, folder)
+        finally:
+            shutil.rmtree(growing, ignore_errors=True)
