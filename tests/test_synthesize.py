@@ -31,7 +31,7 @@ from mi_ring.synthesis.materials import COLOURS, load_material, parse_plugin
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object
 from mi_ring.synthesis.options import SynthesizeConfig
 from mi_ring.synthesis.path_traced_capture import Studio, write_scenes
-from mi_ring.synthesis.tracing import TracedView
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import look_at, poses
 
 SMALL = ["--views", "9", "--size", "56", "40", "--spp", "16", "--novel", "2"]
@@ -97,7 +97,7 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
     camera = camera_at(middle + turn @ [4, 3, 20], middle + turn @ [1, -1, 0])
     rgb, place = np.array([900.0, 500.0, 700.0]), middle + turn @ [-6, 2, 11]
     light = Light("point", place, rgb) if kind == "point" else Light("directional", -turn @ [0.3, 0.5, 0.8], rgb / 900)
-    found = scene.radiance(TracedView(camera), light, 64, 3, 2)
+    found = scene.radiance(LensCamera(camera), light, 64, 3, 2)
     d = rays(camera)
     p = camera.position + ((middle - camera.position) @ n / (d @ n))[..., None] * d
     to_light = place - p if kind == "point" else np.broadcast_to(turn @ [0.3, 0.5, 0.8], p.shape)
@@ -116,7 +116,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
     room = light_sources.random_room("harmonics", in_camera, np.random.default_rng(4))
     lamp = light_sources.environment_map(light_sources.seen_from_within(room, camera.to_world))
-    found = scene.radiance(TracedView(camera), lamp, 256, 5, 2)
+    found = scene.radiance(LensCamera(camera), lamp, 256, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
     root = half**2 - camera.position @ camera.position + 1

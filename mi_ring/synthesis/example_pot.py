@@ -14,7 +14,7 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.object_on_table import ObjectOnTable
-from mi_ring.synthesis.tracing import TracedView
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import GOLDEN, look_at
 from mi_ring.system.progress import progress
 
@@ -85,7 +85,7 @@ def write_example(folder: Path, spp: int = SPP) -> None:
     for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
         position = camera.position + camera.to_world[:3, :3] @ FLASH
         light = Light("point", position, np.full(3, np.pi * BRIGHTNESS * DISTANCE**2))
-        name, view = f"{k:03}", TracedView(camera)
+        name, view = f"{k:03}", LensCamera(camera)
         picture = scene.radiance(view, light, spp, k, DEPTH)
         write_image(to_bytes(linear_to_srgb(picture)), folder / "images" / f"{name}.png")
         write_image(to_bytes(scene.coverage(view)[..., None] >= 0.5), folder / "masks" / f"{name}.png")

@@ -18,7 +18,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis.materials import COLOURS, Pattern
-from mi_ring.synthesis.tracing import TracedView, clamped_radiance_along, hits_along, pixel_means, radiance_along
+from mi_ring.synthesis.tracing import LensCamera, clamped_radiance_along, hits_along, pixel_means, radiance_along
 
 SMOOTH = 10_000  #: least number of vertices after subdivision
 TABLE, BELOW = 8.0, 2e-3  #: side of the table, and its distance below the sheet [object radii]
@@ -41,7 +41,7 @@ class ObjectOnTable:
         return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
 
     def radiance(
-        self, view: TracedView, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
+        self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
         """Linear radiance (H, W, 3) under one light. `hidden`: an environment is invisible itself."""
         trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
@@ -54,7 +54,7 @@ class ObjectOnTable:
         window = view.around(self.vertices) if hidden and not self.tables else view.whole
         return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
 
-    def coverage(self, view: TracedView, spp: int = 64) -> np.ndarray:
+    def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
         """Share of each pixel that shows the object (H, W)."""
         trace = partial(hits_along, scene=self.under(mi.load_dict({"type": "constant"})), shape=self.object)
         return pixel_means(trace, view, view.around(self.vertices), spp, 0)[..., 0]

@@ -35,7 +35,7 @@ from mi_ring.synthesis.degradation import HALF_LIMIT, encoded, exposures, miscal
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object, shape_of, table_elements
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.tracing import TracedView
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import poses
 from mi_ring.system.files import quoted, read_json, write_file, writing
 from mi_ring.system.progress import progress
@@ -139,7 +139,7 @@ class Studio:
         self, scene: ObjectOnTable, photograph: PlannedPhotograph, camera: Camera, spp: int
     ) -> tuple[np.ndarray, np.ndarray | float]:
         """Linear radiance (H, W, 3) by the photographs' light of 1 W/m² and further lamps; and by the room, or 0."""
-        config, view = self.config, TracedView(camera)
+        config, view = self.config, LensCamera(camera)
         light = photograph.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, photograph.seed, config.depth, hidden=self.environment is None)
         for n, lamp in enumerate(self.further_lamps(photograph.light), 1):
@@ -160,7 +160,7 @@ class Studio:
         scale = max(1, min(TRIAL_SCALE, min(config.size) // 8))
         for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
             camera = photograph.camera.shrunk(scale)
-            inside = scene.coverage(TracedView(camera), 16) > 0.9
+            inside = scene.coverage(LensCamera(camera), 16) > 0.9
             own, ambient = self.radiance(scene, photograph, camera, 36)
             values.append((own + ambient)[inside].max(-1))
         if not np.concatenate(values).size:
@@ -195,7 +195,7 @@ def write_capture(config: SynthesizeConfig) -> None:
     for photograph, folder in progress(todo, "photographing", unit="photograph", leave=True):
         own, ambient = studio.radiance(scene, photograph, photograph.camera, studio.spp)
         pictures = {"images": exposure * (own + ambient)}
-        coverage = scene.coverage(TracedView(photograph.camera))
+        coverage = scene.coverage(LensCamera(photograph.camera))
         write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{photograph.name}.png")
         if folder == out:  # novel views have neither noise nor errors
             if config.pairs:

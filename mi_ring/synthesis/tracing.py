@@ -23,7 +23,7 @@ Trace = Callable[[mi.RayDifferential3f, int], list]  #: (rays, seed) ↦ channel
 
 
 @dataclass(frozen=True)
-class TracedView:
+class LensCamera:
     """A camera with lens distortion and motion blur.
 
     `distortion` (k1, k2): a pinhole's x / z and y / z times 1 + k1 r² + k2 r⁴ are those of the lens.
@@ -54,7 +54,7 @@ class TracedView:
         return left, top, right, bottom
 
 
-def rays_of(view: TracedView, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
+def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
     """`spp` rays through each pixel of a window, stratified. `spp` is a square; the rays of a pixel are consecutive."""
     left, top, right, bottom = window
     side = round(spp**0.5)
@@ -107,7 +107,7 @@ def hits_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, shape: mi
     return [dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), mi.Float(1), 0)]
 
 
-def pixel_means(trace: Trace, view: TracedView, window: Window, spp: int, seed: int) -> np.ndarray:
+def pixel_means(trace: Trace, view: LensCamera, window: Window, spp: int, seed: int) -> np.ndarray:
     """Means (H, W, channels) of `trace` over the rays of each pixel of a window; 0 outside the window."""
     left, top, right, bottom = window
     rows = max(1, LANES // ((right - left) * spp))
