@@ -24,7 +24,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
 from mi_ring.scene.plain_mesh import mesh_of
-from mi_ring.synthesis.tracing import Trace, TracedView, clamped_radiance_along, hits_along, pixel_means, radiance_along
+from mi_ring.synthesis.tracing import LensCamera, Trace, clamped_radiance_along, hits_along, pixel_means, radiance_along
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -248,21 +248,21 @@ class Stage:
         self.flashed = mi.load_dict({"type": "scene", **shapes, "flash": self.flash})
         self.lit = mi.load_dict({"type": "scene", **shapes, "room": room})
 
-    def radiance(self, shot: TracedView, spp: int, seed: int) -> np.ndarray:
+    def radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
         flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, brightest=self.brightest)
         if self.bare:
             return pixel_means(flashed, shot, shot.around(self.mesh.vertices), spp, seed)
         return self.pictured(flashed, shot, spp, seed)
 
-    def room_radiance(self, shot: TracedView, spp: int, seed: int) -> np.ndarray:
+    def room_radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the room, whose mean radiance is 1.
 
         Apart, for an integrator that chooses between two lights is much noisier.
         """
         return self.pictured(partial(radiance_along, scene=self.lit, depth=3), shot, spp, seed)
 
-    def pictured(self, trace: Trace, shot: TracedView, spp: int, seed: int) -> np.ndarray:
+    def pictured(self, trace: Trace, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Radiance (H, W, 3) of paths by `trace`, many more where the object is.
 
         What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
@@ -276,7 +276,7 @@ class Stage:
         picture[top:bottom, left:right] = fine[top:bottom, left:right]
         return picture
 
-    def coverage(self, shot: TracedView, spp: int = 16) -> np.ndarray:
+    def coverage(self, shot: LensCamera, spp: int = 16) -> np.ndarray:
         """How much of each pixel shows the object (H, W)."""
         trace = partial(hits_along, scene=self.flashed, shape=self.object)
         return pixel_means(trace, shot, shot.around(self.mesh.vertices), spp, 0)[..., 0]
