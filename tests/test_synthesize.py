@@ -27,11 +27,11 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of, scene_of
 from mi_ring.synthesis import light_sources
 from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
-from mi_ring.synthesis.materials import COLOURS, load_material, plugin
+from mi_ring.synthesis.materials import COLOURS, load_material, parse_plugin
+from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.path_traced_capture import Production, write_scenes
-from mi_ring.synthesis.stage import Stage, load_object
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.path_traced_capture import Studio, write_scenes
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import look_at, poses
 
 SMALL = ["--views", "9", "--size", "56", "40", "--spp", "16", "--novel", "2"]
@@ -92,12 +92,12 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
     """ρ / π cos θ I / d²."""
     turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]) @ turn.T + [3, -2, 5]
-    stage = Stage(lambert(mesh_of(square, [[0, 1, 2], [0, 2, 3]]), ALBEDO), square)
+    scene = ObjectOnTable(lambert(mesh_of(square, [[0, 1, 2], [0, 2, 3]]), ALBEDO), square)
     n, middle = turn[:, 2], square.mean(0)
     camera = camera_at(middle + turn @ [4, 3, 20], middle + turn @ [1, -1, 0])
     rgb, place = np.array([900.0, 500.0, 700.0]), middle + turn @ [-6, 2, 11]
     light = Light("point", place, rgb) if kind == "point" else Light("directional", -turn @ [0.3, 0.5, 0.8], rgb / 900)
-    found = stage.radiance(Shot(camera), light, 64, 3, 2)
+    found = scene.radiance(LensCamera(camera), light, 64, 3, 2)
     d = rays(camera)
     p = camera.position + ((middle - camera.position) @ n / (d @ n))[..., None] * d
     to_light = place - p if kind == "point" else np.broadcast_to(turn @ [0.3, 0.5, 0.8], p.shape)
@@ -111,12 +111,12 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
 def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     """Order l of the room's radiance brings π, 2π/3, π/4 times as much irradiance (Ramamoorthi and Hanrahan 2001)."""
     ball = trimesh.creation.icosphere(subdivisions=5)
-    stage = Stage(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
+    scene = ObjectOnTable(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
     camera = camera_at([5, 9, -14], [0.05, 0.02, 0], (27, 21))
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
-    room = light_sources.room_of("harmonics", in_camera, np.random.default_rng(4))
-    lamp = light_sources.environment_of(light_sources.room_envmap(room, camera.to_world))
-    found = stage.radiance(Shot(camera), lamp, 256, 5, 2)
+    room = light_sources.random_room("harmonics", in_camera, np.random.default_rng(4))
+    lamp = light_sources.environment_map(light_sources.room_envmap(room, camera.to_world))
+    found = scene.radiance(LensCamera(camera), lamp, 256, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
     root = half**2 - camera.position @ camera.position + 1
@@ -223,8 +223,8 @@ def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     (out / "truth").mkdir(parents=True)
     config = SynthesizeConfig(lump, out, views=30, novel=0, room=0.1, wrong_cameras=0.5, wrong_light=3, wrong_power=10,
                        wrong_room=True, light="flash")  # fmt: skip
-    production = Production(config)
-    write_scenes(production, production.views(30), [], exposure=7.0)
+    studio = Studio(config)
+    write_scenes(studio, studio.photographs(30), [], exposure=7.0)
     said, true = (mi_ring.load_capture(out / name, images=False) for name in ("scene.xml", "truth/exact.xml"))
     assert said.photographs.room is None and not said.sensors[0].calibrated and true.sensors[0].calibrated
     a, b = ([s.camera.to_world for s in c.sensors] for c in (said, true))
@@ -395,7 +395,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
             assert len(colours) == len(mesh.vertices) and (len(mesh.vertices) > 10_000) == smooth
             seen = colours[mesh.vertices[:, 0] > 20]
             np.testing.assert_allclose(seen, np.broadcast_to(linear, seen.shape), rtol=0.01, err_msg=name)
-    assert plugin("diffuse reflectance=vertex_color", "", True)["reflectance"]["name"] == COLOURS
+    assert parse_plugin("diffuse reflectance=vertex_color", "", True)["reflectance"]["name"] == COLOURS
 
 
 @pytest.mark.parametrize("options, message", [

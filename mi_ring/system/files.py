@@ -8,6 +8,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -150,3 +151,22 @@ def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[N
             # an open file; there filelock removes it.
             if os.name == "posix" and not wait:
                 file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder`. At the end it is renamed to `folder`, which must then be missing or empty.
+
+    After an error nothing is left of it. Raises InputError if something in it cannot be written.
+    """
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            yield growing
+            growing.chmod(0o755)
+            with contextlib.suppress(FileNotFoundError):
+                folder.rmdir()
+            os.replace(growing, folder)
+        finally:
+            shutil.rmtree(growing, ignore_errors=True)
