@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 from accuracy import processor, product_speed, scene_file, table, truth_of
+from mi_ring.capture.calibrated import with_calibration
 from scipy.spatial.transform import Rotation
 
 import mi_ring
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.degradation import miscalibrated

@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.tracing import (
-    Shot,
+    LensCamera,
     Traced,
     Window,
     averaged,
@@ -256,7 +256,7 @@ class Stage:
         self.flashed = mi.load_dict({"type": "scene", **shapes, "flash": self.flash})
         self.lit = mi.load_dict({"type": "scene", **shapes, "room": room})
 
-    def radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
+    def radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
 
         def flashed(window: Window, spp: int, seed: int) -> list:
@@ -267,7 +267,7 @@ class Stage:
             return averaged(flashed, shot, window, spp, seed)
         return self.pictured(flashed, shot, spp, seed)
 
-    def room_radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
+    def room_radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the room, whose mean radiance is 1.
 
         Apart, for an integrator that chooses between two lights is much noisier.
@@ -278,7 +278,7 @@ class Stage:
 
         return self.pictured(lit, shot, spp, seed)
 
-    def pictured(self, traced: Traced, shot: Shot, spp: int, seed: int) -> np.ndarray:
+    def pictured(self, traced: Traced, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Radiance (H, W, 3) of paths `traced`(window, spp, seed), many more where the object is.
 
         What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
@@ -292,7 +292,7 @@ class Stage:
         picture[top:bottom, left:right] = fine[top:bottom, left:right]
         return picture
 
-    def coverage(self, shot: Shot, spp: int = 16) -> np.ndarray:
+    def coverage(self, shot: LensCamera, spp: int = 16) -> np.ndarray:
         """How much of each pixel shows the object (H, W)."""
 
         def traced(window: Window, spp: int, seed: int) -> list:

@@ -29,7 +29,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis import example_pot
 from mi_ring.synthesis.stage import Stage
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.tracing import LensCamera
 
 # isort: split
 import mitsuba as mi
@@ -77,11 +77,11 @@ def write_capture(name: str, folder: Path) -> None:
     for k, camera in enumerate(example_pot.cameras()[::EVERY]):
         position = camera.position + camera.to_world[:3, :3] @ example_pot.FLASH
         light = Light("point", position, np.full(3, 2 * example_pot.DISTANCE**2))
-        picture = stage.radiance(Shot(camera), light, 36, k, 2)
+        picture = stage.radiance(LensCamera(camera), light, 36, k, 2)
         noisy = picture + random.normal(0, NOISE, picture.shape)
         files = f"images/{k:03}.png", f"masks/{k:03}.png"
         write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files[0])
-        write_image(to_bytes(stage.coverage(Shot(camera))[..., None] >= 0.5), folder / files[1])
+        write_image(to_bytes(stage.coverage(LensCamera(camera))[..., None] >= 0.5), folder / files[1])
         elements.append(photograph_element(f"{k:03}", files[0], camera, light, files[1], calibrated=True))
     truth.export(folder / "truth.ply")
     np.savez(folder / "truth.npz", **material)

@@ -49,7 +49,8 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config.thread_count or processes.threads), contextlib.ExitStack() as held:
         fit = processes.together(lambda: resumed(state, capture, config, folder) if state else Fit(capture, config))
-        processes.by_first(lambda: results.fitted_scene(fit, folder))  # refuses what cannot be written later
+        # Refuses what cannot be written later.
+        processes.by_first(lambda: results.fitted_scene(fit.capture, fit.ring, folder))
         processes.by_first(lambda: held.enter_context(locked(folder)))
         costs = None
         if config.minutes and not state:

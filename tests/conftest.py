@@ -92,7 +92,7 @@ def small_capture(tmp_path_factory):
     from mi_ring.scene.lights import Light
     from mi_ring.scene.plain_mesh import mesh_of
     from mi_ring.synthesis.stage import Stage
-    from mi_ring.synthesis.tracing import Shot
+    from mi_ring.synthesis.tracing import LensCamera
     from mi_ring.synthesis.viewpoints import look_at
 
     folder = tmp_path_factory.mktemp("small")
@@ -117,7 +117,7 @@ def small_capture(tmp_path_factory):
         matrix = look_at(origin, target, random.normal(size=3))
         light = origin + matrix[:3, :3] @ [15, 10, 0]
         intensity = 2.2 * np.linalg.norm(light - CENTER) ** 2
-        shot = Shot(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
+        shot = LensCamera(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
         radiance = stage.radiance(shot, Light("point", light, np.full(3, intensity)), 16, k, 2)
         coverage = stage.coverage(shot, 16)
         mi.Bitmap(to_bytes(linear_to_srgb(radiance))).write(str(folder / f"images/{k:03}.png"))

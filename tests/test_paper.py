@@ -460,8 +460,8 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
     made = Made(tmp_path, scene, tmp_path / "truth", tmp_path / "captures", Asked())
     (row,) = measures.in_millimetres(Run("ball", part, {}), made)
     depths = []
-    for sensor in load_capture(scene, images=False).sensors:
-        camera = sensor.camera
+    for shot in load_capture(scene, images=False).shots:
+        camera = shot.camera
         x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size))
         rays = np.stack([(camera.centre[0] - x) / camera.focal[0], (camera.centre[1] - y) / camera.focal[1], x**0], -1)
         rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.to_world[:3, :3].T
@@ -490,7 +490,7 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     capture = load_capture(scene)
     seen, _, normals, _ = hits(load_true_mesh(folder / "mesh.ply")[1], capture.photograph(0))
     for k, observed in enumerate(capture.observe([0, 1, 2]).rgb.numpy()):
-        light = Lights.of(capture.sensors)[k]
+        light = Lights.of(capture.shots)[k]
         brightness = ALBEDO * light.rgb * np.maximum(normals @ -light.vector, 0)[:, None]  # by Lambert
         there = seen & (observed.reshape(-1, 3) > 0).any(1)
         assert there.sum() > 0.5 * seen.sum()
@@ -520,7 +520,7 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     whole = load_capture(egg.scene)
     part = recipes.Part("part", egg, 5)
     some = load_capture(part.made(tmp_path))
-    assert [sensor.id() for sensor in some.sensors] == ["000", "003", "006", "008", "011"]
+    assert [shot.name for shot in some.shots] == ["000", "003", "006", "008", "011"]
     assert part.truth(tmp_path) == known_capture / "truth"
     torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
     scene = part.made(tmp_path)

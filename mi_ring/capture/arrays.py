@@ -50,11 +50,11 @@ def shots_of(
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:
         raise InputError(f"saturation: is {saturation}, must be above 0")
-    several = zip(names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights"))
+    columns = names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
     return tuple(
         Shot(name, camera_of(camera, image, f"cameras[{k}]"), light_of(light, f"lights[{k}]"), encoding=encoding,
              saturation=full, calibrated=calibrated)
-        for k, (name, image, camera, light) in enumerate(several)
+        for k, (name, image, camera, light) in enumerate(zip(*columns))
     )  # fmt: skip
 
 

@@ -108,7 +108,8 @@ class Capture:
         reach = None if radius is None else float(arrays.numbers(radius, (), "radius"))
         if reach is not None and not reach > 0:
             raise InputError(f"radius: is {radius}, must be above 0")
-        own_masks, shown = (arrays.masks_of(items, pictures, what) for items, what in ((masks, "masks"), (valid, "valid")))
+        own_masks = arrays.masks_of(masks, pictures, "masks")
+        shown = arrays.masks_of(valid, pictures, "valid")
         files = map(arrays.files_of, shots, pictures, own_masks.given, shown.given)
         elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]
         root = scene_element(elements, center=middle, radius=reach, up=upward)

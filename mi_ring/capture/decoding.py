@@ -37,7 +37,7 @@ def decode(
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
     """Factors of radiance by lens and gain, (H, W, 3) or (3,), of a photograph `scale` times smaller; 1 if all are."""
-    gain = np.float32(shot.response.gain if shot.response.gain != (1, 1, 1) else 1)
+    gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
     cosines = shot.camera.shrunk(scale).cosines()

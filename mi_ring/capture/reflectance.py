@@ -13,9 +13,7 @@ from mi_ring.scene.mesh_attributes import attributes_of, constants
 from mi_ring.scene.xml_elements import load_bsdf
 
 
-def predicted_parameters(
-    capture: Capture, ranges: dict[str, tuple[float, float]]
-) -> tuple[tuple[Parameter, ...], str]:
+def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
     """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the BSDF that reads them, as XML.
 
     `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where

@@ -234,13 +234,12 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
             element.set("value", relative_to(folder.resolve(), file.resolve()))
 
 
-def fitted_scene_xml(scene: bytes, path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """A scene file with the fitted object and its `bsdf`, its names of files made relative to `folder`.
+def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
+    """The scene file `path` with the fitted object and its `bsdf`, its names of files made relative to `folder`.
 
-    `scene`: content of the file `path`. Raises InputError for a scene that cannot be rewritten, and for a shapenet that
-    no fit can start from.
+    Raises InputError for a scene that cannot be rewritten, and for a shapenet that no fit can start from.
     """
-    root = ElementTree.fromstring(scene)
+    root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
     move_names(root, path.parent, folder)
     shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")

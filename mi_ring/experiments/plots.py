@@ -158,7 +158,7 @@ def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
     """What the first photograph shows by a fit, sRGB (H, W, 3), and by what it is made smaller."""
     assert outcome.made
     capture = load_capture(outcome.made.folder / "scene.xml", images=False)
-    scale = -(-capture.sensors[0].size[0] // WIDTH)
+    scale = -(-capture.shots[0].size[0] // WIDTH)
     surface = bridge.Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     rgb, _ = bridge.draw(surface, capture.photograph(0, scale), SPP, shadows=capture.shadows, indirect=ring.indirect)

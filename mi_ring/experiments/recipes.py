@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import move_names, recalibrated_xml, scene_bytes
 from mi_ring.collection.jobs import written
@@ -20,7 +19,6 @@ from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
@@ -245,17 +243,13 @@ class Perturbed(Derived):
         """Its scene file, of the same photographs, which no longer says that it is calibrated."""
         capture = load_capture(scene, images=False)
         center, _ = capture.sphere()
-        cameras, found = [sensor.camera for sensor in capture.sensors], Lights.of(capture.sensors)
-        lights = [found[k] for k in range(len(cameras))]
-        random = np.random.default_rng(self.seed)
-        moved = miscalibrated(cameras, lights, center, random, turned=self.degrees)
-        wrong = with_calibration(capture, *moved, room=capture.photographs.room)
+        wrong = miscalibrated(capture.shots, center, np.random.default_rng(self.seed), turned=self.degrees)
         root = ElementTree.parse(scene).getroot()
         for sensor in root.findall("sensor"):
             for said in sensor.findall("boolean[@name='calibrated']"):
                 sensor.remove(said)
         move_names(root, scene.parent, self.folder_in(captures))
-        content = recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)
+        content = recalibrated_xml(ElementTree.tostring(root), wrong, capture.room)
         write_file(folder / "scene.xml", content)
 
 

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
@@ -30,7 +29,7 @@ from mi_ring.geometry.rotations import quarter_turns, rotations
 from mi_ring.rendering import bridge
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
-from mi_ring.scene.assembly import has_table, lamp_lights, lamps_of
+from mi_ring.scene.assembly import has_table, lamp_lights, lamps_of, with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
@@ -84,7 +83,7 @@ def refined_of(capture: Capture, config: Config, albedo: float) -> tuple[str, ..
         names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
-        subtracted = {"ambient"} if all(sensor.ambient for sensor in capture.sensors) else set()
+        subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
@@ -125,10 +124,10 @@ class Calibration(nn.Module):
         """
         super().__init__()
         self.refined, self.exposure, self.first_power = tuple(refined), exposure, power
-        cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
+        cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
-        cones = np.array([sensor.cone for sensor in capture.sensors])
+        cones = np.array([shot.falloff for shot in capture.shots])
         distortion = np.array([camera.distortion for camera in cameras])
         #: Does any lens have a distortion, or one that is to be found?
         self.bent = bool(distortion.any()) or "distortion" in refined
@@ -150,10 +149,10 @@ class Calibration(nn.Module):
             raise InputError(f"{capture.path}: emitter: the lights do not move with the cameras, but --refine "
                              "falloff is for a flash that does; leave it out")  # fmt: skip
         self.lamps = Lamps.of(lamp_lights(capture.scene) if "lamps" in refined else [])  #: unknown
-        self.sizes = [sensor.size for sensor in capture.sensors]
-        self.gammas = torch.tensor([sensor.gamma for sensor in capture.sensors])
-        self.dimmed = torch.tensor([sensor.vignetting for sensor in capture.sensors])
-        self.gains = torch.from_numpy(np.stack([sensor.gain for sensor in capture.sensors])).float()
+        self.sizes = [shot.size for shot in capture.shots]
+        self.gammas = torch.tensor([shot.response.gamma for shot in capture.shots])
+        self.dimmed = torch.tensor([shot.response.vignetting for shot in capture.shots])
+        self.gains = torch.from_numpy(np.array([shot.response.gain for shot in capture.shots])).float()
         kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
         lenses = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
@@ -333,18 +332,20 @@ class Calibration(nn.Module):
     def applied(self, capture: Capture) -> Capture:
         """The capture with cameras, lights and curve as they are by now."""
         with torch.no_grad():
-            matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in self())
+            matrices, intrinsics, places, strengths, falloff, distortion = (part.numpy() for part in self())
             gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
             contrast, gains = float(self.value("contrast").exp()), self.centred("gain").double().exp().numpy()
         # The curve's fixed point is the exposure here, full scale in a scene file.
         level = self.exposure ** ((1 - gamma) / gamma)
-        cameras = []
-        for k, sensor in enumerate(capture.sensors):
-            to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
-            cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size, distortion[k]))
-        lights = Lamps(torch.from_numpy(places), self.finite, torch.from_numpy(level * strengths)).lights()
-        now, room = self.lamps_now(), None
-        lamps = now._replace(strengths=level * now.strengths).lights() if "lamps" in self.refined else None
-        if "ambient" in self.refined or capture.photographs.room is not None:
-            room = self.roomlight().double().numpy(force=True) * level
-        return with_calibration(capture, cameras, lights, gamma, room, falloff, vignetting, contrast, gains, lamps)
+        strong = torch.from_numpy(level * strengths.astype(float))
+        lights, shots = Lamps(torch.from_numpy(places), self.finite, strong).lights(), []
+        for k, shot in enumerate(capture.shots):
+            pose = np.vstack([matrices[k], np.float32([[0, 0, 0, 1]])])
+            camera = Camera(pose, intrinsics[k, :2], intrinsics[k, 2:], shot.size, float(distortion[k]))
+            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]),
+                                 response=shot.response.changed(gamma, contrast, vignetting, gains[k])))  # fmt: skip
+        now, lit = self.lamps_now(), "ambient" in self.refined or capture.room is not None
+        lamps = now._replace(strengths=level * now.strengths).lights()
+        scene = with_lamps(capture.scene, lamps) if "lamps" in self.refined else capture.scene
+        room = self.roomlight().double().numpy(force=True) * level if lit else None
+        return replace(capture, scene=scene, shots=tuple(shots), room=room)

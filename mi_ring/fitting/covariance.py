@@ -71,7 +71,7 @@ def deviations(fit: "Fit") -> dict[str, np.ndarray]:
         return {}
     colours, outlines = Equations(entries.count), Equations(entries.count)
     for index in fit.capture.together(fit.fitted):
-        scale = -(-fit.capture.sensors[index[0]].size[0] // WIDTH)
+        scale = -(-fit.capture.shots[index[0]].size[0] // WIDTH)
         compare(fit, calibration, index, scale, entries, colours, outlines)
     calibration.relight(fit.surface)  # as it was
     precision = np.eye(entries.count) + colours.information() + outlines.information()

@@ -331,7 +331,7 @@ class Fit:
         term, for whose backward pass the renderer keeps what it rendered.
         """
         self.surface.show(self.ring, *self.ring.domain.sample(level))
-        photograph = self.calibrated().photograph(k, -(-self.capture.sensors[k].size[0] // width))
+        photograph = self.calibrated().photograph(k, -(-self.capture.shots[k].size[0] // width))
         rgb, _ = bridge.draw(self.surface, photograph, spp, shadows=self.capture.shadows, indirect=self.ring.indirect)
         return rgb[0].numpy()
 

@@ -35,12 +35,12 @@ def find_outlines(fit: "Fit") -> dict[int, Tensor]:
     capture = fit.calibrated()
     fit.surface.show(fit.ring, *fit.ring.domain.sample(fit.stages[-1].level))
     places: dict[tuple, list[int]] = {}
-    for k, sensor in enumerate(capture.sensors):
-        places.setdefault((sensor.size, sensor.camera.to_world.tobytes()), []).append(k)
+    for k, shot in enumerate(capture.shots):
+        places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Picture, coverage, and what surely is background."""
-        scale = -(-max(capture.sensors[index[0]].size) // LONGEST)
+        scale = -(-max(capture.shots[index[0]].size) // LONGEST)
         seen = capture.observe(index, scale)
         _, coverage = bridge.draw(fit.surface, capture.photograph(index[0], scale), spp=4, shadows=False)
         picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / fit.exposure)))
@@ -73,5 +73,5 @@ def with_outlines(capture: Capture, outlines: Mapping[int, Tensor]) -> Capture:
         whole = cv2.resize(255 * outline.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
         return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
 
-    readers = {k: partial(enlarged, outline, capture.sensors[k].size) for k, outline in outlines.items()}
+    readers = {k: partial(enlarged, outline, capture.shots[k].size) for k, outline in outlines.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

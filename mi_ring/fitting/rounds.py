@@ -10,14 +10,14 @@ class Rounds:
     """Draws photographs of a capture, of those that are `fitted` (indices)."""
 
     def __init__(self, capture: Capture, fitted: np.ndarray) -> None:
-        self.sensors, self.fitted = capture.sensors, fitted
+        self.shots, self.fitted = capture.shots, fitted
         self.alike = {size: np.intersect1d(index, fitted) for size, index in capture.sizes.items()}
         #: Of each size (width, height), those that have not come yet.
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, most: int, random: torch.Generator) -> tuple[np.ndarray, tuple[int, int]]:
         """Indices of the next `most` photographs, or of as many as there are of one size, and that size."""
-        size = self.sensors[self.fitted[int(torch.randint(len(self.fitted), (), generator=random))]].size
+        size = self.shots[self.fitted[int(torch.randint(len(self.fitted), (), generator=random))]].size
         alike = self.alike[size]
         count, waiting = min(most, len(alike)), self.waiting.get(size, [])
         if len(waiting) < count:  # those that are left come again at the end of the next round

@@ -117,7 +117,7 @@ class Keeper:
             write_checkpoint(self.fit, self.files, elsewhere)
             saved = f"what could be written is in {elsewhere} instead, with a checkpoint"
             with contextlib.suppress(InputError, OSError):  # the scene may have gone with the folder
-                fitted_scene = results.fitted_scene(self.fit, elsewhere)
+                fitted_scene = results.fitted_scene(self.fit.capture, self.fit.ring, elsewhere)
             results.write(elsewhere, self.fit, fitted_scene)
         except (InputError, OSError):
             left = "what the last checkpoint there has is left, for --resume; make room or choose another place"
@@ -184,7 +184,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     iterations, if they have been measured already.
     """
     processes = fit.processes
-    fitted_scene = processes.by_first(lambda: results.fitted_scene(fit, folder))
+    fitted_scene = processes.by_first(lambda: results.fitted_scene(fit.capture, fit.ring, folder))
     with heeding_signals() as heard, outliving_readers():
 
         def interrupted() -> int:

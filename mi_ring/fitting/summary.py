@@ -32,7 +32,7 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         before, after, std = (np.asarray(value, float).tolist() for value in (before, after, std))
         unknowns[name] = {"what": what, "before": before, "after": after, "std": std}
 
-    old, new = fit.capture.sensors, refined.sensors
+    old, new = fit.capture.shots, refined.shots
     lenses = np.unique(calibration.lens.numpy(), return_index=True)[1]
     focal = np.stack([new[k].camera.focal for k in lenses])
     if "light" in now and calibration.flash is not None:
@@ -64,22 +64,21 @@ def summary(fit: "Fit", refined: Capture, deviations: dict[str, np.ndarray]) -> 
         add("principal", "principal point [px]", [old[k].camera.centre for k in lenses],
             [new[k].camera.centre for k in lenses], focal * deviations["principal"])  # fmt: skip
     if "distortion" in now:
-        add("distortion", "first radial distortion of the lens", [old[k].bend for k in lenses],
-            [new[k].bend for k in lenses], deviations["distortion"])  # fmt: skip
-    for name, attribute, what in (
-        ("falloff", "cone", "exponent of the flash's cone"),
-        ("vignetting", "vignetting", "exponent of the lens' vignetting"),
-    ):
-        if name in now:
-            before, after = (np.mean([getattr(sensor, attribute) for sensor in side]) for side in (old, new))
-            add(name, what, before, after, deviations[name])
+        add("distortion", "first radial distortion of the lens", [old[k].camera.distortion for k in lenses],
+            [new[k].camera.distortion for k in lenses], deviations["distortion"])  # fmt: skip
+    if "falloff" in now:
+        add("falloff", "exponent of the flash's cone", np.mean([shot.falloff for shot in old]),
+            np.mean([shot.falloff for shot in new]), deviations["falloff"])  # fmt: skip
+    if "vignetting" in now:
+        add("vignetting", "exponent of the lens' vignetting", np.mean([shot.response.vignetting for shot in old]),
+            np.mean([shot.response.vignetting for shot in new]), deviations["vignetting"])  # fmt: skip
     if "curve" in now:
-        gamma = np.mean([sensor.gamma for sensor in new])
-        add("curve", "exponent of the camera's curve", np.mean([sensor.gamma for sensor in old]), gamma,
+        gamma = np.mean([shot.response.gamma for shot in new])
+        add("curve", "exponent of the camera's curve", np.mean([shot.response.gamma for shot in old]), gamma,
             gamma * deviations["curve"])  # fmt: skip
     if "contrast" in now:
-        contrast = np.mean([sensor.contrast for sensor in new])
-        add("contrast", "contrast of the camera's curve", np.mean([sensor.contrast for sensor in old]), contrast,
+        contrast = np.mean([shot.response.contrast for shot in new])
+        add("contrast", "contrast of the camera's curve", np.mean([shot.response.contrast for shot in old]), contrast,
             contrast * deviations["contrast"])  # fmt: skip
     if "scale" in now:
         add("scale", "power of all lights together", 1, strengthened, strengthened * deviations["scale"])

@@ -105,7 +105,7 @@ def rgb(it: Iteration) -> Tensor:
 
 def outline_blur(it: Iteration) -> float:
     """Standard deviation [px] of the blur of silhouettes: it shrinks, to a pixel for the last fifth of the fit."""
-    width = it.fit.capture.sensors[it.index[0]].size[0] / it.scale
+    width = it.fit.capture.shots[it.index[0]].size[0] / it.scale
     return max(1.0, it.fit.config.blur * (1 - it.progress / 0.8) * width)
 
 

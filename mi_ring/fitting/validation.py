@@ -47,12 +47,12 @@ def unexplained(fit: "Fit", capture: Capture) -> float:
     """
     shares = []
     for k in fit.held_out[:: -(-len(fit.held_out) // MOST)]:
-        scale = -(-capture.sensors[k].size[0] // WIDTH)
+        scale = -(-capture.shots[k].size[0] // WIDTH)
         rgb, coverage = bridge.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=fit.ring.indirect)  # fmt: skip
-        seen, sensor = capture.observe([k], scale), capture.sensors[k]
+        seen, shot = capture.observe([k], scale), capture.shots[k]
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)
-        observed, predicted = (recorded(linear[0].numpy(), sensor, scale)[inside[0]] for linear in (seen.rgb, rgb))
+        observed, predicted = (recorded(linear[0].numpy(), shot, scale)[inside[0]] for linear in (seen.rgb, rgb))
         if len(observed):
             factor = (observed * predicted).sum() / max((predicted**2).sum(), 1e-12)
             shares.append(float(np.abs(factor * predicted - observed).sum() / observed.sum()))

@@ -104,7 +104,7 @@ def report_html(
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
     """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
-    eye = capture.sensors[0].camera.position
+    eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
         irradiance = np.ones(3)
@@ -192,7 +192,7 @@ def scale_of(fit: Any, size: tuple[int, int]) -> int:
 
 def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]:
     """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
-    size = capture.sensors[index[0]].size
+    size = capture.shots[index[0]].size
     scale = scale_of(fit, size)
     rgb, coverage = bridge.draw(
         fit.surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
@@ -214,13 +214,13 @@ def panels_of(
 
 def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
     """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
-    scale = scale_of(fit, capture.sensors[k].size)
+    scale = scale_of(fit, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
-    sensor = capture.sensors[k]
+    shot = capture.shots[k]
     shown = prediction.rgb * valid[..., None]
-    photo, guess = (linear_to_srgb(recorded(linear, sensor, scale)) for linear in (observed, shown))
+    photo, guess = (linear_to_srgb(recorded(linear, shot, scale)) for linear in (observed, shown))
     found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)

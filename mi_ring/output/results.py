@@ -28,6 +28,7 @@ from mi_ring.system.files import locked, read_json, relative_to, write_file, wri
 
 ROUNDED = 1e-5  #: share of an environment by which a room may differ from it and be nothing but it
 PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
+OWN_SCENE = Path("capture", "scene.xml")  #: in the folder of a fit: the scene file of a capture from arrays
 VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
 
 
@@ -48,9 +49,13 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
     A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
     written or holds the scene.
     """
-    folder = folder.resolve()
-    if folder in scene.resolve().parents:
-        raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
+    if folder.resolve() in scene.resolve().parents:
+        raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
+    make_folder(folder.resolve(), scene, options, resume)
+
+
+def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
+    """As `prepare_folder`, for a scene file that may be in the folder."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -69,18 +74,27 @@ def move_aside(folder: Path) -> None:
 
 
 def save_fit(folder: Path, fit: Any) -> None:
-    """All results of a `Fit`, finished or not, into a folder of its own."""
-    scene = fitted_scene(fit, folder)
+    """Write all results of a `Fit`, finished or not, into a folder of its own.
+
+    A capture from arrays is written as well: it is the scene file capture/scene.xml in the folder.
+    """
+    capture, settings = fit.capture, fit.config.settings()
     ring_state(fit.ring)  # before anything is moved: it may have no name for a network
+    if not capture.in_memory:
+        fitted_scene(capture, fit.ring, folder)  # likewise: it may refuse the scene
     with locked(folder):
-        prepare_folder(folder, fit.capture.path, fit.config.settings())
+        if capture.in_memory:
+            make_folder(folder.resolve(), folder / OWN_SCENE, settings)
+            capture = capture.save(folder / OWN_SCENE)
+        else:
+            prepare_folder(folder, capture.path, settings)
         write_log(folder, fit.log)
-        write(folder, fit, scene)
+        write(folder, fit, fitted_scene(capture, fit.ring, folder))
 
 
-def fitted_scene(fit: Any, folder: Path) -> bytes:
-    """scene.xml of a fit. Raises InputError for a scene that cannot be rewritten."""
-    return fitted_scene_xml(fit.capture.path, folder, fit.ring.subdivisions, fit.ring.bsdf)
+def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
+    """scene.xml of a fit, without its calibration. Raises InputError for a scene that cannot be rewritten."""
+    return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
 
 
 def write_log(folder: Path, entries: list[dict]) -> None:
@@ -114,7 +128,7 @@ def write_inputs(path: Path, fit: Any) -> None:
     sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for index in fit.capture.together(some):
-        scale = max(1, max(fit.capture.sensors[index[0]].size) // cell)
+        scale = max(1, max(fit.capture.shots[index[0]].size) // cell)
         _, covered = bridge.draw(fit.surface, fit.capture.selected(index, scale), spp=4, shadows=False)
         for k, observed, coverage in zip(index, fit.capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
@@ -140,9 +154,9 @@ def write(folder: Path, fit: Any, scene: bytes) -> None:
     if fit.calibration:
         frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
         lamps = lamp_lights(capture.scene) if "lamps" in fit.calibration.refined else None
-        scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames, lamps)
+        scene = recalibrated_xml(scene, capture.shots, found_room(fit, capture), frames, lamps)
     if fit.outlines:
-        scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
+        scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, fit.outlines))
     write_file(folder / "scene.xml", scene)
     if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
         # It is all the light there is.

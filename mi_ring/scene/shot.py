@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mi_ring.geometry.camera import Camera, moved_pose
 from mi_ring.scene.lights import Light
@@ -22,6 +23,9 @@ class Files(NamedTuple):
     ambient: Path | None = None  #: the same view without the photograph's own light
 
 
+NO_FILES = Files()
+
+
 @dataclass(frozen=True)
 class Response:
     """How a camera records radiance. By default the file holds the radiance itself.
@@ -34,6 +38,13 @@ class Response:
     vignetting: float = 0.0  #: exponent of the cosine between the ray of a pixel and the optical axis
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: factors of R, G, B, by exposure and white balance
 
+    def changed(
+        self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
+    ) -> "Response":
+        """With `gamma`, `contrast` and `gain` times these, and `vignetting` plus this."""
+        red, green, blue = np.multiply(self.gain, gain).tolist()
+        return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
@@ -44,7 +55,7 @@ class Shot:
     light: Light | None = None  #: its own light, which lights no other photograph; None as in `own_light`
     falloff: float = 0.0  #: exponent of the cosine between the direction from a point light and where the camera looks
     response: Response = Response()
-    files: Files = Files()
+    files: Files = NO_FILES
     encoding: Encoding = "auto"  #: of the photograph's file
     saturation: float = 1.0  #: encoded value from which a pixel is clipped (1 = full scale)
     calibrated: bool = False  #: are camera and light exact? Then a fit does not refine them by default
@@ -53,6 +64,11 @@ class Shot:
     def size(self) -> tuple[int, int]:
         """(width, height) [px]"""
         return self.camera.size
+
+    @property
+    def file_name(self) -> str:
+        """Of the photograph's file, without its folder; `name` where it has no file."""
+        return self.files.filename.name if self.files.filename else self.name
 
     @property
     def own_light(self) -> Light:

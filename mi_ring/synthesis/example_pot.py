@@ -13,8 +13,9 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis.stage import Stage
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import GOLDEN, look_at
 from mi_ring.system.progress import progress
 
@@ -86,10 +87,10 @@ def write_example(folder: Path, spp: int = SPP) -> None:
     for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
         position = camera.position + camera.to_world[:3, :3] @ FLASH
         light = Light("point", position, np.full(3, np.pi * BRIGHTNESS * DISTANCE**2))
-        name, shot = f"{k:03}", Shot(camera)
-        picture = stage.radiance(shot, light, spp, k, DEPTH)
+        name, lens_camera = f"{k:03}", LensCamera(camera)
+        picture = stage.radiance(lens_camera, light, spp, k, DEPTH)
         write_image(to_bytes(linear_to_srgb(picture)), folder / "images" / f"{name}.png")
-        write_image(to_bytes(stage.coverage(shot)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
-        files = f"images/{name}.png", f"masks/{name}.png"
-        elements.append(photograph_element(name, files[0], camera, light, files[1], calibrated=True))
+        write_image(to_bytes(stage.coverage(lens_camera)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
+        files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
+        elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -30,13 +31,14 @@ from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis import light_sources
 from mi_ring.synthesis.degradation import HIGHEST, encoded, exposures, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.options import SynthesizeConfig
 from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import poses
 from mi_ring.system.files import quoted, read_json, write_file, writing
 from mi_ring.system.progress import progress
@@ -138,18 +140,18 @@ class Production:
 
     def radiance(self, stage: Stage, view: View, camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray | float]:
         """Linear radiance (H, W, 3) where the photographs' light brings 1 W/m² to the object, and by the room."""
-        config, shot = self.config, Shot(camera)
+        config, lens_camera = self.config, LensCamera(camera)
         light = view.light if self.environment is None else load_element(self.environment)
-        picture = stage.radiance(shot, light, spp, view.seed, config.depth, hidden=self.environment is None)
+        picture = stage.radiance(lens_camera, light, spp, view.seed, config.depth, hidden=self.environment is None)
         for n, lamp in enumerate(self.lamps_beside(view), 1):
-            picture = picture + stage.radiance(shot, lamp, spp, view.seed + BETWEEN * n, config.depth)
+            picture = picture + stage.radiance(lens_camera, lamp, spp, view.seed + BETWEEN * n, config.depth)
         if not config.room:
             return picture, 0.0
         # Apart: paths that choose between two lights are much noisier.
         seen = light_sources.environment_of(
             self.room_level * light_sources.seen_from_within(self.room, camera.to_world)
         )
-        return picture, stage.radiance(shot, seen, spp, view.seed + 1, config.depth)
+        return picture, stage.radiance(lens_camera, seen, spp, view.seed + 1, config.depth)
 
     @property
     def room_level(self) -> float:
@@ -165,7 +167,7 @@ class Production:
         scale = max(1, min(TRIAL, min(config.size) // 8))
         for view in views[:: -(-len(views) // TRIALS)]:
             camera = view.camera.shrunk(scale)
-            inside = stage.coverage(Shot(camera), 16) > 0.9
+            inside = stage.coverage(LensCamera(camera), 16) > 0.9
             own, ambient = self.radiance(stage, view, camera, 36)
             values.append((own + ambient)[inside].max(-1))
         if not np.concatenate(values).size:
@@ -211,7 +213,7 @@ def write_capture(config: SynthesizeConfig) -> None:
     for view, folder, fitted in progress(todo, "photographing", unit="photograph", leave=True):
         own, ambient = production.radiance(stage, view, view.camera, production.spp)
         pictures = {"images": exposure * (own + ambient)}
-        coverage = stage.coverage(Shot(view.camera))
+        coverage = stage.coverage(LensCamera(view.camera))
         write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{view.name}.png")
         if fitted:
             if config.pairs:
@@ -245,24 +247,23 @@ def write_scenes(production: Production, seen: list[View], novel: list[View], ex
     def scene(folder: Path, views: list[View], images: str, masks: str, exact: bool) -> bytes:
         paired = config.pairs and views is seen
         gains = production.gains if exact and views is seen else np.ones((len(views), 3))
-        cameras, lights = [view.camera for view in views], [view.light for view in views]
-        if not exact:
-            cameras, lights = miscalibrated(
-                cameras, lights, np.zeros(3), production.random(4), config.wrong_cameras, config.wrong_light,
-                config.wrong_power,
-            )  # fmt: skip
-            if config.light == "lamp":  # which no camera takes along
-                lights = [light._replace(vector=view.light.vector) for light, view in zip(lights, views)]
-        elements = [
-            photograph_element(
-                view.name, f"{images}/{photograph_name(config, view)}", camera,
-                light._replace(rgb=strength * light.rgb), f"{masks}/{view.name}.png",
-                saturation=HIGHEST if config.format == "exr" else None, calibrated=exact, gain=gain,
-                ambient=f"ambient/{photograph_name(config, view)}" if paired else None,
+        shots: Sequence[Shot] = [
+            Shot(
+                view.name, view.camera, view.light._replace(rgb=strength * view.light.rgb),
+                response=Response(gain=tuple(gain.tolist())),
+                files=Files(Path(images, photograph_name(config, view)), Path(masks, f"{view.name}.png"),
+                            ambient=Path("ambient", photograph_name(config, view)) if paired else None),
+                saturation=HIGHEST if config.format == "exr" else 1.0, calibrated=exact,
             )
-            for view, camera, light, gain in zip(views, cameras, lights, gains)
+            for view, gain in zip(views, gains)
         ]  # fmt: skip
-        root = scene_element(elements, ground, up, metres)
+        if not exact:
+            shots = miscalibrated(shots, np.zeros(3), production.random(4), config.wrong_cameras, config.wrong_light,
+                                  config.wrong_power)  # fmt: skip
+            if config.light == "lamp":  # which no camera takes along
+                shots = [replace(shot, light=shot.own_light._replace(vector=view.light.vector))
+                         for shot, view in zip(shots, views)]  # fmt: skip
+        root = scene_element(map(photograph_element, shots), ground=ground, up=up, metres=metres)
         root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(extra))
         for table in production.tables:
             root.append(deepcopy(table))

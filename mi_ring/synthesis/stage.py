@@ -17,7 +17,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis.materials import COLOURS, Pattern
-from mi_ring.synthesis.tracing import Shot, Window, averaged, covered, flashed_along, radiance_along, rays_of
+from mi_ring.synthesis.tracing import LensCamera, Window, averaged, covered, flashed_along, radiance_along, rays_of
 
 SMOOTH = 10_000  #: vertices that a surface is subdivided to
 WIDTH, BELOW = 8.0, 2e-3  #: of a table, and how far it is below a sheet on it, in radii of the object
@@ -40,7 +40,7 @@ class Stage:
         return mi.load_dict({"type": "scene", **shapes, "lamp": lamp}, optimize=False)
 
     def radiance(
-        self, shot: Shot, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
+        self, lens_camera: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
         """Linear radiance (H, W, 3) under one light. `hidden`: an environment is not seen itself."""
         scene = self.under(load_element(emitter_element(light)) if isinstance(light, Light) else light)
@@ -49,24 +49,24 @@ class Stage:
             middle = (self.corners.min(0) + self.corners.max(0)) / 2
             falloff = np.square(light.vector - middle).sum() if light.kind == "point" else 1.0
             white = light.rgb.max() / (np.pi * falloff)
-        window = shot.around(self.corners) if hidden and not self.tables else shot.whole
+        window = lens_camera.around(self.corners) if hidden and not self.tables else lens_camera.whole
 
         def traced(window: Window, spp: int, seed: int) -> list:
-            rays = rays_of(shot, window, spp, seed)
+            rays = rays_of(lens_camera, window, spp, seed)
             if isinstance(light, Light):
                 return flashed_along(rays, scene, seed, depth, BRIGHTEST * white)
             return radiance_along(rays, scene, seed, depth, hidden)
 
-        return averaged(traced, shot, window, spp, seed)
+        return averaged(traced, lens_camera, window, spp, seed)
 
-    def coverage(self, shot: Shot, spp: int = 64) -> np.ndarray:
+    def coverage(self, lens_camera: LensCamera, spp: int = 64) -> np.ndarray:
         """How much of each pixel shows the object (H, W)."""
         scene = self.under(mi.load_dict({"type": "constant"}))
 
         def traced(window: Window, spp: int, seed: int) -> list:
-            return [covered(rays_of(shot, window, spp, seed), scene, self.object)]
+            return [covered(rays_of(lens_camera, window, spp, seed), scene, self.object)]
 
-        return averaged(traced, shot, shot.around(self.corners), spp, 0)[..., 0]
+        return averaged(traced, lens_camera, lens_camera.around(self.corners), spp, 0)[..., 0]
 
 
 def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimesh, np.ndarray | None, np.ndarray]:

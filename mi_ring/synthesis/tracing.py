@@ -22,7 +22,7 @@ Traced = Callable[[Window, int, int], list]  #: values along the rays of a windo
 
 
 @dataclass(frozen=True)
-class Shot:
+class LensCamera:
     """A camera with its lens: `camera` without distortion, which is x ↦ x (1 + k1 r² + k2 r⁴) of tangents."""
 
     camera: Camera
@@ -50,7 +50,7 @@ class Shot:
         return left, top, right, bottom
 
 
-def rays_of(shot: Shot, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
+def rays_of(lens_camera: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
     """`spp` = n² stratified rays through each pixel of a part of the picture, in consecutive lanes."""
     left, top, right, bottom = window
     width, height = right - left, bottom - top
@@ -61,20 +61,20 @@ def rays_of(shot: Shot, window: Window, spp: int, seed: int) -> mi.RayDifferenti
     seeds = [dr.opaque(mi.UInt32, (4 * seed + k) % 2**32) for k in range(3)]
     jitter: list[Any] = [mi.sample_tea_float32(lane, own) for own in seeds]  # type: ignore[call-overload]
     time = (mi.Float((7 * stratum + pixel) % spp) + jitter[2]) / spp - 0.5
-    moved = [dr.opaque(mi.Float, m) * time for m in shot.motion]
+    moved = [dr.opaque(mi.Float, m) * time for m in lens_camera.motion]
     columns = dr.opaque(mi.UInt32, width)
     u = dr.opaque(mi.Float, left) + mi.Float(pixel % columns) + (mi.Float(stratum % side) + jitter[0]) / side + moved[0]
     v = dr.opaque(mi.Float, top) + mi.Float(pixel // columns) + (mi.Float(stratum // side) + jitter[1]) / side
     v += moved[1]
-    (fx, fy), (cx, cy) = shot.camera.focal, shot.camera.centre
+    (fx, fy), (cx, cy) = lens_camera.camera.focal, lens_camera.camera.centre
     bent: Any = mi.Vector2f((u - dr.opaque(mi.Float, cx)) / dr.opaque(mi.Float, fx),
                        (v - dr.opaque(mi.Float, cy)) / dr.opaque(mi.Float, fy))  # fmt: skip
-    k1, k2 = (dr.opaque(mi.Float, k) for k in shot.distortion)
+    k1, k2 = (dr.opaque(mi.Float, k) for k in lens_camera.distortion)
     straight: Any = mi.Vector2f(bent)
     for _ in range(8):  # contracts by a tenth each time
         r2 = dr.squared_norm(straight)
         straight = bent / (1 + r2 * (k1 + k2 * r2))
-    pose = [[dr.opaque(mi.Float, float(value)) for value in row] for row in shot.camera.to_world[:3]]
+    pose = [[dr.opaque(mi.Float, float(value)) for value in row] for row in lens_camera.camera.to_world[:3]]
     direction = mi.Vector3f(*(-row[0] * straight.x - row[1] * straight.y + row[2] for row in pose))
     return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*(row[3] for row in pose)), dr.normalize(direction)))
 
@@ -104,9 +104,9 @@ def covered(rays: mi.RayDifferential3f, scene: mi.Scene, shape: mi.Shape) -> mi.
     return dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), mi.Float(1), 0)
 
 
-def averaged(traced: Traced, shot: Shot, window: Window, spp: int, seed: int) -> np.ndarray:
+def averaged(traced: Traced, lens_camera: LensCamera, window: Window, spp: int, seed: int) -> np.ndarray:
     """Means (H, W, channels) over the pixels of a part of the picture, 0 around it, of values `traced` along rays."""
-    width, height = shot.camera.size
+    width, height = lens_camera.camera.size
     parts = []
     for strip, own in strips(window, spp, seed):
         left, top, right, bottom = strip
