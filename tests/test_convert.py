@@ -37,7 +37,7 @@ def by_hand(R, t, calibration=K):
 
 def in_scene(shot):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    lens = mi.Point2f(*shot.camera.focal), mi.Point2f(*shot.camera.centre), None
+    lens = mi.Point2f(shot.camera.focal), mi.Point2f(shot.camera.centre), None
     x, depth = pinhole.project(mi.Matrix4f(shot.camera.to_world), *lens, mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T

@@ -332,20 +332,19 @@ class Calibration(nn.Module):
     def applied(self, capture: Capture) -> Capture:
         """The capture with cameras, lights and curve as they are by now."""
         with torch.no_grad():
-            matrices, intrinsics, places, strengths, falloff, distortion = (part.numpy() for part in self())
-            gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
-            contrast, gains = float(self.value("contrast").exp()), self.centred("gain").double().exp().numpy()
+            now, lamps, gains = self(), self.lamps_now(), self.centred("gain").double().exp().numpy()
+            gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
+            vignetting = float(self.value("vignetting"))
         # The curve's fixed point is the exposure here, full scale in a scene file.
         level = self.exposure ** ((1 - gamma) / gamma)
-        strong = torch.from_numpy(level * strengths.astype(float))
-        lights, shots = Lamps(torch.from_numpy(places), self.finite, strong).lights(), []
+        lights, shots = Lamps(now.places, self.finite, level * now.strengths.double()).lights(), []
+        matrices, intrinsics, _, _, falloff, distortion = (part.numpy() for part in now)
         for k, shot in enumerate(capture.shots):
-            pose = np.vstack([matrices[k], np.float32([[0, 0, 0, 1]])])
+            pose = np.vstack([matrices[k], np.eye(4, dtype=np.float32)[3]])
             camera = Camera(pose, intrinsics[k, :2], intrinsics[k, 2:], shot.size, float(distortion[k]))
-            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]),
-                                 response=shot.response.changed(gamma, contrast, vignetting, gains[k])))  # fmt: skip
-        now, lit = self.lamps_now(), "ambient" in self.refined or capture.room is not None
-        lamps = now._replace(strengths=level * now.strengths).lights()
-        scene = with_lamps(capture.scene, lamps) if "lamps" in self.refined else capture.scene
-        room = self.roomlight().double().numpy(force=True) * level if lit else None
+            response = shot.response.changed(gamma, contrast, vignetting, gains[k])
+            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]), response=response))
+        found, lit = lamps._replace(strengths=level * lamps.strengths).lights(), "ambient" in self.refined
+        scene = with_lamps(capture.scene, found) if "lamps" in self.refined else capture.scene
+        room = self.roomlight().double().numpy(force=True) * level if lit or capture.room is not None else None
         return replace(capture, scene=scene, shots=tuple(shots), room=room)
