@@ -98,9 +98,11 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
     """The camera of an image, in float32. Raises InputError, which begins with `what`, if it is none."""
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
-    shapes = {"to_world": (4, 4), "focal": (2,), "centre": (2,), "distortion": ()}
-    parts = {name: numbers(getattr(camera, name), shape, f"{what}: {name}") for name, shape in shapes.items()}
-    own = camera._replace(**parts, distortion=float(parts["distortion"]), size=image.shape[1::-1])
+    to_world, focal, centre, distortion = (
+        numbers(getattr(camera, name), shape, f"{what}: {name}")
+        for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()))
+    )
+    own = Camera(to_world, focal, centre, (image.shape[1], image.shape[0]), float(distortion))
     if tuple(camera.size) != own.size:
         raise InputError(f"{what}: size is {tuple(camera.size)}, (width, height); its image is {sides(image)}")
     if not (own.focal > 0).all():
