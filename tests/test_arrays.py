@@ -188,7 +188,8 @@ def test_files_have_all_bits_of_the_arrays(tmp_path):
               random.uniform(0, 3, (HEIGHT, WIDTH, 3)).astype(np.float32)]  # fmt: skip
     shown = random.uniform(size=(HEIGHT, WIDTH)) < 0.6
     capture = Capture.from_arrays(images, valid=[None, shown], cameras=[CAMERA, CAMERA._replace(distortion=0.05)],
-                                  names=["left", "right"], saturation=2.5, calibrated=True, room=[[0.1, 0.2, 0.3]])  # fmt: skip
+                                  names=["left", "right"], saturation=2.5, calibrated=True,
+                                  room=[[0.1, 0.2, 0.3]])  # fmt: skip
     saved = capture.save(tmp_path / "deep" / "pair.xml")
     assert saved.path == tmp_path / "deep" / "pair.xml" and not saved.in_memory
     read = mi_ring.load_capture(saved.path)
