@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from mi_ring.capture.decoding import is_linear
 from mi_ring.capture.pixels import Pixels
+from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import write_image
@@ -172,6 +174,21 @@ def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
                    for folder, there in (("masks", masked), ("valid", valid)))  # fmt: skip
     return Files(Path("images", f"{shot.name}.{suffix}"), mask, shown)
+
+
+def scene_xml(
+    shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
+    room: ArrayLike | None,
+) -> bytes:  # fmt: skip
+    """The scene file of `Capture.from_arrays`, by these files. Raises InputError, which names the argument."""
+    middle = None if center is None else numbers(center, (3,), "center")
+    reach = None if radius is None else float(numbers(radius, (), "radius"))
+    if reach is not None and not reach > 0:
+        raise InputError(f"radius: is {radius}, must be above 0")
+    elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]
+    root = scene_element(elements, middle, reach)
+    root.extend([] if room is None else room_elements(room_of(room)))
+    return scene_bytes(root)
 
 
 def write_array(array: np.ndarray, file: Path) -> None:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mi_ring.capture import arrays
-from mi_ring.capture.observation import Decoded, DecodedCache, Observation, decoded, together
+from mi_ring.capture.observation import Observation, ObservationCache, observed
 from mi_ring.capture.pixels import Pixels
-from mi_ring.capture.scenefile import photograph_element, recalibrated_xml, room_elements, scene_bytes, scene_element
+from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.errors import InputError, SceneError
 from mi_ring.geometry.camera import Camera, NoParallax, nearest_point
 from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
@@ -63,16 +63,15 @@ class Capture:
     threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were given
     #: Visual hulls by what they are made of. All captures that are made of this one by `replace` share them.
     hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
-    _decoded: DecodedCache = field(default_factory=DecodedCache, init=False, repr=False)
+    _observed: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
 
     @classmethod
     def from_arrays(
         cls, images: Sequence[ArrayLike], masks: Sequence[ArrayLike | None] | None = None, *,
         cameras: Sequence[Camera], lights: Sequence[Light | None] | None = None,
         valid: Sequence[ArrayLike | None] | None = None, names: Sequence[str] | None = None,
-        center: ArrayLike | None = None, radius: float | None = None, up: ArrayLike | None = None,
-        room: ArrayLike | None = None, encoding: Encoding = "auto", saturation: float = 1.0, calibrated: bool = False,
-        name: str = "capture",
+        center: ArrayLike | None = None, radius: float | None = None, room: ArrayLike | None = None,
+        encoding: Encoding = "auto", saturation: float = 1.0, calibrated: bool = False, name: str = "capture",
     ) -> "Capture":  # fmt: skip
         """A capture of photographs in arrays, without any file. The object is fitted with `cooktorrance`. ::
 
@@ -82,7 +81,7 @@ class Capture:
 
         `images`: N arrays (H, W, 3), which may differ in size. uint8 is sRGB; uint16 and float32 are linear, unless
         `encoding` is "srgb". 1.0, or the largest integer, is full scale. `saturation`: encoded value (1 = full scale)
-        from which a pixel is clipped.
+        from which a pixel is clipped. Arrays are not copied.
 
         `masks`, `valid`: N arrays (H, W) of bool or of uint8 from 0 to 255, or None for a photograph without one. In a
         mask 255 is the object; where `valid` is 0 the photograph shows nothing. Default: none.
@@ -91,10 +90,10 @@ class Capture:
         is a point light of intensity 1 at the camera. Lengths are in the units of the scene.
 
         `names`: N different names of photographs. Default: 000, 001, …. `center` (3,), `radius`: sphere about the
-        object [scene units]. Default: estimated from masks or cameras. `up` (3,): direction for exports. `room` (n, 3):
-        light of the room that all photographs share, R, G, B of its radiance in each of the first n real spherical
-        harmonics in the axes of the world; n is 1, 4, 9, 16 or 25. `calibrated`: are cameras and lights exact? `name`:
-        begins the messages of errors, and is the title of reports.
+        object [scene units]. Default: estimated from masks or cameras. `room` (n, 3): light of the room that all
+        photographs share, R, G, B of its radiance in each of the first n real spherical harmonics in the axes of the
+        world; n is 1, 4, 9, 16 or 25. `calibrated`: are cameras and lights exact? `name`: begins the messages of
+        errors, and is the title of reports.
 
         Anything else that a scene file can say of a photograph is a field of a `Shot`: `replace` the capture's `shots`.
 
@@ -103,18 +102,9 @@ class Capture:
         require_variant(name)
         pictures = arrays.images_of(images, encoding)
         shots = arrays.shots_of(pictures, cameras, lights, names, encoding, saturation, calibrated)
-        middle, upward = (None if vector is None else arrays.numbers(vector, (3,), what)
-                          for vector, what in ((center, "center"), (up, "up")))  # fmt: skip
-        reach = None if radius is None else float(arrays.numbers(radius, (), "radius"))
-        if reach is not None and not reach > 0:
-            raise InputError(f"radius: is {radius}, must be above 0")
-        own_masks = arrays.masks_of(masks, pictures, "masks")
-        shown = arrays.masks_of(valid, pictures, "valid")
-        files = map(arrays.files_of, shots, pictures, own_masks.given, shown.given)
-        elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]
-        root = scene_element(elements, center=middle, radius=reach, up=upward)
-        root.extend([] if room is None else room_elements(arrays.room_of(room)))
-        xml = scene_bytes(root)
+        own_masks, shown = arrays.masks_of(masks, pictures, "masks"), arrays.masks_of(valid, pictures, "valid")
+        files = list(map(arrays.files_of, shots, pictures, own_masks.given, shown.given))
+        xml = arrays.scene_xml(shots, files, center, radius, room)
         scene = mi.load_string(xml.decode(), optimize=False, parallel=False)
         shape = next(s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh))
         capture = cls(Path(name), xml, scene, shape, shots, room_of(scene), True, Pixels.of(pictures), own_masks, shown)
@@ -215,11 +205,10 @@ class Capture:
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
-        several = [self._decoded.get(k, scale, partial(self._decode, k, scale)) for k in index]
-        return together(several, self.masks.part(index).given)
+        return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
-    def _decode(self, k: int, scale: int) -> Decoded:
-        return decoded(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
+    def _observe(self, k: int, scale: int) -> Observation:
+        return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
         """Mean linear radiance of the object's pixels; without masks, of all pixels that are not black.

@@ -11,7 +11,7 @@ from mi_ring.capture.decoding import decode, is_linear, shade
 from mi_ring.images import box_filter
 from mi_ring.scene.shot import Shot
 
-#: Pixels of all photographs in a `DecodedCache`. A pixel takes up to 200 bytes: what is kept fragments the memory.
+#: Pixels of all photographs in an `ObservationCache`. A pixel takes up to 200 bytes: what is kept fragments the memory.
 REMEMBERED_PIXELS = 2**23
 
 
@@ -33,63 +33,57 @@ class Observation(NamedTuple):
         """The same on a device."""
         return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
 
+    @classmethod
+    def joined(cls, several: Sequence["Observation"]) -> "Observation":
+        """Several of photographs of one size as one."""
+        rgb, clipped, mask, masked, valid = zip(*several)
+        if all(v is None for v in valid):
+            return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), None)
+        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
+        return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), torch.cat(shown))
 
-class Decoded(NamedTuple):
-    """One photograph of an `Observation`."""
 
-    rgb: Tensor  #: (H, W, 3)
-    clipped: Tensor  #: (H, W, 3) bool
-    mask: Tensor  #: (H, W)
-    valid: Tensor | None  #: (H, W) bool
-
-
-def decoded(shot: Shot, image: np.ndarray, mask: np.ndarray | None, valid: np.ndarray | None, scale: int) -> Decoded:
-    """A photograph's radiance by its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
+def observed(
+    shot: Shot, image: np.ndarray, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
+) -> Observation:
+    """One photograph by its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
 
     `mask`, `valid`: (H, W) uint8 as in its files, None where it has none.
     """
     curve = shot.response.gamma, shot.response.contrast
     linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
     linear = linear / shade(shot)
-    mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
+    coverage = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
     shown = None
     if valid is not None:
         here = valid > 127
         linear = np.where(here[..., None], linear, 0)
         clipped = clipped | ~here[..., None]  # nothing is known: the scene is at least this black
-        shown = box_filter(torch.from_numpy(here).float()[..., None], scale)[..., 0] == 1
-    return Decoded(
-        box_filter(torch.from_numpy(linear), scale),
-        box_filter(torch.from_numpy(clipped).float(), scale) > 0,
-        box_filter(torch.from_numpy(mask).float()[..., None] / 255, scale)[..., 0],
+        shown = box_filter(torch.from_numpy(here).float()[..., None], scale)[None, ..., 0] == 1
+    return Observation(
+        box_filter(torch.from_numpy(linear), scale)[None],
+        box_filter(torch.from_numpy(clipped).float(), scale)[None] > 0,
+        box_filter(torch.from_numpy(coverage).float()[..., None] / 255, scale)[None, ..., 0],
+        torch.tensor([mask is not None]),
         shown,
     )
 
 
-def together(several: Sequence[Decoded], masked: Sequence[bool]) -> Observation:
-    """Decoded photographs of one size as an observation; `masked`: which of them have a mask."""
-    rgb, clipped, mask, valid = zip(*several)
-    shown = None
-    if not all(v is None for v in valid):
-        shown = torch.stack([torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)])
-    return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), torch.tensor(masked), shown)
-
-
-class DecodedCache:
-    """Decoded photographs, each at its last scale, as many as there is room for; none at the scale of its file."""
+class ObservationCache:
+    """Observations of single photographs, each at its last scale, as many as there is room for; none at scale 1."""
 
     def __init__(self) -> None:
-        self.kept: dict[int, tuple[int, Decoded]] = {}  # (scale, photograph) by index
+        self.kept: dict[int, tuple[int, Observation]] = {}  # (scale, photograph) by index
         self.pixels = 0  # of all that are kept
 
-    def get(self, k: int, scale: int, decode: Callable[[], Decoded]) -> Decoded:
-        """Photograph `k` at a scale; `decode` is called if it is not kept."""
+    def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
+        """Photograph `k` at a scale; `observe` is called if it is not kept."""
         if k in self.kept:
             before, result = self.kept[k]
             if before == scale:
                 return result
             self.pixels -= self.kept.pop(k)[1].mask.numel()
-        result = decode()
+        result = observe()
         pixels = result.mask.numel()
         if scale > 1 and self.pixels + pixels <= REMEMBERED_PIXELS:
             self.kept[k] = scale, result
