@@ -47,6 +47,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.photogrammetry.capture_files import windows
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
 
 DISTURBANCES = (
     "sheet", "ambient", "offset", "cone", "lens", "principal", "exposure", "jpeg", "noise", "blur", "failures"
@@ -254,8 +255,8 @@ def make_capture(out: Path, settings: Settings) -> None:
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
         light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
-                                           calibrated=True))  # fmt: skip
+        files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
+        elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
         (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

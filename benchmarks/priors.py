@@ -27,6 +27,7 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis import example_pot
 from mi_ring.synthesis.object_on_table import ObjectOnTable
 from mi_ring.synthesis.tracing import LensCamera
@@ -76,10 +77,10 @@ def write_capture(name: str, folder: Path) -> None:
         light = Light("point", position, np.full(3, 2 * example_pot.DISTANCE**2))
         picture = scene.radiance(LensCamera(camera), light, 36, k, 2)
         noisy = picture + random.normal(0, NOISE, picture.shape)
-        files = f"images/{k:03}.png", f"masks/{k:03}.png"
-        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files[0])
-        write_image(to_bytes(scene.coverage(LensCamera(camera))[..., None] >= 0.5), folder / files[1])
-        elements.append(photograph_element(f"{k:03}", files[0], camera, light, files[1], calibrated=True))
+        files = Files(Path(f"images/{k:03}.png"), Path(f"masks/{k:03}.png"))
+        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files.filename)
+        write_image(to_bytes(scene.coverage(LensCamera(camera))[..., None] >= 0.5), folder / files.mask)
+        elements.append(photograph_element(Shot(f"{k:03}", camera, light, files=files, calibrated=True)))
     truth.export(folder / "truth.ply")
     np.savez(folder / "truth.npz", **material)
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

@@ -100,7 +100,7 @@ def main(arguments: Sequence[str]) -> None:
         level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
     if kind in (".glb", ".obj"):
         gltf.require_expressible(ring)
-    photograph, room = first_photograph(config.run) if kind == ".xml" else (None, None)
+    photograph = first_photograph(config.run) if kind == ".xml" else None
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
     require_place(config.file)
     files = [config.file]
@@ -118,10 +118,10 @@ def main(arguments: Sequence[str]) -> None:
         atlas = unwrap(ring, level, config.resolution, config.time)
         texels = rasterise(ring, atlas, config.resolution, config.time)
         values = reflectances(ring, texels.s)
-        if kind == ".obj":
-            files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+        if photograph:
+            files = write_scene(config.file, atlas, texels, ring.bsdf, values, *photograph)
         else:
-            files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph, room)
+            files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
     if unknown := ambiguity_of(config.material or config.run):
         print(unknown, file=sys.stderr)
     print("\n".join(map(str, files)))

@@ -18,7 +18,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
-from mi_ring.photogrammetry.capture_files import windows, write_shot, write_table
+from mi_ring.photogrammetry.capture_files import windows, write_posed_picture, write_table
 from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, models, unlit, ups, without_exposure
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
@@ -29,9 +29,9 @@ from mi_ring.photogrammetry.workflow import (
     find_cameras,
     find_sheet,
     flash_of,
+    posed_pictures,
     require_same_photographs,
     require_sides,
-    shots,
     upright,
 )
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
@@ -201,19 +201,20 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not flash and not offset.any() and len({picture.held for picture in pictures}) > 1:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
-    taken = shots(pictures, motion, found, offset, flash)
+    taken = posed_pictures(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
-    root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
+    root = scene_element(ground=ground, up=up, metres=METRES if sheet else None, fresnel=flash is not None)
+    writer = Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
         harmonics = np.zeros((PER_FRAME, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
         cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
-        written = in_threads(partial(write_shot, writer), taken, cuts)
+        written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
             root.extend(write_table(writer, taken, plane, found.center, flash))

@@ -34,12 +34,12 @@ def main(arguments: Sequence[str]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
     pictures = render_views(surface, ring, views, integrator, capture, config)
     if config.film:
-        frames = (recorded(picture, view.sensor) for picture, view in zip(pictures, views))
-        write_film(frames, config.out, views[0].sensor.size, config.fps)
+        frames = (recorded(picture, view.shot) for picture, view in zip(pictures, views))
+        write_film(frames, config.out, views[0].shot.size, config.fps)
         print(config.out)
     else:
         for picture, view in zip(pictures, views):  # `pictures` first, so that its progress bar ends
-            write_picture(recorded(picture, view.sensor), config.out / view.name)
+            write_picture(recorded(picture, view.shot), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
     run = config.run if config.run.is_dir() else config.run.parent
     same_light = config.scene.resolve().parent == run.resolve() and not (config.material or config.envmap)
@@ -80,14 +80,14 @@ def require_options(config: RenderConfig) -> None:
 def require_writable(views: list[RenderedView], capture: Capture, config: RenderConfig) -> None:
     """Raise InputError if pictures cannot be written, or would overwrite each other or the photographs."""
     if config.film:
-        sizes = sorted({view.sensor.size for view in views})
+        sizes = sorted({view.shot.size for view in views})
         if len(sizes) > 1:
             raise InputError(f"{config.scene}: film: photographs have several sizes, {sizes[0]} and {sizes[1]} [px]; "
                              "a film has one: name a folder")  # fmt: skip
         if config.out.is_dir():
             raise InputError(f"{config.out}: is a folder; a film needs the name of a file")
         return
-    own = {file for sensor in capture.sensors for file in sensor.files}
+    own = {file.resolve() for shot in capture.shots for file in shot.files if file}
     names = set()
     for view in views:
         if Path(view.name).suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):

@@ -24,7 +24,6 @@ from mi_ring.nets.brdf_net import Parameter
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import atlas, gltf, mitsuba_scene, results
-from mi_ring.rendering.photograph_lights import Lights
 
 CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
 RESOLUTION = 256
@@ -396,10 +395,10 @@ assert "mi_ring" not in sys.modules
 np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
-    sensor, _ = mitsuba_scene.first_photograph(run)
-    matrix, (fx, fy), (cx, cy), *_ = sensor.camera
+    shot, _ = mitsuba_scene.first_photograph(run)
+    matrix, (fx, fy), (cx, cy), *_ = shot.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
-    light = Lights.of([sensor])[0]
+    light = shot.light
     scene = mi.load_dict({
         "type": "scene", "object": {"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 4,
                                     "bsdf": {"type": "cooktorrance"}},
@@ -420,7 +419,7 @@ def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
     torch.save(ring_state(bright, {"subdivisions": 4}), tmp_path / "ring.pt")
     (tmp_path / "scene.xml").write_text(small_capture.read_text())
     export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
-    intensity = Lights.of(mitsuba_scene.first_photograph(tmp_path)[:1])[0].rgb
+    intensity = mitsuba_scene.first_photograph(tmp_path)[0].light.rgb
     stock = mi.load_file(str(tmp_path / "stock.xml"), parallel=False)
     boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
     assert boost.min() > 20

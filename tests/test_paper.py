@@ -457,8 +457,8 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
         trimesh.Trimesh(CENTER + r * ball.vertices, ball.faces).export(tmp_path / file)
     (row,) = measures.in_millimetres(Run("ball", part, {}), tmp_path, ExperimentOptions())
     depths = []
-    for sensor in load_capture(scene, images=False).sensors:
-        camera = sensor.camera
+    for shot in load_capture(scene, images=False).shots:
+        camera = shot.camera
         x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size))
         rays = np.stack([(camera.centre[0] - x) / camera.focal[0], (camera.centre[1] - y) / camera.focal[1], x**0], -1)
         rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.to_world[:3, :3].T
@@ -487,7 +487,7 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     capture = load_capture(scene)
     seen, _, normals, _ = hits(load_true_mesh(folder / "mesh.ply")[1], capture.photograph(0))
     for k, observed in enumerate(capture.observe([0, 1, 2]).rgb.numpy()):
-        light = Lights.of(capture.sensors)[k]
+        light = Lights.of(capture.shots)[k]
         brightness = ALBEDO * light.rgb * np.maximum(normals @ -light.vector, 0)[:, None]  # by Lambert
         there = seen & (observed.reshape(-1, 3) > 0).any(1)
         assert there.sum() > 0.5 * seen.sum()
@@ -519,7 +519,7 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
 
     part = datasets.Subset.of("part", tmp_path, egg, 5)
     some = load_capture(made(part))
-    assert [sensor.id() for sensor in some.sensors] == ["000", "003", "006", "008", "011"]
+    assert [shot.name for shot in some.shots] == ["000", "003", "006", "008", "011"]
     assert part.truth == known_capture / "truth"
     torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
     before = part.scene.stat().st_ino

@@ -77,7 +77,7 @@ def lens_capture(tmp_path):
 
 
 def test_a_scene_says_where_its_photographs_show_something(lens_capture):
-    assert len({sensor.valid for sensor in lens_capture.sensors}) == 1  # one lens, one file
+    assert len({shot.files.valid for shot in lens_capture.shots}) == 1  # one lens, one file
     rgb, clipped, _, masked, valid = lens_capture.observe([0, 1])
     assert masked.all() and valid.shape == (2, H, W) and 0.8 < valid.float().mean() < 0.99
     assert not rgb[~valid].any() and clipped[~valid].all() and not clipped[valid].any()

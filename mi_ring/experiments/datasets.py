@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import move_names, recalibrated_xml, scene_bytes
 from mi_ring.collection.jobs import modified
@@ -19,7 +18,6 @@ from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
@@ -208,15 +206,11 @@ class PerturbedCameras(Derived):
     def changed(self, root: ElementTree.Element) -> bytes:
         capture = load_capture(self.source.scene, images=False)
         center, _ = capture.sphere()
-        cameras, found = [sensor.camera for sensor in capture.sensors], Lights.of(capture.sensors)
-        lights = [found[k] for k in range(len(cameras))]
-        random = np.random.default_rng(self.seed)
-        moved = miscalibrated(cameras, lights, center, random, turned=self.degrees)
-        wrong = with_calibration(capture, *moved, room=capture.photographs.room)
-        for sensor in root.findall("sensor"):
-            for flag in sensor.findall("boolean[@name='calibrated']"):
-                sensor.remove(flag)
-        return recalibrated_xml(ElementTree.tostring(root), wrong.sensors, wrong.photographs.room)
+        wrong = miscalibrated(capture.shots, center, np.random.default_rng(self.seed), turned=self.degrees)
+        for shot in root.findall("sensor"):
+            for flag in shot.findall("boolean[@name='calibrated']"):
+                shot.remove(flag)
+        return recalibrated_xml(ElementTree.tostring(root), wrong, capture.room)
 
 
 @dataclass(frozen=True)

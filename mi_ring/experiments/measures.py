@@ -66,7 +66,7 @@ def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
 
 def rotation_error(a: Path, b: Path) -> float:
     """Root mean square angle [°] between the cameras of two scenes, apart from a rotation that all share."""
-    first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).sensors] for x in (a, b))
+    first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).shots] for x in (a, b))
     between = Rotation.from_matrix([x @ y.T for x, y in zip(first, second, strict=True)])
     return float(np.degrees(np.sqrt(np.mean((between * between.mean().inv()).magnitude() ** 2))))
 

@@ -153,7 +153,7 @@ def three_pictures(outcome: Outcome) -> list[np.ndarray]:
 def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
     """Prediction of the first photograph, sRGB (H, W, 3), and the factor by which it is smaller than the photograph."""
     capture = load_capture(outcome.folder / "scene.xml", images=False)
-    scale = -(-capture.sensors[0].size[0] // WIDTH)
+    scale = -(-capture.shots[0].size[0] // WIDTH)
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     rgb, _ = prediction.draw(

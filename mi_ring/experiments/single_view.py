@@ -1,6 +1,5 @@
 """DiLiGenT's photographs of one camera as a dataset."""
 
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from mi_ring.foreign import load_npz
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import write_image
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import write_file
 
 DISTANCE = 1500.0  #: assumed, from the camera to the object [mm]; one camera does not determine it
@@ -74,11 +74,8 @@ class SingleView(CachedDataset):
             file = f"images/{k:03}.png"
             write_image(image, folder / file)
             light = Light("directional", -TO_MITSUBA * to_light, np.asarray(rgb, float))
-            elements.append(photograph_element(f"{k:03}", file, camera, light, "mask.png"))
-        root = scene_element(elements)
-        x, y = map(str, DISTANCE * (centre - np.argwhere(mask).mean(0)[::-1]) / focal)
+            files = Files(Path(file), Path("mask.png"))
+            elements.append(photograph_element(Shot(f"{k:03}", camera, light, files=files)))
+        middle = DISTANCE * np.append((centre - np.argwhere(mask).mean(0)[::-1]) / focal, 1)
         radius = np.sqrt(mask.sum() / np.pi) * DISTANCE / focal[0]
-        shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
-        ElementTree.SubElement(shape, "point", name="center", x=x, y=y, z=str(DISTANCE))
-        ElementTree.SubElement(shape, "float", name="radius", value=str(radius))
-        write_file(folder / "scene.xml", scene_bytes(root))
+        write_file(folder / "scene.xml", scene_bytes(scene_element(elements, middle, radius)))

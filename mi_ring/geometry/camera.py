@@ -10,6 +10,7 @@ from mi_ring.errors import InputError
 #: Below −4/27 the lens folds: it shows some points twice. Above 10, Newton's method leaves an error of over 1e-6.
 MIN_DISTORTION, MAX_DISTORTION = 0.9 * -4 / 27, 10.0
 NEWTON_STEPS = 6
+FARTHEST = 50  #: sizes of the picture from which a principal point may be
 
 
 class NoParallax(InputError):
@@ -125,6 +126,27 @@ class Camera(NamedTuple):
         """The camera of the same photograph at 1 / `scale` of its size."""
         size = self.size[0] // scale, self.size[1] // scale
         return self._replace(focal=self.focal / scale, centre=self.centre / scale, size=size)
+
+    @property
+    def key(self) -> tuple[bytes, ...]:
+        """Equal for equal cameras: a key for dictionaries."""
+        return tuple(np.asarray(part).tobytes() for part in self)
+
+    def fault(self) -> str | None:
+        """What is wrong with principal point, distortion or pose, as a scene file names them; None if nothing is."""
+        if (far := np.abs(self.centre / np.array(self.size))).max() > FARTHEST:
+            k = int(far.argmax())
+            return (f"{('cx', 'cy')[k]} is {self.centre[k]:g}, which is more than {FARTHEST} times its film away; is "
+                    "it in pixels?")  # fmt: skip
+        least, most = distortion_range(self.focal, self.centre, np.array(self.size))
+        if not least <= self.distortion <= most:
+            return (f"distortion is {self.distortion:.6g}, must be within {least:.6g} and {most:.6g}: below, its "
+                    "corners would show what is elsewhere, too")  # fmt: skip
+        rotation = self.to_world[:3, :3]
+        rigid = np.isfinite(self.to_world).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+        if not rigid or np.linalg.det(rotation) < 0:
+            return "to_world must be a rotation and a translation, without scale or mirror"
+        return None
 
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:

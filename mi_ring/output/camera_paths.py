@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.loading import reason
+from mi_ring.capture.loading import photographs_in, reason
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError, require_file
 from mi_ring.geometry.camera import Camera
@@ -20,11 +20,11 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions
 from mi_ring.output.atlas import flow_points
 from mi_ring.rendering import prediction
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.assembly import assembled, is_table, top_level_emitters
 from mi_ring.scene.lights import is_flash, is_room
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.system.progress import progress
 
@@ -93,9 +93,10 @@ class RenderConfig(MaterialOptions):
 class RenderedView:
     """A view to render."""
 
-    sensor: Any  #: a `photograph`
-    name: str
+    shot: Shot
+    name: str  #: of the picture's file
     time: float  #: of the flow
+    sensor: Any = None  #: the scene's own, if there is one, with the film that the scene gives it
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
@@ -117,16 +118,17 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
-        return [RenderedView(sensor, name, config.time) for sensor, name in zip(capture.sensors, names)]
+        several = zip(capture.shots, names, photographs_in(capture.scene), strict=True)
+        return [RenderedView(shot, name, config.time, sensor) for shot, name, sensor in several]
     if config.view is not None and config.view not in capture.names:
         first = capture.names[0]
         raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {first}")
-    sensor = capture.sensors[capture.names.index(config.view) if config.view else 0]
+    shot = capture.shots[capture.names.index(config.view) if config.view else 0]
     up = up_of(capture, config)
-    width, height = sensor.size
-    size = (config.width, round(height * config.width / width)) if config.width else sensor.size
-    camera, middle = framed(sensor.camera._replace(size=size), ring, up)
-    light = Lights.of([sensor])[0]
+    width, height = shot.size
+    size = (config.width, round(height * config.width / width)) if config.width else shot.size
+    camera, middle = framed(shot.camera._replace(size=size), ring, up)
+    light = shot.own_light
     if config.light_orbit and not light.rgb.any():
         raise InputError(f"{config.scene}: --light-orbit: photographs have no light of their own that could go round; "
                          "give --turntable")  # fmt: skip
@@ -150,9 +152,8 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        cone = 0.0 if config.light_orbit else sensor.cone  # about the axis of a camera that the light goes with
-        element = photograph_element("view", "none", seen_from, lit_from, falloff=cone)
-        views.append(RenderedView(load_element(element), name, time))
+        falloff = 0.0 if config.light_orbit else shot.falloff  # about the axis of a camera that the light goes with
+        views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, files=Files(Path("none"))), name, time))
     return views
 
 
@@ -213,9 +214,10 @@ def render_views(
             surface.show(ring, s, faces, view.time)
             shown = view.time
         if integrator:
-            yield render_passes(surface.scene, view.sensor, integrator, config.spp, seed=k)
+            sensor = view.sensor or load_element(photograph_element(view.shot))
+            yield render_passes(surface.scene, sensor, integrator, config.spp, seed=k)
         else:
-            one = Photographs.of([view.sensor], capture.photographs.room)
+            one = Photographs.of([view.shot], capture.room)
             rgb, _ = prediction.draw(surface, one, spp=config.spp, shadows=capture.shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 
@@ -225,7 +227,7 @@ def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: 
 
     A pass has at most `LANES` rays, or one ray per pixel if there are more pixels.
     """
-    width, height = sensor.size
+    width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))
     total = np.zeros(3, np.float32)
     for number, first in enumerate(range(0, spp, at_once)):

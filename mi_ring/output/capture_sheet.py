@@ -26,7 +26,7 @@ LEGEND = (
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
     """Cameras with their viewing directions, lights and the normalising sphere, along the three axes."""
-    cameras, lights = np.stack([sensor.camera.to_world for sensor in capture.sensors]), capture.photographs.lights
+    cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())
     away = away[lights.rgb().any(1)]
@@ -66,7 +66,7 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
         left += draw.textlength(words) + 16
     white = 3 * capture.exposure()
     for place, k in enumerate(some):
-        scale = max(1, max(capture.sensors[k].size) // CELL)
+        scale = max(1, max(capture.shots[k].size) // CELL)
         observed, _, mask, masked, valid = capture.observe([k], scale)
         picture = linear_to_srgb(observed[0].numpy() / white)
         if hull:

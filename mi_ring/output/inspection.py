@@ -9,7 +9,7 @@ from PIL import Image
 from mi_ring.capture.capture import Capture, sphere_of_cameras
 from mi_ring.geometry.hull import NoHull
 from mi_ring.images import encoded_picture
-from mi_ring.metrics.capture_findings import capture_findings, drop_empty, facing, measure, quality_table
+from mi_ring.metrics.capture_findings import capture_findings, facing, measure, quality_table, without_empty_masks
 from mi_ring.metrics.mask_agreement import agreements
 from mi_ring.output.capture_sheet import capture_sheet
 from mi_ring.system.files import write_file, writing
@@ -32,14 +32,15 @@ class Inspection:
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Measure a capture. Empty masks, which are findings, are taken from it."""
+    """Measure a capture. Empty masks are findings; the other findings are made as if they were not there."""
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     """As `inspect`; `advance` is called after each of its four steps."""
-    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(capture)]
+    capture, empty = without_empty_masks(capture)
+    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:
         center, radius = capture.sphere()
     except NoHull as error:

@@ -2,7 +2,6 @@
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -14,29 +13,29 @@ from mi_ring.images import write_image
 from mi_ring.output import gltf
 from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.spherical_harmonics import room_envmap, room_of
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
 
 
-def first_photograph(run: Path) -> tuple[Any, np.ndarray | None]:
+def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
     """The first photograph in a fit's scene.xml, and the light of the room.
 
     Raises InputError if there is no such file, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
-    scene, sensors = open_scene(run / "scene.xml")
+    scene, shots = open_scene(run / "scene.xml")
     room = room_of(scene)
-    if room is None and not Lights.of(sensors[:1])[0].rgb.any():
+    if room is None and not shots[0].own_light.rgb.any():
         raise InputError(f"{run}/scene.xml: a scene for Mitsuba takes the photographs' own light, of which there is "
                          "none; give an OBJ or GLB file, and light it yourself")  # fmt: skip
-    return sensors[0], room
+    return shots[0], room
 
 
 def write_scene(
-    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any,
+    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], shot: Shot,
     room: np.ndarray | None,
 ) -> list[Path]:  # fmt: skip
     """Write a scene with the textured object and a photograph's camera and light; returns the paths of its files.
@@ -83,13 +82,13 @@ def write_scene(
             parent = next(e for e in element.iter() if texture in e)
             parent.remove(texture)
             bitmap(parent, name, values[name])
-    light = Lights.of([photograph])[0]
-    scene.append(perspective_element(photograph.camera, atlas.vertices))
+    light = shot.own_light
+    scene.append(perspective_element(shot.camera, atlas.vertices))
     if light.rgb.any():
         scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # reflectances are scaled
     elif room is not None:
         files.append(path.with_name(f"{path.stem}_environment.exr"))
-        radiance = room_envmap(room, photograph.camera.to_world).clip(min=0) / scale
+        radiance = room_envmap(room, shot.camera.to_world).clip(min=0) / scale
         write_image(radiance.astype(np.float32), files[-1])
         environment = ElementTree.SubElement(scene, "emitter", type="envmap")
         ElementTree.SubElement(environment, "string", name="filename", value=files[-1].name)

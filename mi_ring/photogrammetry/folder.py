@@ -15,6 +15,7 @@ from mi_ring.foreign import require_plausible_size
 from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
+from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
@@ -97,7 +98,7 @@ class Picture:
         return found if found > 0 else np.nan
 
     @property
-    def encoding(self) -> str:
+    def encoding(self) -> Encoding:
         """`linear` or `srgb`: what the numbers mean."""
         return "linear" if self.path.suffix.lower() in RAW else "srgb"
 

@@ -1,14 +1,14 @@
 """Simulated errors of photographs and calibration: sensor noise, quantisation, exposure, wrong cameras and lights."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Shot
 
 Format = Literal["exr", "png16", "png8"]
 
@@ -43,32 +43,33 @@ def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndar
 
 
 def miscalibrated(
-    cameras: Sequence[Camera], lights: Sequence[Light], center: np.ndarray, random: np.random.Generator,
-    turned: float = 0.0, shifted: float = 0.0, scaled: float = 0.0,
-) -> tuple[list[Camera], list[Light]]:  # fmt: skip
-    """Cameras and lights with known errors. Distances are those of the cameras from the `center` (3,).
+    shots: Sequence[Shot], center: np.ndarray, random: np.random.Generator, turned: float = 0.0, shifted: float = 0.0,
+    scaled: float = 0.0,
+) -> tuple[Shot, ...]:  # fmt: skip
+    """Photographs with known errors of cameras and lights. Distances are those of the cameras from the `center` (3,).
 
     `turned`: standard deviation of each camera's rotation about each of its axes [deg], and of its translation along
     each [% of the distance]; its flash moves with it. `shifted`: all point lights move by so many per cent of the
     distance, in one direction of the cameras' axes. `scaled`: standard deviation of a lognormal factor of each light's
     power [%].
     """
-    cameras, lights = list(cameras), list(lights)
+    wrong = []
     direction = random.normal(size=3)
     direction /= np.linalg.norm(direction)
-    for k, (camera, light) in enumerate(zip(cameras, lights, strict=True)):
+    for shot in shots:
+        camera, light = shot.camera, shot.own_light
         distance, point = np.linalg.norm(camera.position - center), light.kind == "point"
         if turned:
             to_world = camera.to_world.copy()
             to_world[:3, :3] @= Rotation.from_rotvec(np.radians(random.normal(0, turned, 3))).as_matrix()
             to_world[:3, 3] += camera.to_world[:3, :3] @ random.normal(0, turned / 100 * distance, 3)
-            cameras[k] = camera._replace(to_world=to_world)
-            if point:
+            if point:  # a flash stays where it is in the camera's axes
                 in_camera = camera.to_world[:3, :3].T @ (light.vector - camera.position)
                 light = light._replace(vector=to_world[:3, :3] @ in_camera + to_world[:3, 3])
+            shot = replace(shot, camera=camera._replace(to_world=to_world))
         if shifted and point:
             light = light._replace(vector=light.vector + camera.to_world[:3, :3] @ direction * shifted / 100 * distance)
         if scaled:
             light = light._replace(rgb=light.rgb * np.exp(random.normal(0, scaled / 100)))
-        lights[k] = light
-    return cameras, lights
+        wrong.append(replace(shot, light=light))
+    return tuple(wrong)

@@ -13,6 +13,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis.object_on_table import ObjectOnTable
 from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import GOLDEN, look_at
@@ -89,6 +90,6 @@ def write_example(folder: Path, spp: int = SPP) -> None:
         picture = scene.radiance(view, light, spp, k, DEPTH)
         write_image(to_bytes(linear_to_srgb(picture)), folder / "images" / f"{name}.png")
         write_image(to_bytes(scene.coverage(view)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
-        files = f"images/{name}.png", f"masks/{name}.png"
-        elements.append(photograph_element(name, files[0], camera, light, files[1], calibrated=True))
+        files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
+        elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

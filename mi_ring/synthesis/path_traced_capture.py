@@ -5,6 +5,7 @@ import json
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis import light_sources
 from mi_ring.synthesis.degradation import HALF_LIMIT, encoded, exposures, miscalibrated, noisy
@@ -231,24 +233,23 @@ def write_scenes(
     def scene(folder: Path, photographs: list[PlannedPhotograph], images: str, masks: str, exact: bool) -> bytes:
         paired = config.pairs and photographs is seen
         gains = studio.gains if exact and photographs is seen else np.ones((len(photographs), 3))
-        cameras, lights = [photograph.camera for photograph in photographs], [p.light for p in photographs]
-        if not exact:
-            cameras, lights = miscalibrated(
-                cameras, lights, np.zeros(3), studio.random(4), config.wrong_cameras, config.wrong_light,
-                config.wrong_power,
-            )  # fmt: skip
-            if config.light == "lamp":  # it does not move with a camera
-                lights = [light._replace(vector=p.light.vector) for light, p in zip(lights, photographs)]
-        elements = [
-            photograph_element(
-                photograph.name, f"{images}/{photograph.file}", camera,
-                light._replace(rgb=strength * light.rgb), f"{masks}/{photograph.name}.png",
-                saturation=HALF_LIMIT if config.format == "exr" else None, calibrated=exact, gain=gain,
-                ambient=f"ambient/{photograph.file}" if paired else None,
+        shots: Sequence[Shot] = [
+            Shot(
+                p.name, p.camera, p.light._replace(rgb=strength * p.light.rgb),
+                response=Response(gain=tuple(gain.tolist())),
+                files=Files(Path(images, p.file), Path(masks, f"{p.name}.png"),
+                            ambient=Path("ambient", p.file) if paired else None),
+                saturation=HALF_LIMIT if config.format == "exr" else 1.0, calibrated=exact,
             )
-            for photograph, camera, light, gain in zip(photographs, cameras, lights, gains)
+            for p, gain in zip(photographs, gains)
         ]  # fmt: skip
-        root = scene_element(elements, ground, up, metres)
+        if not exact:
+            shots = miscalibrated(shots, np.zeros(3), studio.random(4), config.wrong_cameras, config.wrong_light,
+                                  config.wrong_power)  # fmt: skip
+            if config.light == "lamp":  # it does not move with a camera
+                shots = [replace(shot, light=shot.own_light._replace(vector=p.light.vector))
+                         for shot, p in zip(shots, photographs)]  # fmt: skip
+        root = scene_element(map(photograph_element, shots), ground=ground, up=up, metres=metres)
         root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(emitters))
         root.extend(deepcopy(studio.tables))
         move_names(root, out, folder)
