@@ -154,10 +154,9 @@ def read_image(path: Path) -> np.ndarray:
             if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
             require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
-            if sum(page.databytecounts) > path.stat().st_size:
-                raise ValueError(f"declares {sum(page.databytecounts):,} bytes, and is shorter")
-            if math.prod(page.chunked) > path.stat().st_size:  # its reader would request each of them
-                raise ValueError(f"declares {math.prod(page.chunked):,} strips or tiles, and is shorter")
+            for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
+                if count > path.stat().st_size:  # the reader would request each of them
+                    raise ValueError(f"declares {count:,} {what}, and is shorter")
         pixels = np.array(imageio.imread(path, page=0))
     elif suffix == ".exr":
         width, height, channels = exr_size(path)
