@@ -39,8 +39,7 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
 def ring_of(state: dict) -> FittedObject:
     """The inverse of `ring_state`.
 
-    Raises InputError for networks that are not registered here, and KeyError, RuntimeError, TypeError or ValueError if
-    the state is damaged.
+    Raises InputError for networks that are not registered; KeyError, RuntimeError, TypeError or ValueError for damage.
     """
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
@@ -121,8 +120,7 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
 def load_fit(path: str | Path) -> FittedObject:
     """The object of a fit, from its results folder or its `ring.pt`.
 
-    Raises InputError if there is no such file, if a newer or a much older mi_ring wrote it, and if its networks are not
-    registered here.
+    Raises InputError if there is no such file, if its version cannot be read, or if its networks are not registered.
     """
     path = Path(path)
     path = path / "ring.pt" if path.is_dir() else path
