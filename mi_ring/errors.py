@@ -7,10 +7,9 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """The user's input cannot be used.
+    """The user's input cannot be used. Commands print the message and exit with status 2.
 
-    The message is one line: the file, the field, what was found, and what to do. Commands print it and exit with
-    status 2.
+    The message is one line: the file, the field, what was found, and what to do.
     """
 
     def __init__(self, message: str) -> None:

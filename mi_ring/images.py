@@ -84,8 +84,7 @@ class BoundedFile(io.BufferedReader):
 def open_image(path: Path) -> Iterator[Image.Image]:
     """An image file opened by Pillow.
 
-    Raises ValueError if it is no image, or declares more pixels than a file of its size can hold; other errors if it is
-    damaged.
+    Raises ValueError if it is no image or declares an implausible size, and other errors if it is damaged.
     """
     Image.init()
     formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF if its package is installed
@@ -144,8 +143,7 @@ def exr_size(path: Path) -> tuple[int, int, int]:
 def read_image(path: Path) -> np.ndarray:
     """The pixels (H, W, C) of an image file: uint8, uint16, or float32 for all other types.
 
-    Raises ValueError for CMYK, and for a file that declares more than a file of its size can hold, before memory is
-    allocated; other errors if the file is damaged.
+    Raises ValueError for CMYK and for an implausible size, before memory is allocated; other errors for damaged files.
     """
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # Mitsuba does not read it
@@ -154,10 +152,9 @@ def read_image(path: Path) -> np.ndarray:
             if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
             require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
-            if sum(page.databytecounts) > path.stat().st_size:
-                raise ValueError(f"declares {sum(page.databytecounts):,} bytes, and is shorter")
-            if math.prod(page.chunked) > path.stat().st_size:  # its reader would request each of them
-                raise ValueError(f"declares {math.prod(page.chunked):,} strips or tiles, and is shorter")
+            for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
+                if count > path.stat().st_size:  # the reader would request each of them
+                    raise ValueError(f"declares {count:,} {what}, and is shorter")
         pixels = np.array(imageio.imread(path, page=0))
     elif suffix == ".exr":
         width, height, channels = exr_size(path)

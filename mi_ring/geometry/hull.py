@@ -86,9 +86,8 @@ class Hull:
     def depth(self, points: Tensor) -> Tensor:
         """Approximate signed distance of points (N, 3) from the hull's surface [scene units]; positive inside.
 
-        It is the smallest distance from a silhouette's outline, at the depth of the point, without the outliers. A
-        silhouette does not count where its photograph does not show the point. A point that few photographs show is
-        outside.
+        It is the smallest distance from the outline in any silhouette, at the depth of the point, without outliers.
+        Photographs that do not show the point are not counted. A point that few photographs show is outside.
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))

@@ -34,8 +34,7 @@ COOK_TORRANCE = (
 class MaterialNet(nn.Module):
     """Base class of BRDF-Net: the parameters of a BSDF as functions of the domain point, each within its range.
 
-    Derive from it to replace BRDF-Net. A subclass has a method `evaluate`, whose outputs are about 0 at first. The fit
-    calls `set_parameters`.
+    A subclass with a method `evaluate`, whose outputs are about 0 at first, can replace BRDF-Net.
     """
 
     bsdf_parameters: tuple[Parameter, ...]

@@ -21,7 +21,7 @@ SLOPE = 0.01  #: of the leaky ReLU
 
 @contextlib.contextmanager
 def plain_autograd() -> Iterator[None]:
-    """Within it the networks use PyTorch's own operations: slower, but differentiable any number of times.
+    """A context manager in which networks use PyTorch's own operations: slower, but differentiable repeatedly.
 
     It is needed for Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
     """
@@ -58,8 +58,7 @@ class MLP(nn.Module):
     def operands(self, x: Tensor) -> list:
         """The last arguments of `_Evaluate` and of Shape-Net's `_EulerSteps`.
 
-        The encoding, the type of the matrix products, whether gradients are needed, the weights and biases of each
-        layer.
+        The encoding, the type of the matrix products, whether gradients are needed, weights and biases by layer.
         """
         dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # as autocast decides
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]

@@ -81,8 +81,7 @@ class ShapeNet(VelocityField, Flow):
     def flow(self, x: Tensor, steps: int) -> Tensor:
         """`Flow.flow`, with products in bfloat16 under `torch.autocast`.
 
-        It can be differentiated once, by one backward pass; within `mi_ring.nets.mlp.plain_autograd`, any number of
-        times.
+        It can be differentiated once, by one backward pass; within `plain_autograd`, any number of times.
         """
         if _plain.get():
             return super().flow(x, steps)

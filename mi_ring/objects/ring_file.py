@@ -131,8 +131,7 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
 def load_fit(path: str | Path) -> FittedObject:
     """The object of a fit, from its results folder or its `ring.pt`.
 
-    Raises InputError if there is no such file, if a newer or a much older mi_ring wrote it, and if its networks are not
-    registered here.
+    Raises InputError if there is no such file, if its version cannot be read, or if its networks are not registered.
     """
     path = Path(path)
     path = path / "ring.pt" if path.is_dir() else path

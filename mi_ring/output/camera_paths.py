@@ -14,7 +14,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import photographs_in, reason
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError, require_file
-from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.camera import Camera, moved_pose
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions
@@ -137,9 +137,7 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         seen_from, lit_from, time = camera, light, config.time
         if config.turntable:
             turn = Rotation.from_rotvec(2 * np.pi * k / count * up).as_matrix()
-            to_world = camera.to_world.copy()
-            to_world[:3, :3] = turn @ to_world[:3, :3]
-            to_world[:3, 3] = middle + turn @ (camera.position - middle)
+            to_world = moved_pose(camera.to_world, 1.0, turn, middle - turn @ middle)
             around = middle if light.kind == "point" else 0.0
             lit_from = light._replace(vector=around + turn @ (light.vector - around))
             seen_from = camera._replace(to_world=to_world)

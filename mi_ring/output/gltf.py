@@ -46,8 +46,7 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     correlated with height. c ≤ 1 and w ≤ 1 hold where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in a
     hundred does not, the lights' intensities were wrong, and all ρ are scaled.
 
-    ``diffuse`` is exact in glTF, and ``principled`` without its other lobes nearly so. Raises InputError for other
-    BSDFs.
+    ``diffuse`` is exact in glTF, and ``principled`` without other lobes nearly so. Raises InputError for other BSDFs.
     """
     loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")

@@ -17,8 +17,7 @@ def write_mesh(
 ) -> float | None:
     """Write the surface as PLY in scene units, with the BSDF's parameters as vertex attributes (vertex_diffuse, …).
 
-    With `views`, vertex_seen is 1 where a view shows the object and 0 elsewhere; returns the share of the area where no
-    view does.
+    With `views`, vertex_seen is 1 where a view shows the object; returns the share of the area that no view shows.
     """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():

@@ -146,7 +146,7 @@ def interrupted() -> bool:
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """For work that the same command continues after an interruption; prints that when a signal of `SIGNALS` arrives.
+    """A context manager for work that the same command resumes; it prints that when a signal of `SIGNALS` arrives.
 
     Raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
     """

@@ -123,7 +123,7 @@ def quoted(content: bytes) -> list[str]:
 
 @contextlib.contextmanager
 def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
-    """Within it no other process of ours writes into this folder. If one does, raise InputError, or `wait` for it.
+    """A context manager that locks a folder. If another process has the lock, raise InputError or `wait` for it.
 
     The lock file is beside the folder, so that the folder may be moved. The lock ends with the process.
     """

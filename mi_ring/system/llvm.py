@@ -95,8 +95,7 @@ def cure(package: str, more: str = "") -> str:
 def libraries(folders: list[str] | None = None) -> list[tuple[int, str]]:
     """The LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first.
 
-    Default: those of the system, then the private copy. Versions are read from file names: loading several LLVMs into
-    one process is not safe.
+    Default: those of the system, then the private copy. Versions are read from file names, without loading the files.
     """
     if folders is None:
         return libraries(_system_folders()) + libraries([f"{glob.escape(str(PRIVATE))}/**"])

@@ -101,8 +101,7 @@ def pipelined(
 ) -> Iterator[Result]:
     """`second(thing, first(thing))` of each thing. Another thread runs `second` during the next thing's `first`.
 
-    With a single thread of Dr.Jit all runs in this thread: `exr_threads` must not change the number of threads while
-    another thread renders.
+    If Dr.Jit has one thread, all runs in this thread: `exr_threads` must not change their number during rendering.
     """
     if dr.thread_count() < EXR_THREADS:
         for thing in things:
@@ -171,7 +170,7 @@ def computer() -> str:
 
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
-    """Within it torch and Dr.Jit use this number of threads. 0: all `cores`.
+    """A context manager in which torch and Dr.Jit use this number of threads. 0: all `cores`.
 
     Only one thread is deterministic: the order of parallel sums depends on which thread finishes first.
     """
@@ -186,7 +185,7 @@ def threads_of(count: int = 0) -> Iterator[None]:
 
 @contextlib.contextmanager
 def exr_threads() -> Iterator[None]:
-    """Within it Dr.Jit has at least `EXR_THREADS` threads, as Mitsuba needs to read or write an EXR."""
+    """A context manager in which Dr.Jit has the `EXR_THREADS` threads that Mitsuba needs for an EXR, or more."""
     with _exr_lock:  # another thread may have raised the number for a moment
         before = dr.thread_count()
     if before >= EXR_THREADS:

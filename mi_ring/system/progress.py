@@ -18,7 +18,7 @@ DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and 
 
 @contextlib.contextmanager
 def tolerating_closed_output() -> Iterator[None]:
-    """Within it, output that cannot be written is dropped: after `| head`, or when the terminal is closed."""
+    """A context manager that drops output that cannot be written: after `| head`, or if the terminal is closed."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and TolerantStream(stream) for stream in before)  # None: there is no console
     try:
