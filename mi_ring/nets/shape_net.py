@@ -38,7 +38,7 @@ class Flow(nn.Module):
     def flow(self, x: Tensor, steps: int) -> Tensor:
         """Φ(x, steps / T) for points (V, 3): the first `steps` of T Euler steps `x ← x + V(x) / T`."""
         for step in range(steps):
-            x = x + self.velocity_of(step)(x) / self.steps
+            x = x + 1 / self.steps * self.velocity_of(step)(x)
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
