@@ -202,7 +202,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
     taken = posed_pictures(pictures, motion, found, offset, flash)
-    if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
+    if silent := without_exposure([posed.picture for posed in taken if not posed.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
@@ -213,7 +213,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
-        cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
+        cuts = windows([posed.mask for posed in taken], [posed.lens.size for posed in taken])
         written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:

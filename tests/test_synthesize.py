@@ -228,7 +228,7 @@ def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     write_scenes(studio, studio.photographs(30), [], exposure=7.0)
     said, true = (mi_ring.load_capture(out / name, images=False) for name in ("scene.xml", "truth/exact.xml"))
     assert said.photographs.room is None and not said.shots[0].calibrated and true.shots[0].calibrated
-    a, b = ([s.camera.to_world for s in c.sensors] for c in (said, true))
+    a, b = ([s.camera.to_world for s in c.shots] for c in (said, true))
     turns = [Rotation.from_matrix(x[:3, :3] @ y[:3, :3].T).as_rotvec(degrees=True) for x, y in zip(a, b)]
     assert 0.4 < np.std(turns) < 0.6
     distance = np.linalg.norm(np.array(b)[:, :3, 3], axis=1)
