@@ -78,7 +78,7 @@ def watch() -> dict[str, float]:
 
         return run
 
-    for part, cls in (("flow", shape_net._Flow), ("rendering", bridge._Differentiable)):
+    for part, cls in (("flow", shape_net._EulerSteps), ("rendering", bridge._Differentiable)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
     GlobalIllumination.of = timed("rendering", GlobalIllumination.of)
     for cls in (torch.optim.Adam, Muon):

@@ -65,9 +65,9 @@ def iterations(scene: Path, preset: str, settings: dict) -> dict:
     machine.set_threads()
     running = Fit(photographs, config)
     loading, times, parts = time.perf_counter() - started, [], []
-    for k, sensor in enumerate(running.capture.sensors):  # as later in a fit, where what is decoded is remembered
-        if width < sensor.size[0]:
-            running.capture.observe([k], -(-sensor.size[0] // width))
+    for k, shot in enumerate(running.capture.shots):  # as later in a fit, where what is decoded is remembered
+        if width < shot.size[0]:
+            running.capture.observe([k], -(-shot.size[0] // width))
     for _ in range(WARM_UP + ITERATIONS):
         started, already = time.perf_counter(), dict(seconds)
         running.step()

@@ -78,7 +78,7 @@ def layer(level: int) -> str:
 
 def rendering(running: Fit, level: int) -> str:
     """The table of the renderer, of the start surface."""
-    surface, size = running.surface, running.capture.sensors[0].size
+    surface, size = running.surface, running.capture.shots[0].size
     photographs = running.capture.photographs.select(running.capture.sizes[size][:8], size)
     s, faces = running.ring.domain.sample(level)
     surface.show(running.ring, s, faces)

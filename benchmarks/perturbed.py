@@ -19,6 +19,7 @@ import json
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,6 @@ from accuracy import processor, product_speed, scene_file, table, truth_of
 from scipy.spatial.transform import Rotation
 
 import mi_ring
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.scenefile import move_names, recalibrated_xml
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.degradation import miscalibrated
@@ -42,11 +42,13 @@ FITS = {"exact": (False, False), "again": (False, True), "wrong": (True, False),
 def perturbed(capture, wrong: str, by: float, seed: int):
     """The capture with other cameras or lights."""
     center, _ = capture.sphere()
-    cameras, lights = [sensor.camera for sensor in capture.sensors], list(Lights.of(capture.sensors))
     if wrong in CURVES:
-        return with_calibration(capture, cameras, lights, **{CURVES[wrong]: 1 + by / 100})
-    amount = {{"cameras": "turned", "light": "shifted", "power": "scaled"}[wrong]: by}
-    return with_calibration(capture, *miscalibrated(cameras, lights, center, np.random.default_rng(seed), **amount))
+        factor = {CURVES[wrong]: 1 + by / 100}
+        shots = tuple(replace(shot, response=shot.response.changed(**factor)) for shot in capture.shots)
+    else:
+        amount = {{"cameras": "turned", "light": "shifted", "power": "scaled"}[wrong]: by}
+        shots = miscalibrated(capture.shots, center, np.random.default_rng(seed), **amount)
+    return replace(capture, shots=shots)
 
 
 def write(capture, path: Path) -> None:
@@ -54,7 +56,7 @@ def write(capture, path: Path) -> None:
     root = ElementTree.parse(capture.path).getroot()
     move_names(root, capture.path.parent, path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.sensors, capture.photographs.room))
+    path.write_bytes(recalibrated_xml(ElementTree.tostring(root), capture.shots, capture.room))
 
 
 def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list[str]) -> dict:
@@ -76,14 +78,14 @@ def fitted(scene: Path, out: Path, truth: Path, refine: list[str], options: list
 def left(true, found, wrong: str) -> float:
     """What is left of the perturbation: [°] of cameras, [% of the distance] of lights, [%] of powers and curves."""
     center, _ = true.sphere()
-    a, b = ([sensor.camera for sensor in capture.sensors] for capture in (true, found))
+    a, b = ([shot.camera for shot in capture.shots] for capture in (true, found))
     if wrong == "cameras":  # as a whole they may have turned
         turns = Rotation.from_matrix([x.to_world[:3, :3] @ y.to_world[:3, :3].T for x, y in zip(a, b)])
         return float(np.degrees(np.sqrt(np.mean((turns * turns.mean().inv()).magnitude() ** 2))))
     if wrong in CURVES:
-        before, after = (getattr(capture.sensors[0], CURVES[wrong]) for capture in (true, found))
+        before, after = (getattr(capture.shots[0].response, CURVES[wrong]) for capture in (true, found))
         return 100 * (after / before - 1)
-    lights = [Lights.of(capture.sensors) for capture in (true, found)]
+    lights = [Lights.of(capture.shots) for capture in (true, found)]
     if wrong == "light":
         own = [
             np.stack([c.to_world[:3, :3].T @ (p - c.position) for c, p in zip(cameras, light.positions())])

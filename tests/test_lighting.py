@@ -15,7 +15,7 @@ from conftest import photographed_ellipsoid
 import mi_ring
 from mi_ring import export
 from mi_ring.calibration.rig import Rig
-from mi_ring.capture.scenefile import photograph_element
+from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
 from mi_ring.fitting import light_selection, priors
 from mi_ring.fitting.lighting import Lighting, lit, moved
@@ -24,10 +24,8 @@ from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import prediction
-from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, harmonics_in, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, room_envmap, world_harmonics
 from mi_ring.scene.lights import is_room, shared_emitters
-from mi_ring.scene.xml_elements import load_element
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
@@ -97,7 +95,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
     for _ in fit:
         pass
-    gains = np.log([sensor.gain for sensor in fit.calibrated().sensors]), np.log(true)
+    gains = np.log([shot.response.gain for shot in fit.calibrated().shots]), np.log(true)
     off = (gains[0] - gains[0].mean(0)) - (gains[1] - gains[1].mean(0))
     assert np.abs(off).mean() < 0.5 * np.abs(gains[1] - gains[1].mean(0)).mean()
 
@@ -105,7 +103,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     said = re.sub(r'(name="intensity" value=)"0 0 0"', lambda _: '{}"{} {} {}"'.format(_[1], *next(values)), text)
     (exposed / "said.xml").write_text(said)
     told = lit(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
-    np.testing.assert_allclose([sensor.gain for sensor in told.sensors], true / true.mean(0), rtol=1e-5)
+    np.testing.assert_allclose([shot.response.gain for shot in told.shots], true / true.mean(0), rtol=1e-5)
     with pytest.raises(InputError, match="--refine: is power gain, must be without power or without gain"):
         mi_ring.Config(refine=("power", "gain"))
 
@@ -184,7 +182,7 @@ def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environ
     assert again.photographs.room is None and not (tmp_path / "environment.exr").exists()
 
     # Without masks it may be what is seen beside the object.
-    bare = replace(capture, masks=[None] * len(capture))
+    bare = replace(capture, masks=Pixels([None] * len(capture)))
     fit = mi_ring.Fit(bare, mi_ring.Config.preset("fast", **TINY))
     assert fit.problem.environment is None and np.isfinite(fit.step().loss)
     with pytest.raises(InputError, match="--refine power: is of the photographs' own lights, of which there are none"):
@@ -222,16 +220,9 @@ def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_en
         (dark, ("auto",), "capture", ("gain", "ambient")),
     ):
         assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5) == refined
-    exact = [load_element(element) for element in calibrated_elements(dark)]
-    said = lit(replace(dark, sensors=exact), Lighting("environment"))
+    exact = tuple(replace(shot, calibrated=True) for shot in dark.shots)
+    said = lit(replace(dark, shots=exact), Lighting("environment"))
     assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5) == ("ambient",)
-
-
-def calibrated_elements(capture):
-    """The photographs of a capture, which say that they are calibrated."""
-    lights = Lights.of(capture.sensors)
-    return [photograph_element(sensor.id(), str(sensor.filename), sensor.camera, lights[k], calibrated=True)
-            for k, sensor in enumerate(capture.sensors)]  # fmt: skip
 
 
 def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path):
@@ -303,7 +294,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
         schedule = SimpleNamespace(iterations=60)
         harmonics = torch.zeros(BASIS, 3)
         harmonics[:25] = torch.from_numpy(
-            harmonics_in(np.eye(3)) @ np.diag([3.0, 2.0, 1.0]).sum(1, keepdims=True)
+            world_harmonics(np.eye(3)) @ np.diag([3.0, 2.0, 1.0]).sum(1, keepdims=True)
         ).float()
         room = SimpleNamespace(harmonics=harmonics, matrix=torch.eye(BASIS).expand(3, -1, -1))
         model = SimpleNamespace(calibration=SimpleNamespace(room=room))
@@ -357,7 +348,7 @@ def test_a_map_shows_the_radiance_of_harmonics():
     """Of l = 0 the same everywhere; of l = 1 the cosine to an axis."""
     room = np.zeros((BASIS, 3))
     room[0], room[2] = np.sqrt(4 * np.pi) * np.array([1, 2, 3]), np.sqrt(4 * np.pi / 3)  # 1, 2, 3 and z
-    seen = seen_from_within(room, np.eye(4), 16)
+    seen = room_envmap(room, np.eye(4), 16)
     v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
     z = -np.sin(np.pi * v) * np.cos(2 * np.pi * u)
     np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)

@@ -127,7 +127,7 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
     calibration, index = Calibration(capture, ["cameras"], rig), np.array([3, 8])
     weights = {"rgb": 1.0, "mask": 2.0, "calibration": 0.5}
     weights |= {"colours": {"mask": 0.0}, "silhouettes": {"rgb": 0.0}, "both": {}}[kind]
-    width, height = capture.sensors[0].size
+    width, height = capture.shots[0].size
     context = SimpleNamespace(model=SimpleNamespace(calibration=calibration, ring=SimpleNamespace(radius=radius)),
                               config=mi_ring.Config(loss="l2"), exposure=0.3, capture=SimpleNamespace(lit_room=False),
                               schedule=SimpleNamespace(outline_blur=lambda progress, width: 1.5))  # fmt: skip

@@ -51,8 +51,8 @@ def test_what_is_switched_off_changes_nothing_else_that_is_drawn(changes, usual,
 
 def test_each_photograph_comes_before_one_comes_again():
     sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
-    sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
-    capture = SimpleNamespace(sensors=sensors, sizes=sizes)
+    shots = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
+    capture = SimpleNamespace(shots=shots, sizes=sizes)
     sampler = Sampler(SimpleNamespace(capture=capture, fitted=np.arange(12), config=Config(seed=5)))
     drawn: dict = {size: [] for size in sizes}
     for _ in range(60):

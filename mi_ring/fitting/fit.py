@@ -21,6 +21,7 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.optimisation import Optimisation
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.regulariser_strength import RegulariserStrength
+from mi_ring.fitting.renamed import FIT, Renamed
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.result import result_of
 from mi_ring.fitting.sampler import Sampler
@@ -34,13 +35,12 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_of, ring_state
 from mi_ring.output import results
 from mi_ring.output.fit_result import FitResult
-from mi_ring.rendering import prediction
 from mi_ring.system.machine import release_memory
 
 PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: parts of a fit with a state of their own
 
 
-class Fit:
+class Fit(Renamed):
     """A reconstruction in progress. ::
 
         for it in Fit(capture, Config.preset("fast")):
@@ -49,12 +49,13 @@ class Fit:
     `networks`: (Shape-Net, BRDF-Net) to train instead of the paper's, see `Flow` and `MaterialNet`. `terms`: of the
     loss, by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks` are called with
     each `Iteration` when it is done. `lighting`: what `choose_lighting` returned; needed unless the scene's own lights
-    are used. `state`: what `state()` of an interrupted fit returned, to continue it.
-
-    A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand.
+    are used. `state`: what `state()` of an interrupted fit returned, to continue it. A deterministic fit needs
+    `mi_ring.system.machine.set_threads(1)` beforehand.
 
     Raises InputError if capture, settings, terms and networks do not go together.
     """
+
+    RENAMED = FIT
 
     def __init__(
         self, capture: Capture, config: Config | None = None, networks: tuple[Flow, MaterialNet] | None = None,
@@ -165,11 +166,7 @@ class Fit:
         `level`: of the surface. Not to be called from within a term of the loss: the renderer keeps the picture of the
         iteration for its backward pass.
         """
-        capture = self.calibrated()
-        photograph = capture.photograph(k, -(-capture.sensors[k].size[0] // width))
-        rgb, _ = prediction.draw(self.renderer.showing(self.model, level), photograph, spp, shadows=capture.shadows,
-                             indirect=self.ring.indirect)  # fmt: skip
-        return rgb[0].numpy()
+        return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
         """What the results are made of: `mi_ring.output` writes them."""

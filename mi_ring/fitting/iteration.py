@@ -8,20 +8,12 @@ import torch
 from torch import Tensor
 
 from mi_ring.capture.capture import Capture, Observation
+from mi_ring.fitting import renamed
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.renderer import Prediction
 from mi_ring.fitting.sampler import Batch
 from mi_ring.fitting.schedule import Schedule, Stage
-
-#: Names that were used up to version 0.2, with the present ones.
-RENAMED = {
-    "fit": "context", "s": "batch.points", "faces": "batch.faces", "index": "batch.photographs",
-    "everything": "batch.all_photographs", "scale": "batch.scale", "share": "batch", "photographs": "prediction.views",
-    "vertices": "prediction.vertices", "material": "prediction.material", "predicted": "prediction.rgb",
-    "coverage": "prediction.coverage", "observed": "observation.rgb", "clipped": "observation.clipped",
-    "mask": "observation.mask", "masked": "observation.masked", "valid": "observation.valid",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,7 @@ class Context:
 
 
 @dataclass
-class Iteration:
+class Iteration(renamed.Renamed):
     """What an iteration has drawn, observed, predicted and weighed. Keep numbers of it: its pictures use memory."""
 
     batch: Batch
@@ -50,10 +42,7 @@ class Iteration:
     terms: dict[str, float] = field(default_factory=dict)  #: unweighted, by name
     weights: dict[str, float] = field(default_factory=dict)  #: of the terms, in this iteration
 
-    def __getattr__(self, name: str) -> Any:
-        if name in RENAMED:
-            raise AttributeError(f"Iteration.{name} is now Iteration.{RENAMED[name]}")
-        raise AttributeError(f"Iteration has no attribute {name}")
+    RENAMED = renamed.ITERATION
 
     @property
     def number(self) -> int:

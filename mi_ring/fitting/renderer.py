@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.capture.capture import Capture
 from mi_ring.fitting.indirect_average import IndirectAverage
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
@@ -53,6 +55,13 @@ class Renderer:
         if model.calibration:
             model.calibration.relight(self.surface)
         return self.surface
+
+    def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
+        """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
+        photograph = capture.photograph(k, -(-capture.shots[k].size[0] // width))
+        rgb, _ = prediction.draw(self.showing(model, level), photograph, spp, shadows=capture.shadows,
+                                 indirect=model.ring.indirect)  # fmt: skip
+        return rgb[0].numpy()
 
     def predict(self, problem: Problem, model: Model, batch: Batch) -> Prediction:
         """Evaluate the networks at the batch's points and render its photographs (paper, section 3)."""

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import ExifTags
 
 from mi_ring.errors import InputError
-from mi_ring.images import opened
+from mi_ring.images import open_image
 from mi_ring.importers.frames import Frame, Source, called
 from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
 
@@ -23,13 +23,13 @@ class Photogrammetry(Source):
     """Photographs with poses from photogrammetry; formats say where from in `posed`."""
 
     images: Path | None = None
-    """Folder of the photographs. Default: the nearest `images` beside or above SRC, else the folder of SRC."""
+    """Folder of the photographs. Without it: the nearest `images` beside or above SRC, else the folder of SRC."""
     masks: Path | None = None
-    """Folder of masks, each called like its photograph with .png added, as COLMAP's are, or instead of its suffix."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the light from the camera, in the camera's axes (x right, y down, z forward) [scene units]."""
+    """Position of the light relative to the camera: right, down and forward [scene units]."""
     exif: bool = True
-    """Bring the photographs to one scale by the exposure time, ISO and aperture in their EXIF data."""
+    """Bring the photographs to one brightness by exposure time, ISO and aperture of their EXIF data."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
         """Photographs that have a pose, each with its name, by which its mask is called."""
@@ -109,5 +109,5 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
 
 def read_exif(path: Path) -> dict[int, Any]:
     """The part of the EXIF data that is about the exposure."""
-    with opened(path) as image:
+    with open_image(path) as image:
         return image.getexif().get_ifd(ExifTags.IFD.Exif)

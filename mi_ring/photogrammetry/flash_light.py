@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from mi_ring.geometry.hull import evenly
+from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.photogrammetry.marker_sheet import White
-from mi_ring.rendering.photograph_lights import SIDEWAYS
+from mi_ring.rendering.photograph_lights import MIN_FLASH_COSINE
 
 PAPER = 0.8  #: albedo of white paper
 #: Standard deviations of priors: of the flash's place across the lens and along its axis [median distance from the
@@ -72,7 +72,7 @@ def irradiance(way: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff
     It looks `forward` (3,) or (n, 3), and shines like the cosine from there to the power of `falloff`.
     """
     away = np.linalg.norm(way, axis=1)
-    cosine = np.maximum(-(way * forward).sum(1) / away, SIDEWAYS)
+    cosine = np.maximum(-(way * forward).sum(1) / away, MIN_FLASH_COSINE)
     return cosine**falloff * np.maximum(way @ normal, 0) / away**3
 
 
@@ -176,7 +176,7 @@ def shared_light(
     papers: Sequence[Paper], told: Exposures, offset: np.ndarray, ball: Ball | None, curved: bool
 ) -> Shared:  # fmt: skip
     """What is alike in all photographs; the arguments are as `find_flash` has them."""
-    some = evenly(len(papers), MOST)
+    some = evenly_spaced(len(papers), MOST)
     papers, told = [papers[k] for k in some], told.part(some)
     paper = Paper(*(np.concatenate(parts) for parts in zip(*papers)))
     of = np.repeat(np.arange(len(some)), [len(own.places) for own in papers])
