@@ -6,9 +6,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.io
+from helpers.nerf_folders import POINTS, SIZE, H, W, cameras, converted, transforms, write
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
-from scipy.spatial.transform import Rotation
 
 from mi_ring import convert, foreign, images
 from mi_ring.capture import loading
@@ -17,16 +17,7 @@ from mi_ring.importers import colmap as importer
 from mi_ring.rendering import pinhole
 from mi_ring.system import command
 
-SIZE = W, H = 62, 52
 K = np.array([[70.0, 0, 28.5], [0, 76.0, 27.25], [0, 0, 1]])  # fx, fy and the principal point are all different
-POINTS = np.array([5, -8, 110]) + np.random.default_rng(3).uniform(-4, 4, (40, 3))  # in the world [scene units]
-
-
-def cameras(count=3):
-    """World-to-camera rotations and translations, OpenCV's axes, of cameras that see the points."""
-    random = np.random.default_rng(7)
-    for R in Rotation.random(count, rng=random).as_matrix():
-        yield R, np.array([1.0, -2.0, 30.0]) + random.uniform(-1, 1, 3) - R @ POINTS.mean(0)
 
 
 def by_hand(R, t, calibration=K):
@@ -41,17 +32,6 @@ def in_scene(shot):
     x, depth = pinhole.project(mi.Matrix4f(shot.camera.to_world), *lens, mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T
-
-
-def converted(*arguments):
-    """The scene that a conversion writes."""
-    assert convert.main([str(a) for a in arguments]) is None
-    return loading.load_capture(arguments[2])
-
-
-def write(path, pixels):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    mi.Bitmap(np.ascontiguousarray(pixels)).write(str(path))
 
 
 def noise(dtype, channels=3, seed=0, size=SIZE):
@@ -120,17 +100,6 @@ def test_diligent_mv_takes_all_and_fills_holes_if_asked(diligent, tmp_path):
 
 
 # transforms.json
-
-
-def transforms(folder, top, frames, pixels):
-    for frame, (R, t) in zip(frames, cameras()):
-        c2w = np.linalg.inv(np.block([[R, t[:, None]], [0, 0, 0, 1]]))
-        frame["transform_matrix"] = (c2w * [1, -1, -1, 1]).tolist()  # OpenGL: y up, z back
-    for k, frame in enumerate(frames):
-        name = frame["file_path"]
-        write(folder / (name if "." in name[-4:] else f"{name}.png"), pixels(k))
-    (folder / "transforms.json").write_text(json.dumps(top | {"frames": frames}))
-    return folder
 
 
 def test_transforms_of_nerf(tmp_path):

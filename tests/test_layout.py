@@ -170,3 +170,10 @@ def test_long_modules_give_a_reason(module):
 
 def test_top_level_modules_know_their_names():
     assert len(COMMANDS) >= 7 and "fit.py" in COMMANDS
+
+
+def test_no_test_module_imports_another():
+    """What several need is in conftest or in helpers."""
+    found = {path.name: re.findall(r"^\s*(?:from|import) (test_\w+)", path.read_text("utf-8"), re.M)
+             for path in Path(__file__).parent.rglob("*.py")}  # fmt: skip
+    assert len(found) > 60 and not any(found.values())

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 import trimesh
-from test_fit import TABLE
+from helpers.quick_fits import TABLE
 
 from mi_ring import fit
 from mi_ring.fitting.processes import ALONE, Processes, Share
