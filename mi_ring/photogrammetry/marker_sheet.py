@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 from trimesh.registration import procrustes
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import Lens, inverse
+from mi_ring.importers.camera_models import Lens, camera_to_world
 
 COLUMNS, ROWS = 9, 13  #: squares, of which each white one has a marker of MARKER times its size in its middle
 SQUARE, MARKER = 20, 0.75  #: [mm] as it is printed
@@ -160,7 +160,7 @@ def calibrate(
         if fits.all():
             lens = Lens("SIMPLE_RADIAL", size, (K[0, 0], size[0] / 2, size[1] / 2, distortion.ravel()[0]))
             moved = zip(names, turns, shifts)
-            poses = {name: inverse(cv2.Rodrigues(turn)[0], shift.ravel()) for name, turn, shift in moved}
+            poses = {name: camera_to_world(cv2.Rodrigues(turn)[0], shift.ravel()) for name, turn, shift in moved}
             return lens, poses, dict(zip(names, errors.tolist()))
         names = [name for name, fit in zip(names, fits) if fit]
     raise InputError(f"sheet of markers: {len(names)} photographs show enough of it and fit each other; must be 3 or "

@@ -9,7 +9,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import MITSUBA
-from mi_ring.importers.undistortion import Window, distorted, whole
+from mi_ring.importers.undistortion import Window, source_positions
 from mi_ring.photogrammetry.folder import Picture
 
 ROOM = 0.3  #: of the object's size, left around it in the pictures that its outlines are found in
@@ -53,7 +53,7 @@ def reduced(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> V
     small = cv2.resize(rgb[: height * scale, : width * scale], (width, height), interpolation=cv2.INTER_AREA)
     corner = np.array([window.left, window.top]) / scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
-    places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
+    places = ((source_positions(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
     straight = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
     shown = cv2.remap(np.ones((height, width), np.uint8), places[1], places[0], cv2.INTER_NEAREST)
     return View(picture.name, straight, shown > 0, camera)
@@ -61,7 +61,8 @@ def reduced(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> V
 
 def whole_of(lens: Lens, longest: int) -> Window:
     """All of the picture, in so many pixels at most."""
-    return whole(lens, -(-max(lens.size) // longest))
+    scale = -(-max(lens.size) // longest)
+    return Window(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 def around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
@@ -94,6 +95,6 @@ def reduced_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
     small = cv2.resize(mask[: window.height * scale, : window.width * scale], (window.width, window.height),
                        interpolation=cv2.INTER_AREA)  # fmt: skip
     if not lens.is_pinhole:
-        places = ((distorted(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
+        places = ((source_positions(lens, window) + 0.5) / scale - 0.5).astype(np.float32)
         small = cv2.remap(small, places[1], places[0], cv2.INTER_LINEAR)
     return (small > 127).astype(np.uint8)
