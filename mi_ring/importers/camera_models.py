@@ -9,8 +9,10 @@ import numpy as np
 import scipy.linalg
 
 from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
 from mi_ring.system.optional import need
 
+MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: from Mitsuba's camera axes (x left, y up, z forward) to OpenCV's
 MAX_SIDE = 10**6  #: of a photograph [px]
 
 
@@ -58,6 +60,10 @@ class Lens:
             return True
         rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
+
+    def camera(self, pose: np.ndarray) -> Camera:
+        """The camera of the undistorted photograph; `pose` (4, 4) camera-to-world, OpenCV's axes."""
+        return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
 def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:

@@ -17,7 +17,6 @@ from mi_ring.importers.reading import image_size
 from mi_ring.scene.lights import Light
 from mi_ring.system import command
 
-MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: from Mitsuba's camera axes (x left, y up, z forward) to OpenCV's
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right, y up, z back) to OpenCV's
 
 
@@ -44,7 +43,7 @@ class Frame:
     @property
     def camera(self) -> Camera:
         """The camera of the undistorted photograph."""
-        return Camera(self.pose @ MITSUBA, np.array(self.lens.focal), np.array(self.lens.centre), self.lens.size)
+        return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
         """A point light of intensity `rgb`, `offset` from the camera in the camera's axes [scene units]."""

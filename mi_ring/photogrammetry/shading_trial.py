@@ -1,8 +1,9 @@
-"""What the object might be by its shading alone: a short fit without masks, from the sphere of the sparse points."""
+"""Finds the object by its shading alone: a short fit without masks, which starts from a sphere of sparse points."""
 
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from xml.etree.ElementTree import SubElement
 
 import numpy as np
 from PIL import Image
@@ -11,54 +12,54 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.photogrammetry.reduced_photographs import View
+from mi_ring.photogrammetry.reduced_photographs import ReducedView
 from mi_ring.rendering import bridge
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
 
 ITERATIONS = 100
-FEWEST = 30  #: points that tell where the object is
-INNER, OUTER = 0.15, 0.8  #: least and largest radius of the sphere, in the reach of what is looked at
-DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
+MIN_POINTS = 30  #: near the object
+MIN_RADIUS, MAX_RADIUS = 0.15, 0.8  #: of the sphere, relative to the half size of the voxel grid
+#: Mean albedo that the assumed intensity implies if the true one is unknown. It is above 1, so that fits notice.
+ASSUMED_ALBEDO = 3.0
 SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128,), shares=(1,), subdivisions=4,
                          masks="given", domain="sphere", weights={"mask": 0.0})  # fmt: skip
 
 
-def sphere_of(points: np.ndarray, center: np.ndarray, reach: float) -> tuple[np.ndarray, float] | None:
-    """Centre (3,) and radius of a sphere of about the size of what most points (N, 3) near `center` show.
+def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
+    """Centre (3,) and radius of a sphere that holds most of the points (N, 3) near `center`.
 
-    None if there are too few: then nothing may be there.
+    None if there are too few points: there may be no object.
     """
-    near = points[np.linalg.norm(points - center, axis=1) < reach]
-    if len(near) < FEWEST:
+    near = points[np.linalg.norm(points - center, axis=1) < half_size]
+    if len(near) < MIN_POINTS:
         return None
     middle = np.median(near, axis=0)
     radius = float(np.quantile(np.linalg.norm(near - middle, axis=1), 0.8))
-    return middle, float(np.clip(radius, INNER * reach, OUTER * reach))
+    return middle, float(np.clip(radius, MIN_RADIUS * half_size, MAX_RADIUS * half_size))
 
 
-def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """What a surface that explains the photographs covers of each view: (H, W) uint8, 1 the object.
+def shading_silhouettes(
+    views: Sequence[ReducedView], center: np.ndarray, radius: float, progress: Progress
+) -> list[np.ndarray]:
+    """(H, W) uint8 of each view: 1 where it shows the fitted surface, which starts as a sphere.
 
-    The light is taken to be at the lens. The surface starts as a sphere about `center` (3,) with this `radius`.
+    The flash is taken to be at the lens. Raises InputError if the fit diverges.
     """
-    away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
-    level = float(np.median([view.linear[view.shown].mean() for view in views]))
-    intensity = np.full(3, np.pi * level / DIM * away**2)
+    distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
+    level = float(np.median([view.linear[view.valid].mean() for view in views]))
+    intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)
     with tempfile.TemporaryDirectory() as name:
         folder, elements = Path(name), []
         for k, view in enumerate(views):
             Image.fromarray(view.rgb).save(folder / f"{k}.png")
-            Image.fromarray(view.shown.astype(np.uint8) * 255).save(folder / f"{k}.valid.png")
+            Image.fromarray(view.valid.astype(np.uint8) * 255).save(folder / f"{k}.valid.png")
             light = Light("point", view.camera.position, intensity)
             elements.append(photograph_element(f"{k}", f"{k}.png", view.camera, light, valid=f"{k}.valid.png"))
         scene = scene_element(elements)
         shape = next(scene.iter("shape"))
-        for tag, name, value in (("point", "center", center), ("float", "radius", radius)):
-            element = shape.makeelement(tag, {"name": name})
-            numbers = np.ravel(value)
-            element.attrib.update(zip("xyz", map(str, numbers)) if tag == "point" else {"value": str(numbers[0])})
-            shape.append(element)
+        SubElement(shape, "point", {"name": "center", **dict(zip("xyz", map(str, center)))})
+        SubElement(shape, "float", name="radius", value=str(radius))
         (folder / "scene.xml").write_bytes(scene_bytes(scene))
         capture = load_capture(folder / "scene.xml")
         fit = Fit(capture, SETTINGS)
