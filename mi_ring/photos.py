@@ -18,7 +18,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
-from mi_ring.photogrammetry.capture_files import crop_windows, write_photograph, write_table
+from mi_ring.photogrammetry.capture_files import crop_windows, write_posed_picture, write_table
 from mi_ring.photogrammetry.flash_light import FlashCalibration
 from mi_ring.photogrammetry.folder import (
     TRANSPARENT,
@@ -27,20 +27,20 @@ from mi_ring.photogrammetry.folder import (
     up_directions,
     without_exposure,
     without_flash,
-)  # fmt: skip
+)
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
 from mi_ring.photogrammetry.object_masks import SegmentationInput, SegmentedObject, find_object, require_half
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.photogrammetry.workflow import (
-    calibrated_photographs,
     find_cameras,
     find_sheet,
     flash_from_sheet,
     make_upright,
+    posed_pictures,
     require_parallax,
     require_same_photographs,
-)  # fmt: skip
+)
 from mi_ring.rendering.spherical_harmonics import COUNT
 from mi_ring.system import command
 from mi_ring.system.files import locked, write_file
@@ -214,7 +214,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not flash and not offset.any() and len({picture.camera_orientation for picture in pictures}) > 1:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
-    taken = calibrated_photographs(pictures, sparse, found, offset, flash)
+    taken = posed_pictures(pictures, sparse, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
@@ -226,7 +226,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
         cuts = crop_windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
-        written = in_threads(partial(write_photograph, writer), taken, cuts)
+        written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
             root.extend(write_table(writer, taken, plane, found.center, flash))

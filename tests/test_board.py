@@ -17,10 +17,10 @@ from mi_ring.photogrammetry.marker_sheet import (
     MarkerSheet,
     SheetDetection,
     align,
-    calibrate_cameras,
+    calibrate,
     page,
     sample_paper,
-)  # fmt: skip
+)
 
 MIDDLE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 300.0, 210.0, -0.06))
 ASIDE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 313.0, 201.0, -0.06))
@@ -164,7 +164,7 @@ def test_the_sheet_alone_gives_the_cameras():
     ids, points, pixels = sightings["03"]
     bent = pixels + 30 * np.sin(pixels[:, ::-1] / 40)  # of a sheet that is not flat
     sightings["03"] = SheetDetection(ids, points, bent)
-    lens, found, errors = calibrate_cameras(sightings, MIDDLE.size)
+    lens, found, errors = calibrate(sightings, MIDDLE.size)
     assert found.keys() == errors.keys() == sightings.keys() - {"03"} and max(errors.values()) < 0.2
     assert lens.model == "SIMPLE_RADIAL" and lens.centre == (300, 210)
     assert lens.focal[0] == pytest.approx(640, rel=0.005)
@@ -179,7 +179,7 @@ def test_the_sheet_alone_gives_the_cameras():
 def test_two_photographs_are_too_few(aside):
     two = dict(list(aside[1].items())[:2])
     with pytest.raises(InputError, match="2 photographs show enough"):
-        calibrate_cameras(two, ASIDE.size)
+        calibrate(two, ASIDE.size)
 
 
 def moved(cameras, scale, rotation, shift):

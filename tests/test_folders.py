@@ -32,11 +32,11 @@ from mi_ring.photogrammetry.folder import (
     turn_with_cameras,
     up_directions,
     without_flash,
-)  # fmt: skip
+)
 from mi_ring.photogrammetry.matching import static_share
 from mi_ring.photogrammetry.object_masks import SegmentedObject
 from mi_ring.photogrammetry.structure_from_motion import SparseModel, structure_from_motion
-from mi_ring.photogrammetry.workflow import calibrated_photographs, imported_cameras, require_same_photographs
+from mi_ring.photogrammetry.workflow import imported_cameras, posed_pictures, require_same_photographs
 from mi_ring.system.progress import progress
 
 pty = pytest.importorskip("pty")  # not on Windows
@@ -307,16 +307,14 @@ def test_lights_are_those_that_the_sheet_tells(tmp_path):
     motion = SparseModel({name: (LENS, pose) for name, (pose, _) in poses.items()}, np.zeros((0, 3)), None, {})
     flash = FlashCalibration(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), 1.2, np.array([9.0, 8, 7]),
                   {"0": np.array([4.0, 4, 4]), "1": np.array([9.0, 8, 8]), "2": np.array([9.0, 9, 9])})  # fmt: skip
-    taken = calibrated_photographs(pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
+    taken = posed_pictures(pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
     for one, (pose, axes) in zip(taken, poses.values()):
         np.testing.assert_allclose(one.light.vector, pose[:3, :3] @ axes @ flash.offset + pose[:3, 3])
         assert (one.falloff, one.gamma) == (1.5, 1.2)
     assert [one.measured for one in taken] == [True, True, True, False]
     np.testing.assert_allclose(taken[2].light.rgb, 9)
     np.testing.assert_allclose(taken[3].light.rgb, 2 * flash.power)  # 0.02 s are usual
-    alone = calibrated_photographs(
-        pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.array([3.0, 0, 0]), None
-    )
+    alone = posed_pictures(pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.array([3.0, 0, 0]), None)
     np.testing.assert_allclose(alone[0].light.vector, poses["0"][0][:3, 0] * 3 + poses["0"][0][:3, 3])
     assert not any(one.measured for one in alone) and alone[0].falloff == 0
 

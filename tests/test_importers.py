@@ -293,7 +293,7 @@ def test_the_dinosaur_of_middlebury_fills_the_box_of_its_readme(shared):
         bright = ndimage.binary_erosion(ndimage.binary_dilation(bright, iterations=10), iterations=7, border_value=1)
         x = (grid - frame.pose[:3, 3]) @ frame.pose[:3, :3]
         u, v = np.floor(x[:, :2] / x[:, 2:] * frame.lens.focal + frame.lens.centre).astype(int).T
-        seen = (u >= 0) & (u < frame.size[0]) & (v >= 0) & (v < frame.size[1])
+        seen = (u >= 0) & (u < frame.lens.size[0]) & (v >= 0) & (v < frame.lens.size[1])
         inside[seen] &= bright[v[seen], u[seen]]
         views += seen
     parts, _ = ndimage.label((inside & (views >= 12)).reshape(3 * [steps]))  # corners that few cameras see remain

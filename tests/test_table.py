@@ -10,7 +10,7 @@ from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
-from mi_ring.photogrammetry.capture_files import OBJECT, CalibratedPhotograph, write_table
+from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, write_table
 from mi_ring.photogrammetry.flash_light import FlashCalibration
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
@@ -178,7 +178,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
     for k, (pose, flash, srgb, mask) in enumerate(photographs_of_a_table()):
         write_image(srgb, tmp_path / f"{k}.png")
         light = flash._replace(rgb=brightness * flash.rgb)
-        shots.append(CalibratedPhotograph(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
+        shots.append(PosedPicture(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
     writer = Writer(tmp_path / "capture/scene.xml")
     root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))

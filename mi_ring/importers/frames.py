@@ -36,11 +36,6 @@ class Frame:
     fill_mask: bool = False  #: fill the holes in the mask
 
     @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]"""
-        return self.lens.size
-
-    @property
     def camera(self) -> Camera:
         """The camera of the undistorted photograph."""
         return self.lens.camera(self.pose)
@@ -54,10 +49,8 @@ def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
     """The file of this name, whatever the folders and the suffixes of both are; None if there is none."""
     name = PureWindowsPath(name).name
     stem = PureWindowsPath(name).stem
-    for file in sorted(files, key=lambda file: (file.name != name, file.stem != name)):
-        if file.name == name or file.stem in (name, stem):
-            return file
-    return None
+    found = [file for file in files if file.name == name or file.stem in (name, stem)]
+    return min(found, key=lambda file: (file.name != name, file.stem != name), default=None)
 
 
 @dataclass(frozen=True)
@@ -104,8 +97,9 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
     require_cameras(frames)
     for frame in frames:
         for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
-            if file and (size := image_size(file)) != frame.size:
-                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *size, *frame.size))
+            if file and (size := image_size(file)) != frame.lens.size:
+                sizes = *size, *frame.lens.size
+                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *sizes))
 
 
 def require_cameras(frames: Sequence[Frame]) -> None:

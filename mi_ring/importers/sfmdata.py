@@ -55,7 +55,9 @@ class SfmData(Photogrammetry):
             pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
             pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
             key = str(view.get("intrinsicId"))
-            lens = alicevision_lens(intrinsics_of(intrinsics, key, what), version, f"{self.src}: intrinsic {key!r}")
+            if key not in intrinsics:
+                raise InputError(f"{what}: intrinsics {key!r}: there are none")
+            lens = alicevision_lens(intrinsics[key], version, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
@@ -79,9 +81,10 @@ class SfmData(Photogrammetry):
             R = matrix(pose.get("rotation"), (3, 3), f"{what}: extrinsics.rotation")
             center = matrix(pose.get("center"), (3,), f"{what}: extrinsics.center")
             key = str(view.get("id_intrinsic"))
-            intrinsic = intrinsics_of(intrinsics, key, what)
-            kind = types.get(type_number(intrinsic["value"], self.src))
-            lens = openmvg_lens(pointed_to(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
+            if key not in intrinsics:
+                raise InputError(f"{what}: intrinsics {key!r}: there are none")
+            kind = types.get(type_number(intrinsics[key]["value"], self.src))
+            lens = openmvg_lens(pointed_to(intrinsics[key], what), kind, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
@@ -104,13 +107,6 @@ def require_object(value: Any, what: str) -> dict:
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
-
-
-def intrinsics_of(intrinsics: dict[str, Any], key: str, what: str) -> dict:
-    """The intrinsics of this key. Raises InputError if there are none."""
-    if key not in intrinsics:
-        raise InputError(f"{what}: intrinsics {key!r}: there are none")
-    return intrinsics[key]
 
 
 def file_name(view: dict, field: str, what: str) -> str:

@@ -51,14 +51,12 @@ class Transforms(Source):
             elif has_alpha(image):
                 frame.mask = image
             intensity = np.ones(3)
-            if own.get("pl_intensity") is not None:
-                rgb = own["pl_intensity"]
+            if (rgb := own.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
                 intensity = matrix(rgb, (3,), f"{path}: {where}.pl_intensity")
                 frame.light = frame.at_camera(intensity)
-            if own.get("pl_pos") is not None:
-                position = matrix(own["pl_pos"], (3,), f"{path}: {where}.pl_pos")
-                frame.light = Light("point", position, intensity)
+            if (position := own.get("pl_pos")) is not None:
+                frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
 
 

@@ -10,13 +10,6 @@ from mi_ring.images import linear_to_srgb, srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 
 
-class Undistorted(NamedTuple):
-    """A picture as a camera without distortion would take it: same size, focal lengths and principal point."""
-
-    pixels: np.ndarray  #: (H, W, C), in the source's type
-    valid: np.ndarray  #: (H, W) bool: does the source show this pixel? Elsewhere pixels are 0
-
-
 class Window(NamedTuple):
     """A part of the undistorted picture, perhaps reduced."""
 
@@ -24,7 +17,13 @@ class Window(NamedTuple):
     top: int
     width: int  #: after the reduction [px]
     height: int
-    scale: int = 1  #: the reduction: so many pixels of the picture are one pixel of the window, across
+    scale: int = 1  #: of the reduction: pixels of the picture along a pixel of the window
+
+    @classmethod
+    def whole(cls, lens: Lens, longest: int) -> "Window":
+        """The whole picture, reduced to `longest` pixels along at most."""
+        scale = -(-max(lens.size) // longest)
+        return cls(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 @lru_cache(maxsize=1)
@@ -43,12 +42,13 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
 
 def undistort(
     pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
-) -> Undistorted:
-    """Resample a picture (H, W, C) linearly in radiance.
+) -> tuple[np.ndarray, np.ndarray]:
+    """A picture (H, W, C) as a pinhole of the same size and intrinsics takes it, and does the source show it? (H, W)
 
+    Radiance is interpolated. Pixels that the source does not show are 0.
     `srgb`: are the first three channels sRGB-encoded? `saturation`: encoded value (1 = full scale) from which a pixel
-    is clipped; np.inf for masks. Every result that a clipped pixel contributes to is clipped, too: a mean of clipped
-    and other values would pass for exact. `window`: the part to compute, of scale 1; by default all.
+    is clipped; infinite for masks. A result with a clipped pixel in it is clipped, too: their mean would pass for
+    exact. `window`: the part to compute, of scale 1; by default all.
     """
     positions = source_positions(lens, window or Window(0, 0, *lens.size))
     size = np.array(pixels.shape[:2])
@@ -72,4 +72,4 @@ def undistort(
     result = np.stack(channels, -1)
     if pixels.dtype != np.float32:
         result = np.clip(result * full + 0.5, 0, full)
-    return Undistorted(result.astype(pixels.dtype), valid)
+    return result.astype(pixels.dtype), valid

@@ -122,6 +122,6 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
         mask = pixels_of(file)
         if frame.fill_mask:
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
-        return mask if straight else undistort(mask, frame.lens, saturation=np.inf).pixels
+        return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]
 
     return Files(image, place_once("masks", (file, frame.lens), file, mask), valid)

@@ -1,10 +1,10 @@
 """Masks without user input: a first guess, then GrabCut in each photograph and a vote of all masks on voxels, in turn.
 
-The vote keeps a voxel if most photographs that show it have it in their mask. Lamps, highlights and neighbours of the
-object in single photographs drop out. GrabCut then refines the outline, which the voxels know only coarsely. If some
-masks fill a concavity, because of a shadow for instance, a few others that see through it empty it.
+The vote keeps a voxel if most photographs that show it have it in their mask. So lamps, highlights and neighbours of
+the object drop out of single masks, and concavities are emptied that some masks fill, for instance with a shadow.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,12 +21,13 @@ from mi_ring.photogrammetry.reduced_photographs import ReducedView
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
+Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, 1 the object
 MIN_VISIBLE = 0.25  #: share of the photographs that must show a voxel of the object
 MIN_AGREEMENT = 0.9  #: share of those that must have the voxel in their mask
 RESOLUTION = 96  #: voxels along an edge of the grid
 MIN_VOXELS = 30  #: of an object: a few voxels get a unanimous vote by chance
 CONVERGED = 0.995  #: overlap of the masks with those of the iteration before
-MAX_MISSING, MISSING_OFFSET = 2.0, 0.01  #: a mask is an outlier if it misses more than this times the median and offset
+MAX_MISSING, OFFSET = 2.0, 0.01  #: an outlier misses more of the silhouette than this times the median, plus offset
 MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
@@ -69,10 +70,6 @@ class VoxelObject:
         distance = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
         return float(self.spacing * view.camera.focal.mean() / distance)
 
-    def dilated(self, view: ReducedView, silhouette: np.ndarray) -> np.ndarray:
-        """The silhouette (H, W) grown by its uncertainty, a voxel."""
-        return cv2.dilate(silhouette, disk(self.voxel_pixels(view)))
-
 
 class VoxelGrid:
     """A cube of voxels, `half_size` from `center` (3,) to each side, and the views that see it."""
@@ -104,21 +101,19 @@ class VoxelGrid:
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
-    def vote(
-        self, masks: Sequence[np.ndarray], agreement: float, voters: Sequence[bool] | None = None
-    ) -> VoxelObject | None:
-        """The largest connected piece of voxels that this share of the masks (H, W) contains; None if it is too small.
+    def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
+        """The largest connected piece of voxels in this share of the masks (H, W), or in those of some `voters`.
 
-        `voters`: which masks count; by default all.
+        None if it is too small.
         """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 
-        def contained(view: ReducedView, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def look(view: ReducedView, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             row, column, inside = view.project(self.points)
             return inside, inside & (mask[row, column] > 0)
 
-        voting = [k for k in range(len(masks)) if voters is None or voters[k]]
-        for inside, within in in_threads(contained, [self.views[k] for k in voting], [masks[k] for k in voting]):
+        pairs = itertools.compress(zip(self.views, masks), voters or itertools.repeat(True))
+        for inside, within in in_threads(look, *zip(*pairs)):
             shown += inside
             yes += within
         chosen = (yes >= agreement * shown) & (shown >= MIN_VISIBLE * len(self.views)) & self.allowed
@@ -141,38 +136,29 @@ def bright_mask(view: ReducedView) -> np.ndarray:
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def are_complete(
-    views: Sequence[ReducedView], masks: Sequence[np.ndarray], silhouettes: Sequence[np.ndarray]
-) -> list[bool]:
-    """Which masks do not miss much more of the common silhouette (H, W each) than the others, as a lamp causes."""
+def are_complete(views: Sequence[ReducedView], masks: Masks, silhouettes: Masks) -> list[bool]:
+    """Which masks miss about as much of the common silhouette (H, W each) as the others? Lamps make them miss more."""
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
         for view, mask, silhouette in zip(views, masks, silhouettes)
     ]
-    return [share <= MAX_MISSING * np.median(missing) + MISSING_OFFSET for share in missing]
+    return [share <= MAX_MISSING * np.median(missing) + OFFSET for share in missing]
 
 
-@dataclass(frozen=True)
-class Segmentation:
+class Segmentation(NamedTuple):
     """The object and its masks in all views."""
 
     masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
-    found: VoxelObject
+    object: VoxelObject
     agreement: list[float]  #: of each mask with the common silhouette, intersection over union
-
-    @property
-    def quality(self) -> float:
-        """The agreement that four of five masks reach."""
-        return float(np.quantile(self.agreement, 0.2))
 
 
 def refine_masks(
-    grid: VoxelGrid, guesses: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], progress: Progress,
-    settings: RefinementSettings = LOCATION,
+    grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Masks from first guesses (H, W): votes and GrabCut in turn, until the masks converge.
+    """Masks from first guesses (H, W), by votes and GrabCut in turn; None if the guesses have no object in common.
 
-    `backgrounds` (H, W): above 0 where the object certainly is not. None if the guesses have no object in common.
+    `backgrounds` (H, W): above 0 where the object certainly is not.
     """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -187,7 +173,7 @@ def refine_masks(
         if (found := grid.vote(masks, settings.agreement, voters)) is None:
             break
         silhouettes = [found.silhouette(view) for view in grid.views]
-        masks = [mask & found.dilated(view, s) for mask, view, s in zip(masks, grid.views, silhouettes)]
+        masks = [m & cv2.dilate(s, disk(found.voxel_pixels(v))) for m, v, s in zip(masks, grid.views, silhouettes)]
         if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > CONVERGED:
             break
     agreement = [overlap(mask, silhouette) for mask, silhouette in zip(masks, silhouettes)]
@@ -206,10 +192,7 @@ def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) 
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 on pieces of the guess that touch the mask and are not in it, such as a rod or a lamp.
-
-    They may hide the object or be behind it.
-    """
+    """(H, W) uint8: 1 on pieces of the guess that touch the mask, such as a rod, which may hide the object or not."""
     pieces, _ = ndimage.label((guess > 0) & (mask == 0))
     touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
     return np.isin(pieces, touching[touching > 0]).astype(np.uint8)

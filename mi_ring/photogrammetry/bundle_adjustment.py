@@ -12,9 +12,10 @@ from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.marker_sheet import SheetDetection, triangulate
 from mi_ring.photogrammetry.matching import grey_file
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
+pycolmap = LazyPackage("pycolmap", "structure from motion")
 ROBUST = 0.5  #: residual beyond which an observation counts less [px]: highlights and shadows move with the flash
 DETERMINED = 1e-3  #: standard deviation of a principal point, as a share of the picture's longer side, to accept it
 CORNER_WEIGHT = 12  #: a corner of the sheet counts like so many features, because it is found more precisely
@@ -26,19 +27,16 @@ ITERATIONS = 10  #: of the solver per call: pycolmap cannot be interrupted in a 
 def adjust(
     model: Any, pictures: Sequence[Picture], detections: Mapping[str, SheetDetection], progress: Progress
 ) -> Any:
-    """The model after bundle adjustment with the corners of the sheet, or without them if features contradict them.
+    """The model after bundle adjustment with the sheet's corners, or without if features contradict them.
 
-    They do if the object was moved on its sheet, or with the sheet.
+    They do if the object was moved on the sheet.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
     model.tear_down()  # covariances are refused if an image has no pose
-    for _ in progress(robust_adjustment(model), "bundle adjustment"):
-        pass
+    list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
     if not (corners := add_corners(held, pictures, detections)):
         return refine_principal_points(model, progress)
-    for _ in progress(robust_adjustment(held), "bundle adjustment by the sheet"):
-        pass
+    list(progress(robust_adjustment(held), "bundle adjustment by the sheet"))
     held = refine_principal_points(held, progress)
     for corner in filter(held.exists_point3D, corners):
         held.delete_point3D(corner)
@@ -53,7 +51,6 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Mapping[str
 
     Where the sheet is seen at a low angle, features are few and many are wrong.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
         if detection := detections.get(picture.name):
@@ -76,7 +73,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
     Features on highlights and on the flash's shadows move with the camera. They match but are wrong, and plain least
     squares would bend all cameras after them.
     """
-    observations = need("pycolmap", "bundle adjustment").ObservationManager(model)
+    observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
@@ -85,7 +82,6 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
     """Options of a bundle adjustment with a robust loss, and its configuration with all of a model."""
-    pycolmap = need("pycolmap", "bundle adjustment")
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -99,7 +95,6 @@ def adjustment_problem(model: Any) -> tuple[Any, Any]:
 
 def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
     """Run the solver so many times, or until it converges; yields before each call."""
-    pycolmap = need("pycolmap", "bundle adjustment")
     for _ in range(calls):
         yield
         summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -112,7 +107,6 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
     A long lens hardly determines it, because a shift of the picture resembles a turn of the camera.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -121,8 +115,7 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
         options.refine_principal_point = True
         for k in fixed:
             config.set_constant_cam_intrinsics(k)
-        for _ in progress(solve(refined, options, config, 3), "principal points"):
-            pass
+        list(progress(solve(refined, options, config, 3), "principal points"))
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, refined)
         covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), refined, adjuster)
         undetermined = {k for k in lenses - fixed if not is_determined(refined.cameras[k], covariance)}

@@ -14,7 +14,7 @@ from mi_ring.importers.undistortion import Window, undistort
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry.flash_light import FlashCalibration
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph, whole_window
+from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.scene.lights import Light
 from mi_ring.system.machine import in_threads
@@ -27,8 +27,8 @@ OBJECT, UNKNOWN = 255, 128  #: values of masks; 0 is the background
 
 
 @dataclass(frozen=True)
-class CalibratedPhotograph:
-    """A photograph with all that the scene file says of it."""
+class PosedPicture:
+    """A photograph with its calibration, from which it is written."""
 
     picture: Picture
     lens: Lens
@@ -57,15 +57,15 @@ def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, 
     return windows
 
 
-def write_photograph(writer: Writer, shot: CalibratedPhotograph, window: Window) -> Element:
+def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> Element:
     """Write the files of a photograph. Returns its element of the scene file."""
-    picture = shot.picture
+    picture = posed.picture
     pixels = picture.pixels[..., :3]
     left, top, width, height = window[:4]
-    if shot.lens.is_pinhole:
+    if posed.lens.is_pinhole:
         crop, shown = pixels[top : top + height, left : left + width], np.ones((height, width), bool)
     else:
-        crop, shown = undistort(pixels, shot.lens, picture.encoding == "srgb", window=window)
+        crop, shown = undistort(pixels, posed.lens, picture.encoding == "srgb", window=window)
     picture.close()
 
     def write_binary(folder: str, mask: np.ndarray) -> str:
@@ -74,37 +74,37 @@ def write_photograph(writer: Writer, shot: CalibratedPhotograph, window: Window)
     filename = writer.relative(writer.image(f"images/{picture.name}", crop))
     encoding = picture.encoding if crop.dtype == np.uint16 else None
     mask = None
-    if shot.mask is not None:
-        values = crop_mask(shot.mask, shot.lens.size, window)
+    if posed.mask is not None:
+        values = crop_mask(posed.mask, posed.lens.size, window)
         shown = shown & (values != UNKNOWN)
         mask = write_binary("masks", values == OBJECT)
     valid = None if shown.all() else write_binary("valid", shown)
-    camera = shot.lens.camera(shot.pose)
+    camera = posed.lens.camera(posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
-    return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid,
-                              gamma=shot.gamma, falloff=shot.falloff)  # fmt: skip
+    return photograph_element(picture.name, filename, camera, posed.light, mask, encoding, valid=valid,
+                              gamma=posed.gamma, falloff=posed.falloff)  # fmt: skip
 
 
 def write_table(
-    writer: Writer, shots: Sequence[CalibratedPhotograph], plane: Plane, center: np.ndarray, flash: FlashCalibration
+    writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: FlashCalibration
 ) -> list[Element]:
     """Write the picture of the table's albedo around the object at `center` (3,). Returns the `table` element.
 
     The table is in the scene because it reflects light onto the object. Returns no element if no photograph shows it.
     """
 
-    def observe(shot: CalibratedPhotograph) -> tuple[ReducedView, np.ndarray, Light]:
-        view = reduce_photograph(shot.picture, shot.lens, shot.pose, whole_window(shot.lens, TABLE_PIXELS))
+    def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
+        view = reduce_photograph(posed.picture, posed.lens, posed.pose, Window.whole(posed.lens, TABLE_PIXELS))
         # Views of raw photographs are scaled to their white. The light must be scaled alike.
-        white = shot.picture.white if shot.picture.encoding == "linear" else 1.0
-        light = shot.light._replace(rgb=shot.light.rgb / white)
-        shot.picture.close()
-        if shot.mask is None:  # the object may be anywhere
+        white = posed.picture.white if posed.picture.encoding == "linear" else 1.0
+        light = posed.light._replace(rgb=posed.light.rgb / white)
+        posed.picture.close()
+        if posed.mask is None:  # the object may be anywhere
             return view, np.ones(view.valid.shape, np.uint8), light
-        mask = cv2.resize((shot.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
+        mask = cv2.resize((posed.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
         return view, grown(mask, MARGIN), light
 
-    views, hidden, lights = zip(*in_threads(observe, shots))
+    views, hidden, lights = zip(*in_threads(observe, pictures))
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     texels = TexelGrid(plane, center, TABLE_HALF_SIZE * distance, TABLE_TEXELS)
     albedo = estimate_albedo(views, lights, hidden, texels, flash)

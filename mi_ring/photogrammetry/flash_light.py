@@ -1,4 +1,4 @@
-"""Calibrates the flash and the room's light from the brightness of the printed sheet's white paper in photographs."""
+"""Calibrates the flash and the room's light by the brightness of the printed sheet's white paper in photographs."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -82,17 +82,8 @@ class Observations(NamedTuple):
     points: np.ndarray  #: (n, 3)
     colours: np.ndarray  #: (n, 3) logarithms
     in_margin: np.ndarray  #: (n,) bool, as `PaperSamples` has it
-    positions: np.ndarray  #: (n, 3) of the cameras
-    forward: np.ndarray  #: (n, 3) where the cameras look
+    poses: np.ndarray  #: (n, 4, 4) of the cameras
     axes: np.ndarray  #: (n, 3, 3) from the axes of the flash's offset to the world's
-
-    @classmethod
-    def of(cls, paper: PaperSamples, pose: np.ndarray, axes: np.ndarray) -> "Observations":
-        """Those of one photograph, with its pose (4, 4)."""
-        camera = (pose[:3, 3], pose[:3, 2], pose[:3, :3] @ axes)
-        colours = np.log(np.maximum(paper.colours, MIN_RADIANCE))
-        return cls(paper.points, colours, paper.in_margin,
-                   *(np.repeat(part[None], len(colours), 0) for part in camera))  # fmt: skip
 
 
 class FlashParameters(NamedTuple):
@@ -107,9 +98,8 @@ class FlashParameters(NamedTuple):
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
         """(n, 3) log intensities of the flash, by each sample alone."""
-        to_light = seen.positions + seen.axes @ self.offset - seen.points
-        light = irradiance(to_light, np.array([0.0, 0, 1]), seen.forward, self.falloff)[:, None]
-        room = self.room
+        to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
+        light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
         if sphere:
             light = light + self.reflectance * sphere.reflected(seen.points, to_light + seen.points)[:, None]
             room = room * (1 - sphere.form_factor(seen.points))[:, None]
@@ -124,36 +114,38 @@ def calibrate_flash(
 
     By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), from the axes of most photographs to its own;
     relative `exposures`, NaN if unknown. `offset` (3,): guess of the flash's position. `sphere`: the object. `curved`:
-    may the camera's response be a power other than 1?
+    may the response be other than linear?
 
-    Robust least squares of log brightness, with the priors above. The unknowns are the `FlashParameters` and each
-    photograph's intensity. How brightness falls off over the paper and between photographs tells them apart. The margin
-    takes part only if it is as bright as the squares, the response only if it is far from linear.
+    By robust least squares of log brightness with the priors above, for the `FlashParameters` and each photograph's
+    intensity. The margin is used only if it is as bright as the squares, the response only if it is far from linear.
     """
     names = [n for n in papers if n in poses and not papers[n].in_margin.all() and poses[n][2, 3] > 0]
     if not names:
         return None
-    whole = [Observations.of(papers[name], poses[name], axes[name]) for name in names]
+    whole = []
+    for name in names:
+        paper, pose = papers[name], poses[name]
+        colours = np.log(np.maximum(paper.colours, MIN_RADIANCE))
+        camera = [np.repeat(matrix[None], len(colours), 0) for matrix in (pose, pose[:3, :3] @ axes[name])]
+        whole.append(Observations(paper.points, colours, paper.in_margin, *camera))
     squares = [Observations(*(part[~seen.in_margin] for part in seen)) for seen in whole]
     known = np.array([exposures[name] for name in names])
     prior = np.log(np.where(np.isfinite(known), known, 1.0)), np.where(np.isfinite(known), EXIF, NO_EXIF)
 
-    def fit(seen: Sequence[Observations], curved: bool) -> tuple[FlashParameters, np.ndarray]:
-        parameters = fit_parameters(seen, prior, offset, sphere, curved)
-        return parameters, fit_intensities(seen, prior, parameters, sphere)
-
-    seen, (parameters, strengths) = squares, fit(squares, curved)
-    margin = np.concatenate([(parameters.intensities(own, sphere) - strength)[own.in_margin]
-                             for own, strength in zip(whole, strengths)])  # fmt: skip
+    seen, parameters = squares, fit_parameters(squares, prior, offset, sphere, curved)
+    intensities = fit_intensities(squares, prior, parameters, sphere)
+    margin = np.concatenate([(parameters.intensities(own, sphere) - intensity)[own.in_margin]
+                             for own, intensity in zip(whole, intensities)])  # fmt: skip
     if len(margin) and np.abs(np.median(margin, 0)).max() < OTHER_MATERIAL:
-        seen, (parameters, strengths) = whole, fit(whole, curved)
+        seen, parameters = whole, fit_parameters(whole, prior, offset, sphere, curved)
     if curved and abs(np.log(parameters.gamma)) < NO_RESPONSE:
-        parameters, strengths = fit(seen, False)
+        parameters = fit_parameters(seen, prior, offset, sphere, curved=False)
+    intensities = np.exp(fit_intensities(seen, prior, parameters, sphere))
     distance = np.median([np.linalg.norm(poses[name][:3, 3]) for name in names])
     room = parameters.room if (parameters.room * distance**2).max() > NO_ROOM else 0 * parameters.room
     falloff = parameters.falloff if parameters.falloff > NO_CONE else 0.0
-    intensities = dict(zip(names, np.exp(strengths)))
-    return FlashCalibration(parameters.offset, falloff, room, parameters.gamma, np.exp(parameters.power), intensities)
+    return FlashCalibration(parameters.offset, falloff, room, parameters.gamma, np.exp(parameters.power),
+                            dict(zip(names, intensities)))  # fmt: skip
 
 
 def fit_parameters(
@@ -168,7 +160,7 @@ def fit_parameters(
     exposures, deviations = (part[some, None] for part in prior)
     seen = Observations(*(np.concatenate(parts) for parts in zip(*(observations[k] for k in some))))
     index = np.repeat(np.arange(len(some)), [len(observations[k].points) for k in some])
-    unit = float(np.median(np.linalg.norm(seen.positions - seen.points, axis=1)))
+    unit = float(np.median(np.linalg.norm(seen.poses[:, :3, 3] - seen.points, axis=1)))
     units = np.array([OFFSET * unit, OFFSET * unit, DEPTH * unit, CONE, *[ROOM / unit**2] * 3, *[REFLECTED] * 3,
                       RESPONSE])  # fmt: skip
     power = slice(len(units), len(units) + 3)  # of x; the photographs' own follow

@@ -15,7 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.foreign import reading, require_room
 from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, opened, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
-from mi_ring.importers.reading import existing, image_size, read_as
+from mi_ring.importers.reading import image_size, read_as
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
@@ -43,48 +43,45 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """(H, W, C) uint8 sRGB, or uint16: linear from raw files, else as in the file.
-
-        Raises InputError if the file cannot be read.
-        """
+        """(H, W, C) uint8 sRGB, or uint16: linear if raw, else as in the file. Raises InputError if that fails."""
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
         """`pixels` before they are turned."""
-        if self.suffix in RAW:
-            return read_as(self.path, "raw photograph", develop)
-        if self.suffix in HEIF:
-            return self.read_heif(lambda image: np.array(image.convert("RGB")))
+
+        def develop(raw: Any) -> np.ndarray:
+            require_room(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
+            # Linear radiance in sRGB's primaries, with the camera's white balance.
+            return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
+
+        if self.suffix in RAW + HEIF:
+            return self.decode(develop if self.suffix in RAW else lambda image: np.array(image.convert("RGB")))
         pixels = read_as(self.path, "image", read_image)
         if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
-    def read_heif(self, read: Callable[[Image.Image], Any]) -> Any:
-        """`read` of a HEIF file, whose pixels come upright."""
+    def decode(self, read: Callable[[Any], Any]) -> Any:
+        """The result of `read` on the file, opened by LibRaw if it is raw, else by Pillow, which turns HEIF upright."""
         register_heif(self.path)
-        with reading(self.path, "HEIF photograph"), opened(existing(self.path, "HEIF photograph")) as image:
-            return read(image)
-
-    @cached_property
-    def raw_sizes(self) -> Any:
-        """LibRaw's sizes of a raw photograph."""
-        with reading(self.path, "raw photograph"), need("rawpy", f"{self.path}").imread(str(self.path)) as raw:
-            return raw.sizes
+        raw = self.suffix in RAW
+        with reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"):
+            with need("rawpy", f"{self.path}").imread(str(self.path)) if raw else opened(self.path) as file:
+                return read(file)
 
     @cached_property
     def camera_orientation(self) -> int:
-        """How the camera was held, as an EXIF orientation, whether or not the file's pixels are turned already."""
+        """How the camera was held, as an EXIF orientation. The file's pixels may be turned already."""
         if self.suffix in HEIF:
-            return self.read_heif(lambda image: image.info.get("original_orientation") or 1)
+            return self.decode(lambda image: image.info.get("original_orientation") or 1)
         if self.suffix in RAW:
-            return FLIPS.get(self.raw_sizes.flip, 1)
+            return FLIPS.get(self.decode(lambda raw: raw.sizes.flip), 1)
         value = self.exif.get(ExifTags.Base.Orientation)
         return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
     @property
     def orientation(self) -> int:
-        """How the file's pixels must be turned, as an EXIF orientation; HEIF's reader has turned them."""
+        """How the file's pixels must still be turned, as an EXIF orientation; HEIF's reader has turned them."""
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property
@@ -124,8 +121,8 @@ class Picture:
         """(width, height) of `pixels` [px]."""
         register_heif(self.path)
         raw = self.suffix in RAW
-        width, height = (self.raw_sizes.iwidth, self.raw_sizes.iheight) if raw else image_size(self.path)
-        return (height, width) if self.orientation > 4 else (width, height)
+        size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight)) if raw else image_size(self.path)
+        return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
         """(h, w) uint8 for features: means of whole blocks of pixels, `longest` pixels along at most."""
@@ -198,16 +195,8 @@ def rembg() -> Callable[[Image.Image], Image.Image]:
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
-def develop(path: Path) -> np.ndarray:
-    """A raw photograph (H, W, 3) uint16: linear radiance, sRGB's primaries, the camera's white balance."""
-    rawpy = need("rawpy", f"{path}")
-    with rawpy.imread(str(path)) as raw:
-        require_room(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
-        return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
-
-
 def orientation_axes(orientation: int) -> np.ndarray:
-    """(3, 3) from the sensor's axes (x right, y down, z forward) to those of the photograph after it is turned."""
+    """(3, 3) from the axes of pixels (x right, y down, z forward) to those after they are turned by an orientation."""
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
@@ -219,7 +208,7 @@ def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """A vector (3,), or columns (3, n), that is fixed to the camera, in the axes of each photograph, by its name.
+    """A vector (3,) fixed to the camera, or columns (3, n), in the axes of each photograph, by its name.
 
     `vector` is in the axes of most photographs as they are shown.
     """

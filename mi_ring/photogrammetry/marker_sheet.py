@@ -6,12 +6,15 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from skimage.measure import ransac
+from skimage.transform import SimilarityTransform
 from trimesh.registration import procrustes
 
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, camera_to_world
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
 
+pycolmap = LazyPackage("pycolmap", "the sheet of markers")
 COLUMNS, ROWS = 9, 13  #: of squares; each white square has a marker of MARKER times its size in its middle
 SQUARE, MARKER = 20, 0.75  #: [mm] as printed
 DOTS = 14  #: per mm of the page: edges of squares, and of the markers' seven modules, fall on whole dots
@@ -126,13 +129,13 @@ def are_collinear(points: np.ndarray) -> bool:
     return bool(values[1] <= 0.01 * values[0])
 
 
-def calibrate_cameras(
+def calibrate(
     detections: Mapping[str, SheetDetection], size: tuple[int, int]
 ) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
-    """Cameras from the sheet alone, for photographs of one lens and one size (width, height).
+    """The lens of photographs of one size (width, height), their poses [mm] and rms errors [px], by the sheet alone.
 
-    Returns the lens (SIMPLE_RADIAL, its principal point in the middle), poses in the sheet's frame [mm], and rms errors
-    [px]. Photographs that do not fit are left out. Raises InputError if fewer than three fit.
+    Lens: SIMPLE_RADIAL, with the principal point in the middle. Photographs that do not fit are left out. Raises
+    InputError if fewer than three fit.
     """
     names = list(detections)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -159,31 +162,33 @@ def calibrate_cameras(
 
 
 def align(detections: Mapping[str, SheetDetection], cameras: Mapping[str, tuple[Lens, Pose]]) -> Similarity:
-    """The similarity from the cameras' frame to the sheet's, by the corners that at least two photographs show.
+    """The similarity from the cameras' frame to the sheet's, by the corners that two photographs show; robust.
 
-    Wrong corners are left out. Raises InputError if fewer than six are left or if they do not form the sheet.
+    Raises InputError if fewer than six corners are left or if they do not form the sheet.
     """
     seen = np.array([pair for _, *pair in triangulate(detections, cameras)]).reshape(-1, 2, 3)
     found, true = seen[:, 0], seen[:, 1]
     if len(found) < MIN_CORNERS or are_collinear(true):
         raise InputError(f"sheet of markers: photographs with a camera show {len(found)} of its corners together; must "
                          f"be {MIN_CORNERS} or more, not on one line: let more of them show more of it")  # fmt: skip
-    keep = best_half(found, true)
+    _, keep = ransac((found, true), SimilarityTransform, 3, MAX_RMS * np.ptp(true, 0).max(), max_trials=500, rng=0)
+    keep = np.ones(len(found), bool) if keep is None else keep
     for _ in range(3):
-        scale, rotation, shift, errors = fit_similarity(found, true, keep)
+        matrix = procrustes(found[keep], true[keep], reflection=False, return_cost=False)
+        errors = np.linalg.norm(found @ matrix[:3, :3].T + matrix[:3, 3] - true, axis=1)
         keep = errors <= max(4 * float(np.median(errors)), 1e-6 * np.ptp(true))
     rms, width = float(np.sqrt(np.mean(errors[keep] ** 2))), float(np.ptp(true[keep], 0).max())
     if keep.sum() < MIN_CORNERS or not rms < MAX_RMS * width:
         raise InputError(f"sheet of markers: its corners are {rms:.2g} mm off in {width:.0f} mm; is it flat, did it "
                          "stay in its place, and is there only one?")  # fmt: skip
-    return Similarity(scale, rotation, shift, rms, int(keep.sum()))
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3], rms, int(keep.sum()))
 
 
 def triangulate(
     detections: Mapping[str, SheetDetection], cameras: Mapping[str, tuple[Lens, Pose]]
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """The corners that two photographs agree on: id, point (3,) in the cameras' frame, and point (3,) of the sheet."""
-    pycolmap = need("pycolmap", "the sheet of markers")
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0
     seen: dict[int, list[tuple]] = {}
@@ -201,35 +206,6 @@ def triangulate(
             yield corner, found["xyz"], points[corner]
 
 
-def best_half(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """The half (n,) bool of points (n, 3) that a similarity of three of them moves best to the true ones.
-
-    It is least median of squares with 500 random triples.
-    """
-    random, least = np.random.default_rng(0), np.inf
-    keep = np.ones(len(found), bool)
-    for _ in range(500):
-        three = random.choice(len(found), 3, replace=False)
-        if not are_collinear(true[three]) and not are_collinear(found[three]):
-            errors = fit_similarity(found, true, three)[3]
-            if np.median(errors) < least:
-                least, keep = float(np.median(errors)), errors <= np.median(errors)
-    return keep
-
-
-def fit_similarity(
-    found: np.ndarray, true: np.ndarray, chosen: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Scale, rotation (3, 3) and shift (3,) that move the chosen points (n, 3) to the true ones by least squares.
-
-    Also the errors (n,) of all points.
-    """
-    matrix = procrustes(found[chosen], true[chosen], reflection=False, return_cost=False)
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    errors = np.linalg.norm(found @ matrix[:3, :3].T + matrix[:3, 3] - true, axis=1)
-    return scale, matrix[:3, :3] / scale, matrix[:3, 3], errors
-
-
 class PaperSamples(NamedTuple):
     """White paper of the sheet in a photograph."""
 
@@ -239,10 +215,7 @@ class PaperSamples(NamedTuple):
 
 
 def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
-    """Median colours of the white squares and of the page's margin in a photograph (H, W, 3) float32.
-
-    Only beside squares with four detected corners, and only below `CLIPPED`.
-    """
+    """Median colours below `CLIPPED` of white squares, and of the margin beside them, in a photograph (H, W, 3)."""
     pixels = dict(zip(detection.ids.tolist(), detection.pixels))
     points = dict(zip(detection.ids.tolist(), detection.points))
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
@@ -252,10 +225,9 @@ def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
         ring = [corner, corner + 1, corner + COLUMNS - 1, corner + COLUMNS]
         if column == COLUMNS - 2 or not all(k in pixels for k in ring):
             continue
-        four = np.array([pixels[k] for k in ring], np.float32)
-        first, right, down, _ = (points[k] for k in ring)
+        four, (first, right, down, _) = np.array([pixels[k] for k in ring], np.float32), (points[k] for k in ring)
         sides = np.stack([right - first, down - first])
-        if INNER * min(np.linalg.norm(four[1] - four[0]), np.linalg.norm(four[2] - four[0])) < 1:  # [px]: too blurred
+        if INNER * np.linalg.norm(four[1:3] - four[0], axis=1).min() < 1:  # [px]: too blurred
             continue
         plane = cv2.getPerspectiveTransform(unit, four)
         if (row + column) % 2:

@@ -12,9 +12,10 @@ from PIL import Image
 from mi_ring.errors import InputError
 from mi_ring.photogrammetry.folder import Picture, focal_35mm
 from mi_ring.system.machine import interruptible
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
+pycolmap = LazyPackage("pycolmap", "structure from motion")
 #: Pixels along the pictures that features are searched in, number of features, and their least contrast. A smooth
 #: object under even light has few strong features: weak ones are kept, and geometric verification sorts them.
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
@@ -22,14 +23,11 @@ ALL_PAIRS = 150  #: photographs up to which all pairs are matched: with fewer pa
 NEIGHBOURS, KEYS = 12, 40  #: with more: so many neighbours on each side, and so many key photographs with each other
 BATCH = 60  #: pairs that are matched at a time
 MIN_MATCHES = 50  #: of a pair of photographs that overlap
-#: A pair is from one viewpoint if the median feature moves less than this share of the width. Share of such pairs that
-#: is refused.
-STATIC, MAX_STATIC = 0.01, 0.9
+STATIC, MAX_STATIC = 0.01, 0.9  #: motion of features of a static pair, relative to the width; share of such pairs
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
     """Write reduced grey pictures, and their features to the database; those that are there are kept."""
-    pycolmap = need("pycolmap", "features")
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -63,7 +61,7 @@ def camera_ids(database: Path) -> dict[str, int]:
     """The cameras of the images in COLMAP's database, by file; empty if there is no database."""
     if not database.is_file():
         return {}
-    with need("pycolmap", "features").Database.open(database) as opened:
+    with pycolmap.Database.open(database) as opened:
         return {image.name: image.camera_id for image in opened.read_all_images()}
 
 
@@ -81,7 +79,6 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 
     Raises InputError after the first batch if all photographs are from one viewpoint.
     """
-    pycolmap = need("pycolmap", "features")
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0  # else it depends on the thread
@@ -100,7 +97,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
     """The share of these pairs of files that match and were taken from one viewpoint: all features move alike."""
-    with need("pycolmap", "features").Database.open(database) as opened:
+    with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
     asked, static = set(map(frozenset, pairs)), 0
     for a, b, first, second in read_matches(database):
@@ -113,7 +110,6 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
     """Of each matched pair in COLMAP's database: both images, and the matches' positions (n, 2) in each [px]."""
-    pycolmap = need("pycolmap", "features")
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}

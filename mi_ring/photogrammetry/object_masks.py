@@ -21,19 +21,11 @@ from mi_ring.photogrammetry import automatic_masks
 from mi_ring.photogrammetry.automatic_masks import RefinementSettings, Segmentation, VoxelGrid, VoxelObject
 from mi_ring.photogrammetry.capture_files import OBJECT, UNKNOWN, reduction
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.reduced_photographs import (
-    ReducedView,
-    paste_mask,
-    reduce_mask,
-    reduce_photograph,
-    whole_window,
-    window_around,
-)  # fmt: skip
+from mi_ring.photogrammetry.reduced_photographs import ReducedView, paste_mask, read_windows, reduce_mask, window_around
 from mi_ring.photogrammetry.shading_trial import initial_sphere, shading_silhouettes
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import FLATNESS, Plane, TableAppearance, TexelGrid, bare_table, find_plane
-from mi_ring.system.files import write_file
-from mi_ring.system.machine import in_threads
+from mi_ring.system.files import read_json, write_file
 from mi_ring.system.progress import Progress
 
 MIN_AGREEMENT = 0.8  #: of a mask with the common silhouette, intersection over union; else it is not used
@@ -53,7 +45,7 @@ class SegmentedObject(NamedTuple):
 
 
 class SegmentationInput(NamedTuple):
-    """What is known of the object before it is looked for."""
+    """What the user, or the sheet, says of the object."""
 
     plane: Plane | None = None  #: the table
     box: tuple[float, ...] | None = None  #: lowest and highest x, y and z of the object, one after another
@@ -83,17 +75,15 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """The object and its masks, which are kept in `folder`.
+    """The object and its masks. Masks in `folder` are used again: the user may have edited or removed some.
 
-    If the folder has masks already, these are used: the user may have edited or removed some. Raises InputError if they
-    were found with other cameras or another `known`, and if no object is found.
+    Raises InputError if they were found with other cameras or another `known`, and if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
     asked = {"masks": known.digest(), "box": known.box and list(known.box), "cameras": sparse.digest()}
     placed = [picture for picture in pictures if picture.name in sparse.cameras]
-    if record.exists():
-        saved = json.loads(record.read_text("utf-8"))
+    if saved := read_json(record):
         if other := [name for name, value in asked.items() if saved["asked"][name] != value]:
             what = "cameras" if "cameras" in other else f"--{other[0]}"
             raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
@@ -102,12 +92,10 @@ def find_object(
         return SegmentedObject(kept_masks(placed, folder), np.array(saved["center"]), saved["level"], plane)
     for lens, _ in sparse.cameras.values():
         lens.colmap  # noqa: B018  (loads pycolmap here, not in a thread: it installs signal handlers)
-    windows = [[whole_window(sparse.cameras[picture.name][0], COARSE)] for picture in placed]
-    views = [view for (view,) in read_windows(placed, windows, sparse, progress)]
-    grid, plane = VoxelGrid.seen_by(views), known.plane
-    if not plane:
-        positions = np.stack([view.camera.position for view in views])
-        plane = find_plane(sparse.points, positions, grid.center, grid.half_size)
+    windows = [[Window.whole(sparse.cameras[picture.name][0], COARSE)] for picture in placed]
+    views = [view for (view,) in read_windows(placed, windows, sparse.cameras, progress)]
+    grid, positions = VoxelGrid.seen_by(views), np.stack([view.camera.position for view in views])
+    plane = known.plane or find_plane(sparse.points, positions, grid.center, grid.half_size)
     if known.masks == "auto":
         sheet = known.plane is not None
         found, masks = find_masks(placed, sparse, grid, known._replace(plane=plane), sheet, progress)
@@ -115,9 +103,9 @@ def find_object(
         found, masks = given_masks(placed, sparse, grid, known, progress)
     for name, mask in masks.items():
         write_image(mask[..., None], folder / f"{name}.png")
-    small = [(view, automatic_masks.resize_mask(masks[view.name] == OBJECT, view)) for view in views
-             if view.name in masks]  # fmt: skip
-    radiance = float(np.median([view.linear[mask].mean() for view, mask in small if mask.any()]))
+    shown = [view for view in views if view.name in masks]
+    small = [automatic_masks.resize_mask(masks[view.name] == OBJECT, view) for view in shown]
+    radiance = float(np.median([view.linear[mask].mean() for view, mask in zip(shown, small) if mask.any()]))
     result = SegmentedObject(masks, found.points.mean(0), radiance, plane)
     write_file(record, json.dumps({
         "asked": asked, "center": result.center.tolist(), "level": radiance,
@@ -126,23 +114,10 @@ def find_object(
     return result
 
 
-def read_windows(
-    pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], sparse: SparseModel, progress: Progress
-) -> list[list[ReducedView]]:
-    """Each photograph's windows as views."""
-
-    def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
-        views = [reduce_photograph(picture, *sparse.cameras[picture.name], window) for window in wanted]
-        picture.close()
-        return views
-
-    return list(progress(in_threads(read, pictures, windows), "reading", len(pictures)))
-
-
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """The masks in a folder as `SegmentedObject` has them; other grey values become the nearest of the three.
+    """The masks in a folder as `SegmentedObject` has them; other grey values are rounded.
 
-    Raises InputError if there are no masks, or if the size of one is not that of its photograph by a whole number.
+    Raises InputError if there are no masks, or if the size of one is no whole fraction of its photograph's.
     """
     found = {}
     for picture in pictures:
@@ -163,7 +138,7 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """The object by the user's masks, and these masks by name as `SegmentedObject` has them.
+    """The object in the user's masks, and these masks as `SegmentedObject` has them.
 
     Raises InputError if too few photographs have a mask, or if the masks have no object in common.
     """
@@ -175,7 +150,7 @@ def given_masks(
             lens, pose = sparse.cameras[picture.name]
             masks[picture.name] = OBJECT * reduce_mask(mask, lens, GIVEN)
             if known.box:
-                masks[picture.name] *= box_mask(lens.camera(pose).shrunk(whole_window(lens, GIVEN).scale), known.box)
+                masks[picture.name] *= box_mask(lens.camera(pose).shrunk(Window.whole(lens, GIVEN).scale), known.box)
     require_half(len(masks), pictures, known.masks)
     grid = VoxelGrid([view for view in grid.views if view.name in masks], grid.center, grid.half_size)
     grid.allowed = known.allows(grid.points, grid.camera_distance)
@@ -209,10 +184,9 @@ def find_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, sheet: bool,
     progress: Progress,
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:  # fmt: skip
-    """The object, and masks of the photographs that show it clearly, by name, as `SegmentedObject` has them.
+    """The object, located in whole photographs, and its masks where it is clear, refined in windows around it.
 
-    First the object is located in whole photographs, then its masks are refined in windows around it. `sheet`: is the
-    plane that of the printed sheet? Raises InputError if no object is found, or if too few masks agree.
+    `sheet`: is the plane that of the printed sheet? Raises InputError if no object is found or too few masks agree.
     """
     folder = pictures[0].path.parent
     found = locate_object(grid, sparse.points, known, sheet, progress)
@@ -224,9 +198,9 @@ def find_masks(
                          "that the flash lights more than what is around it; give --masks")  # fmt: skip
     windows = [[window_around(sparse.cameras[picture.name][0], silhouette, pixels) for pixels in (SMALL, CLOSE)]
                for picture, silhouette in showing]  # fmt: skip
-    small, close = zip(*read_windows([picture for picture, _ in showing], windows, sparse, progress))
+    small, close = zip(*read_windows([picture for picture, _ in showing], windows, sparse.cameras, progress))
     result = refine_object(small, found, grid, known, automatic_masks.CONCAVITIES, progress)
-    result = result and refine_object(close, result.found, grid, known, automatic_masks.OUTLINES, progress)
+    result = result and refine_object(close, result.object, grid, known, automatic_masks.OUTLINES, progress)
     sure = sum(agreement >= MIN_AGREEMENT for agreement in result.agreement) if result else 0
     if result is None or sure < len(pictures) / 2:
         raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
@@ -234,13 +208,13 @@ def find_masks(
     for view, (_, window), mask, agreement in zip(close, windows, result.masks, result.agreement):
         if agreement >= MIN_AGREEMENT:
             if known.plane:  # there are shadows beside the object
-                silhouette, tolerance = result.found.silhouette(view), result.found.voxel_pixels(view)
+                silhouette, tolerance = result.object.silhouette(view), result.object.voxel_pixels(view)
                 unknown = automatic_masks.disputed_pixels(mask, silhouette, tolerance)
             else:
                 unknown = automatic_masks.touching_pixels(mask, automatic_masks.bright_mask(view))
             mask = np.where(unknown, UNKNOWN, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
             masks[view.name] = paste_mask(mask, sparse.cameras[view.name][0], window)
-    return result.found, masks
+    return result.object, masks
 
 
 def refine_object(
@@ -268,8 +242,8 @@ def locate_object(
 ) -> VoxelObject | None:
     """The object by its difference from the table, else by its brightness, else by a short fit; None if all fail.
 
-    `points` (N, 3): sparse points, from which the fit starts. Brightness does not count on a `sheet`: the paper is
-    bright. On a table, pixels with the table's pattern are left out, because the flash lights its middle, too.
+    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used on a `sheet`, as paper is bright,
+    nor on pixels with the table's pattern, as the flash lights the middle of the table.
     """
     grid.allowed = known.allows(grid.points, grid.camera_distance)
     table = known.plane and TableAppearance(grid.views, TexelGrid(known.plane, grid.center, grid.half_size), progress)
@@ -287,6 +261,6 @@ def locate_object(
 
     for guess in guesses():
         result = automatic_masks.refine_masks(grid, guess, backgrounds, progress)
-        if result and result.quality >= MIN_AGREEMENT:
-            return result.found
+        if result and np.quantile(result.agreement, 0.2) >= MIN_AGREEMENT:
+            return result.object
     return None

@@ -1,5 +1,6 @@
 """Reduced, undistorted photographs with their cameras, in which the object is looked for."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +11,8 @@ from mi_ring.images import srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window, source_positions
 from mi_ring.photogrammetry.folder import Picture
+from mi_ring.system.machine import in_threads
+from mi_ring.system.progress import Progress
 
 MARGIN = 0.3  #: around the object in a window, as a share of its size
 
@@ -56,15 +59,23 @@ def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Wi
     return ReducedView(picture.name, straighten(rgb, lens, window), valid > 0, camera)
 
 
+def read_windows(
+    pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], cameras: Mapping[str, tuple[Lens, np.ndarray]],
+    progress: Progress,
+) -> list[list[ReducedView]]:  # fmt: skip
+    """Each photograph's windows as views; `cameras`: lenses and poses by name."""
+
+    def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
+        views = [reduce_photograph(picture, *cameras[picture.name], window) for window in wanted]
+        picture.close()
+        return views
+
+    return list(progress(in_threads(read, pictures, windows), "reading", len(pictures)))
+
+
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
     """A photograph's mask (H, W) uint8, reduced to `longest` pixels along at most and undistorted: (h, w), 0 or 1."""
-    return (straighten(mask, lens, whole_window(lens, longest)) > 127).astype(np.uint8)
-
-
-def whole_window(lens: Lens, longest: int) -> Window:
-    """The window of the whole picture, reduced to `longest` pixels along at most."""
-    scale = -(-max(lens.size) // longest)
-    return Window(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
+    return (straighten(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:

@@ -23,9 +23,10 @@ from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.marker_sheet import SheetDetection
 from mi_ring.photogrammetry.matching import MIN_MATCHES, find_features, grey_file, match_features, read_matches
 from mi_ring.system.machine import interruptible
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
+pycolmap = LazyPackage("pycolmap", "structure from motion")
 SMALL = 1000  #: pixels along photographs below which they may have too few features
 TEXTURED = 300  #: features of a photograph with enough texture
 EPIPOLAR = 2.5e-3  #: largest distance of a match that two cameras explain, as a share of the picture's width
@@ -72,7 +73,6 @@ def structure_from_motion(
     `detections`: of the printed sheet, by the photograph's name. Raises InputError, with the reason, if less than half
     of the photographs get a camera.
     """
-    pycolmap = need("pycolmap", "cameras from photographs")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
     if sparse.is_dir():
@@ -99,17 +99,17 @@ def structure_from_motion(
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
     """The model that explains most of the matches; None if there is none.
 
-    Two ways are tried. Global mapping ("Global Structure-from-Motion Revisited", Pan et al. 2024) uses all matches from
-    the start. Incremental mapping may place photographs from another side by a few points, nearly in one plane, and
-    then they stay mirrored. But it copes better with photographs whose matches are mostly wrong, because of a pattern
-    that repeats or shadows that move. From both, parts that are not connected with the rest are removed.
+    Global mapping ("Global Structure-from-Motion Revisited", Pan et al. 2024) uses all matches from the start.
+    Incremental mapping may mirror photographs that it adds by a few points in one plane, but copes better with wrong
+    matches, as of repeated patterns and moving shadows. From both, disconnected parts are removed.
     """
-    (folder / "models").mkdir(exist_ok=True)
+    paths = database, _, output = folder / "database.db", folder / "grey", folder / "models"
+    output.mkdir(exist_ok=True)
     best, most = None, 0
-    for models in (map_globally(folder, progress), map_incrementally(folder, count, progress)):
+    for models in (map_globally(paths, progress), map_incrementally(paths, count, progress)):
         if models:
             model = max(models.values(), key=lambda model: len(model.reg_image_ids()))
-            pairs = check_pairs(model, folder / "database.db")
+            pairs = check_pairs(model, database)
             deregister(model, disconnected_images(model.reg_image_ids(), pairs))
             kept = set(model.reg_image_ids())
             explained = sum(pair.explained for pair in pairs if {pair.first, pair.second} <= kept)
@@ -126,31 +126,26 @@ def deregister(model: Any, images: Iterable[int]) -> None:
         model.deregister_frame(model.images[k].frame_id)
 
 
-def map_globally(folder: Path, progress: Progress) -> dict[int, Any]:
-    """Models from the rotations and positions of all cameras together."""
-    pycolmap = need("pycolmap", "structure from motion")
+def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
+    """Models from the rotations and positions of all cameras together; `paths`: database, pictures, output."""
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
         part.random_seed = 0
-    paths = [folder / name for name in ("database.db", "grey", "models")]
     (models,) = (interruptible(pycolmap.global_mapping, *paths, options) for _ in progress(range(1), "all cameras"))
     return models
 
 
-def map_incrementally(folder: Path, count: int, progress: Progress) -> dict[int, Any]:
-    """Models to which one of `count` photographs is added after another."""
-    pycolmap = need("pycolmap", "structure from motion")
+def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
+    """Models to which one of `count` photographs is added after another; `paths`: database, pictures, output."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
     for _ in range(2):  # the first pair
         next(bar, None)
-    paths = [folder / name for name in ("database.db", "grey", "models")]
     models = interruptible(pycolmap.incremental_mapping, *paths, options,
                            next_image_callback=lambda: next(bar, None))  # fmt: skip
-    for _ in bar:
-        pass
+    list(bar)  # to its end
     return models
 
 
@@ -176,10 +171,9 @@ def check_pairs(model: Any, database: Path) -> list[ImagePair]:
 
 
 def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> list[int]:
-    """The images of all parts but the largest. Parts are connected by pairs that explain most of their matches.
+    """The images of all parts but the largest. Pairs that explain most of their matches connect parts.
 
-    A part whose matches with the rest do not fit is placed at random, though it fits in itself. Parts of one or two
-    images are kept: the vote on masks tolerates them.
+    Other parts are placed at random. Those of one or two images are kept: the vote on masks tolerates them.
     """
     index = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= PAIR_MATCHES and p.explained > PAIR_EXPLAINED * p.matches]
@@ -192,7 +186,6 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Sampson's distance (n,) [px] of matches (n, 2) [px] of two images from the epipolar geometry of their poses."""
-    pycolmap = need("pycolmap", "structure from motion")
     cameras = model.cameras[a.camera_id], model.cameras[b.camera_id]
     rays = (camera.cam_from_img(pixels) for camera, pixels in zip(cameras, (first, second)))
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
@@ -201,11 +194,9 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
     """The model in terms of the photographs at full size."""
-    cameras = model_cameras(model, pictures)
-    failed = failure_reasons(pictures, cameras, folder)
-    scales = [scale for _, _, scale in registered(model, pictures)]
+    cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
-    return SparseModel(cameras, model_points(model), error, failed)
+    return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
 
 
 def model_points(model: Any) -> np.ndarray:
@@ -216,22 +207,16 @@ def model_points(model: Any) -> np.ndarray:
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
     """Why the photographs that are not `placed` have no camera, by name."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
-    if failed:
-        detail = {p.name: detail_of(folder / "grey" / grey_file(p)) for p in pictures}
-        usual = float(np.median([detail[name] for name in placed]))
-    for picture in failed:
-        with need("pycolmap", "features").Database.open(folder / "database.db") as opened:
-            image = opened.read_image_with_name(grey_file(picture))
-            features = opened.num_keypoints_for_image(image.image_id)
+    detail = {p.name: detail_of(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
+    for name, file in ((picture.name, grey_file(picture)) for picture in failed):
+        with pycolmap.Database.open(folder / "database.db") as opened:
+            features = opened.num_keypoints_for_image(opened.read_image_with_name(file).image_id)
+        reasons[name] = ("nothing in it fits the others: it shows something else, or there are too few photographs in "
+                         "between")  # fmt: skip
         if features < TEXTURED:
-            reason = f"{features} features only: out of focus, blurred or too dark"
-        elif detail[picture.name] < BLURRED * usual:
-            reason = "far less detail than in the others: blurred, out of focus, or it shows something else"
-        else:
-            reason = (
-                "nothing in it fits the others: it shows something else, or there are too few photographs in between"
-            )
-        reasons[picture.name] = reason
+            reasons[name] = f"{features} features only: out of focus, blurred or too dark"
+        elif detail[name] < BLURRED * np.median([detail[other] for other in placed]):
+            reasons[name] = "far less detail than in the others: blurred, out of focus, or it shows something else"
     return reasons
 
 
@@ -243,7 +228,7 @@ def detail_of(file: Path) -> float:
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
     """Why only `count` photographs have a camera, and what to do."""
-    with need("pycolmap", "features").Database.open(folder / "database.db") as opened:
+    with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])
         total = opened.num_images()

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from scipy import ndimage
+from trimesh.geometry import align_vectors
 from trimesh.points import plane_fit
 
 from mi_ring.capture.grabcut import disk, grown
@@ -49,15 +50,13 @@ class Plane(NamedTuple):
 
     def axes(self) -> np.ndarray:
         """(3, 3) rows: two directions in the plane, and the normal."""
-        first = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
-        first /= np.linalg.norm(first)
-        return np.stack([first, np.cross(self.normal, first), self.normal])
+        return align_vectors(self.normal, [0, 0, 1])[:3, :3]
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """The plane with most of the points (N, 3) within twice `half_size` of `center` (3,), by RANSAC; None without one.
+    """The plane of most points (N, 3) within twice `half_size` of `center` (3,), by RANSAC; None if there is none.
 
-    Almost all cameras (K, 3) and points must be above it.
+    All cameras (K, 3) and most other points must be above it.
     """
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
@@ -126,11 +125,10 @@ def estimate_albedo(
     views: Sequence[ReducedView], lights: Sequence[Light], hidden: Sequence[np.ndarray], grid: TexelGrid,
     flash: FlashCalibration,
 ) -> np.ndarray | None:  # fmt: skip
-    """Diffuse albedo (texels, texels, 3) of the table in views, each under its light; None if no view shows the table.
+    """Diffuse albedo (texels, texels, 3) of the table, median over views; None if no view shows the table.
 
-    `hidden` (H, W): above 0 where something may hide the table; `flash`: cone, room's light and response. It is the
-    median of all views, because few have a shadow or a highlight at one place. Texels that no view shows get the median
-    of the others. Light between the object and the table is ignored.
+    `lights`: one for each view; `flash`: their cone, room's light and response; `hidden` (H, W): above 0 where the
+    table may be hidden. Texels that no view shows get the median of the others. Interreflection is ignored.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -249,8 +247,7 @@ def bare_table(
 def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Difference (H, W, 3) of log radiances (H, W, 3): of their means, of red/green and of blue/green; NaN if unknown.
 
-    Of the expected values at a pixel and its neighbours the nearest to what is seen counts: the texture may be a pixel
-    off.
+    The nearest expected value of a pixel and its neighbours counts, because the texture may be a pixel off.
     """
 
     def split(log: np.ndarray) -> np.ndarray:
@@ -283,10 +280,7 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 where log radiance (H, W) has the table's pattern (H, W), which is NaN where unknown.
-
-    It is the correlation of both in a window, which illumination and soft shadows do not change.
-    """
+    """(H, W) uint8: 1 where log radiance (H, W) correlates with the table's pattern (H, W), which is NaN if unknown."""
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

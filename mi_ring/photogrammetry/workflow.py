@@ -16,22 +16,16 @@ from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.photogrammetry.capture_files import OBJECT, CalibratedPhotograph, reduction
+from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
 from mi_ring.photogrammetry.folder import Picture, register_heif, relative_exposures, turn_with_cameras
-from mi_ring.photogrammetry.marker_sheet import (
-    MarkerSheet,
-    PaperSamples,
-    SheetDetection,
-    calibrate_cameras,
-    sample_paper,
-)  # fmt: skip
+from mi_ring.photogrammetry.marker_sheet import MarkerSheet, PaperSamples, SheetDetection, calibrate, sample_paper
 from mi_ring.photogrammetry.object_masks import SegmentedObject
 from mi_ring.photogrammetry.shading_trial import ASSUMED_ALBEDO
 from mi_ring.photogrammetry.structure_from_motion import SparseModel, model_points, structure_from_motion
 from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.scene.lights import Light
-from mi_ring.system.files import write_file, writing
+from mi_ring.system.files import read_json, write_file, writing
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
@@ -46,9 +40,8 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
     record, first = folder / "photographs.json", folder / "sheet.json"  # without the latter there are no results
-    photographs = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
-    if first.exists() and record.exists():
-        saved = json.loads(record.read_text("utf-8"))
+    photographs, saved = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}, read_json(record)
+    if first.exists() and saved:
         if saved.get("format") != FORMAT:
             raise InputError(f"{folder}: was begun by another version of mi_ring, which kept other things; remove it, "
                              "or give another DIR")  # fmt: skip
@@ -61,10 +54,9 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 def make_upright(
     sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
 ) -> tuple[SparseModel, Plane | None, bool]:
-    """The model and the table in a frame with the object's `center` (3,) as origin and z up, and is up known?
+    """The model and the table in a frame with origin `center` (3,), z up, and unit the cameras' distance; is up known?
 
-    Up is the table's normal, or the mean of `ups` (3,), each in the axes of its camera. It is unknown if photographs
-    without a table were held in all directions. The unit is the median distance from the cameras to the object.
+    Up is the table's normal, or else the mean of `ups` (3,), each in the axes of its camera, unless these cancel out.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
@@ -81,27 +73,15 @@ class SheetObservations(NamedTuple):
     papers: dict[str, PaperSamples]
 
 
-def require_readable(pictures: Sequence[Picture], results: Sequence[object]) -> None:
-    """Raise InputError, which names all photographs whose result is an InputError."""
-    bad = [(picture.path, error) for picture, error in zip(pictures, results) if isinstance(error, InputError)]
-    if len(bad) > 1:
-        names = ", ".join(path.name for path, _ in bad)
-        raise InputError(f"{bad[0][1]}; {len(bad)} photographs cannot be read: {names}; mend or remove them")
-    if bad:
-        raise InputError(f"{bad[0][1]}; mend or remove it")
-
-
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """The sheet in the photographs, with squares of this size [mm]; None if less than three photographs show it.
+    """The sheet with squares of this size [mm]; None if fewer than three photographs show it.
 
-    Raises InputError if photographs cannot be read.
+    Raises InputError, which names them, if photographs cannot be read.
     """
     record = folder / "sheet.json"
-    if record.exists():
-        saved = json.loads(record.read_text("utf-8"))
-    else:
+    if (saved := read_json(record)) is None:
 
         def observe(picture: Picture) -> list | InputError | None:
             try:
@@ -116,7 +96,10 @@ def find_sheet(
                 picture.close()
 
         results = list(progress(in_threads(observe, pictures), "sheet", len(pictures)))
-        require_readable(pictures, results)
+        if bad := [(p.path.name, error) for p, error in zip(pictures, results) if isinstance(error, InputError)]:
+            names = ", ".join(name for name, _ in bad)
+            more = f"{len(bad)} photographs cannot be read: {names}; mend or remove them"
+            raise InputError(f"{bad[0][1]}; {more if len(bad) > 1 else 'mend or remove it'}")
         saved = {picture.name: values for picture, values in zip(pictures, results) if values}
         write_file(record, json.dumps(saved))
     detections, papers = {}, {}
@@ -144,9 +127,9 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
     require_cameras(imported)
     frames = {frame.image.stem: frame for frame in imported}
     for p in pictures:
-        if p.name in frames and frames[p.name].size != p.size:
+        if p.name in frames and frames[p.name].lens.size != p.size:
             raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
-                source.src, *frames[p.name].size, p.path.name, *p.size))  # fmt: skip
+                source.src, *frames[p.name].lens.size, p.path.name, *p.size))  # fmt: skip
     cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
     failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
     if len(cameras) < len(failed):
@@ -172,10 +155,10 @@ def require_parallax(sparse: SparseModel, folder: Path) -> None:
 def find_cameras(
     pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
 ) -> SparseModel:
-    """The cameras: those of another tool, else from structure from motion, else from the sheet.
+    """The cameras of another tool, else from structure from motion, else from the sheet.
 
-    On a turntable always from the sheet: structure from motion would track the room, which does not turn. Raises
-    InputError if too few photographs get a camera.
+    On a turntable from the sheet only: structure from motion would track the room. Raises InputError if too few
+    photographs get a camera.
     """
     if turntable:
         if sheet is None:
@@ -203,7 +186,7 @@ def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) ->
     for size in dict.fromkeys(picture.size for picture in pictures):
         names = [p.name for p in pictures if p.size == size and p.name in sheet.detections]
         with contextlib.suppress(InputError):  # too few of this size
-            lens, poses, own = calibrate_cameras({name: sheet.detections[name] for name in names}, size)
+            lens, poses, own = calibrate({name: sheet.detections[name] for name in names}, size)
             cameras |= {name: (lens, pose) for name, pose in poses.items()}
             errors += own.values()
     if len(cameras) < len(pictures) / 2:
@@ -218,10 +201,7 @@ def flash_from_sheet(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     sheet: SheetObservations,
 ) -> FlashCalibration | None:  # fmt: skip
-    """The flash, roughly `offset` (3,) from the lens, calibrated with the sheet; None if no photograph shows it.
-
-    The object is taken for a sphere, as large as it looks in the median photograph.
-    """
+    """The flash, about `offset` (3,) from the lens, by the sheet; None if that is not seen. The object is a sphere."""
     radii = []
     for name, mask in found.masks.items():
         lens, pose = sparse.cameras[name]
@@ -236,11 +216,11 @@ def flash_from_sheet(
     return calibrate_flash(sheet.papers, poses, axes, exposures, offset, sphere, curved)
 
 
-def calibrated_photographs(
+def posed_pictures(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     flash: FlashCalibration | None,
-) -> list[CalibratedPhotograph]:  # fmt: skip
-    """The photographs that have a camera, with all that the scene file says of them.
+) -> list[PosedPicture]:  # fmt: skip
+    """The photographs that have a camera, with their calibration.
 
     `offset` (3,): of the flash from the lens [scene units], used if there is no calibrated flash. The intensity is then
     unknown, and is set so low that fits notice.
@@ -253,6 +233,6 @@ def calibrated_photographs(
         name, (lens, pose) = picture.name, sparse.cameras[picture.name]
         intensity = known.get(name, exposure * (flash.power if flash else assumed))
         light = Light("point", pose[:3, :3] @ offsets[name] + pose[:3, 3], intensity)
-        shot = CalibratedPhotograph(picture, lens, pose, found.masks.get(name), light, measured=name in known)
-        result.append(replace(shot, falloff=flash.falloff, gamma=flash.gamma) if flash else shot)
+        posed = PosedPicture(picture, lens, pose, found.masks.get(name), light, measured=name in known)
+        result.append(replace(posed, falloff=flash.falloff, gamma=flash.gamma) if flash else posed)
     return result
