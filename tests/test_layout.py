@@ -30,7 +30,7 @@ def imports(module: str) -> set[str]:
             assert node.level == 0, f"{module}: relative imports hide which room is meant"
             names = [alias.name for alias in node.names]
             found |= {f"mi_ring.{name}" for name in names} if node.module == "mi_ring" else {node.module}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "need":  # packages that may be missing
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("need", "LazyPackage"):  # may be missing
             found.add(ast.literal_eval(node.args[0]))
     return {".".join(name.split(".")[: 2 if name.startswith("mi_ring.") else 1]) for name in found}
 
