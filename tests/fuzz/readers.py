@@ -40,7 +40,7 @@ from mi_ring.importers.reading import has_alpha, image_size, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.capture_findings import told_before
+from mi_ring.metrics.capture_findings import findings_of_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import read_log
@@ -326,7 +326,7 @@ def results(folder: Path) -> Reader:
 
     def read() -> None:
         read_log(folder)
-        told_before(folder / "scene.xml", ["000", "001"])
+        findings_of_fit(folder / "scene.xml", ["000", "001"])
         planned_before(config, [config], folder)
 
     return Reader([folder / name for name in names], read)
