@@ -46,8 +46,8 @@ def imported(module: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}: relative imports hide which room is meant"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "need":  # packages that may be missing
-            found.add(ast.literal_eval(node.args[0]))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("need", "LazyPackage"):  # may be missing
+            found |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
     return found
 
 

@@ -20,7 +20,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.photogrammetry.marker_sheet import Board
+from mi_ring.photogrammetry.marker_sheet import MarkerSheet
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.scene.lights import Light
@@ -291,7 +291,7 @@ def test_the_sheet_is_printed_true_to_scale(lump, tmp_path):
         "--distance", "11", "--fov", "45", "--offset", "0.1", "0.1", "0", "--format", "png8", "--material", "diffuse",
     ])  # fmt: skip
     capture = mi_ring.load_capture(out / "scene.xml")
-    sighting = Board().detect(np.array(capture.images[0]))
+    sighting = MarkerSheet().detect(np.array(capture.images[0]))
     ground = trimesh.load(out / "truth/mesh.ply").bounds[0, 1]
     # Seen from above, y up: x of the page is z of the world, and y is x.
     world = np.stack([sighting.points[:, 1], np.full(len(sighting.points), ground), sighting.points[:, 0]], 1)

@@ -5,7 +5,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.importers.camera_models import Lens
-from mi_ring.photogrammetry.reduced_photographs import View, camera_of
+from mi_ring.photogrammetry.reduced_photographs import (
+    ReducedView,
+)
 
 CENTER, AXES = np.array([40.0, -15.0, 9.0]), np.array([3.0, 2.0, 2.4])  #: of an ellipsoid
 LENS = Lens("PINHOLE", (160, 120), (170.0, 176.0, 77.0, 64.0))
@@ -51,14 +53,14 @@ def hit_ellipsoid(camera):
 
 
 def view(name, pose, rgb):
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     height, width = LENS.size[::-1]
-    return View(name, rgb.reshape(height, width, 3).astype(np.uint8), np.ones((height, width), bool), camera)
+    return ReducedView(name, rgb.reshape(height, width, 3).astype(np.uint8), np.ones((height, width), bool), camera)
 
 
 def in_a_dim_room(pose, random):
     """The ellipsoid lit by a flash, a lamp in the background somewhere, noise; and its mask."""
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     t, cosine = hit_ellipsoid(camera)
     object_ = np.isfinite(t)
     shade = np.where(object_, 60 + 150 * np.clip(cosine, 0, 1), 22)[:, None] * np.array([1.0, 0.9, 0.7])
