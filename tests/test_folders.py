@@ -115,6 +115,7 @@ STAGES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_at_any_stage_goes_on(photographs, tmp_path):
     pytest.importorskip("pycolmap")
     arguments = [str(photographs), str(tmp_path / "capture"), "--masks", str(photographs / "masks")]
