@@ -60,6 +60,7 @@ def watch() -> dict[str, float]:
     from mi_ring.fitting.muon import Muon  # here, not in the parent: a process begins with its parent's peak memory
     from mi_ring.nets import shape_net
     from mi_ring.rendering import bridge
+    from mi_ring.rendering.global_illumination import GlobalIllumination
 
     # isort: split
     import torch
@@ -77,9 +78,9 @@ def watch() -> dict[str, float]:
 
         return run
 
-    for part, cls in (("flow", shape_net._Flow), ("rendering", bridge._Render)):
+    for part, cls in (("flow", shape_net._Flow), ("rendering", bridge._Differentiable)):
         cls.forward, cls.backward = (staticmethod(timed(part, f)) for f in (cls.forward, cls.backward))
-    bridge.surroundings = timed("rendering", bridge.surroundings)
+    GlobalIllumination.of = timed("rendering", GlobalIllumination.of)
     for cls in (torch.optim.Adam, Muon):
         cls.step = timed("optimiser", cls.step)
     return seconds

@@ -24,8 +24,9 @@ from playwright.sync_api import sync_playwright
 from mi_ring.capture import loading
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering.surface import Surface
 
 
 def photograph(sensor) -> dict:
@@ -66,7 +67,7 @@ def main() -> None:
     arguments = parser.parse_args()
     scene, ring = loading.load_capture(arguments.run / "scene.xml", images=False), load_fit(arguments.run)
     theirs = drawn(arguments.run / "report.html", scene.sensors)
-    surface = bridge.Surface(scene.scene, scene.shape, ring)
+    surface = Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     print(f"{processor()}; {datetime.date.today()}; {arguments.run.name}, {len(theirs)} photographs\n")
     print("| ours | all pixels, % | the object's, % | PSNR, dB |\n| --- | --- | --- | --- |")
@@ -75,7 +76,9 @@ def main() -> None:
         "direct light, no shadows": {"shadows": False},
         "all light": {"shadows": True, "indirect": True},
     }.items():
-        ours, covered = zip(*(bridge.draw(surface, scene.photograph(k), spp=64, **options) for k in range(len(scene))))
+        ours, covered = zip(
+            *(prediction.draw(surface, scene.photograph(k), spp=64, **options) for k in range(len(scene)))
+        )
         ours = [linear_to_srgb(picture[0].numpy()) for picture in ours]
         plain = plain or ours
         difference = [np.abs(a - b) for a, b in zip(ours, theirs)]

@@ -3,8 +3,8 @@
     python benchmarks/priors.py [--only NAME] [--weights 0 0.03] [--seeds 0 1] [--iterations 150] [--level 4]
                                 [--width 96] [--batch 8] [--out out/priors]
 
-Each capture is made for its prior: `normal_variation` a faceted body, `material_variation` a body of two materials,
-`material_rank` one whose gloss goes with its colour. All are path traced with `cooktorrance` from few sides, and
+Each capture is made for its prior: `normal_variation` a faceted body, `material_rank` one whose gloss goes with its
+colour. All are path traced with `cooktorrance` from few sides, and
 photographed with much noise: what the photographs leave open is where a prior can help. Errors are those of the whole
 surface: of normals in degrees, of colour, gloss and roughness as shares of the truth's mean, at the nearest points.
 """
@@ -37,9 +37,7 @@ import torch
 
 EVERY = 3  #: of the example's cameras, so many are one here
 NOISE = 0.05  #: standard deviation of the linear radiance, 1 is white
-WEIGHTS = {
-    "normal_variation": (0.0, 0.01, 0.03), "material_variation": (0.0, 1e-4, 3e-4), "material_rank": (0.0, 0.005, 0.01),
-}  # fmt: skip
+WEIGHTS = {"normal_variation": (0.0, 0.01, 0.03), "material_rank": (0.0, 0.005, 0.01)}
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
@@ -52,8 +50,7 @@ def body(name: str) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
         share = np.zeros(len(x))
     else:
         mesh = trimesh.Trimesh(ball.vertices * (1.0, 0.8, 1.2), ball.faces, process=False)
-        wave = np.sin(3 * x + 2 * y) + np.sin(4 * z - x)
-        share = (wave > 0).astype(float) if name == "material_variation" else 0.5 + 0.25 * wave
+        share = 0.5 + 0.25 * (np.sin(3 * x + 2 * y) + np.sin(4 * z - x))
     mesh.apply_scale(32)
     mesh.apply_translation(example_pot.CENTER)
     one, other = np.array([0.45, 0.12, 0.06]), np.array([0.1, 0.25, 0.4])

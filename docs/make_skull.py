@@ -14,7 +14,7 @@ from make_picture import labelled, opened
 from PIL import Image
 
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 
 SHOWN = "01", "09", "17", "25", "33", "42", "50", "58"  #: photographs that show each step
 HELD_OUT = "05", "29", "53"  #: photographs that the fit has not seen, beside what it predicts
@@ -79,8 +79,8 @@ def results(out: Path) -> np.ndarray:
         k = next(k for k, sensor in enumerate(capture.sensors) if sensor.id() == name)
         scale = -(-capture.sensors[k].size[0] // WIDTH)
         shot = capture.photograph(k, scale)
-        maps = {what: values[0] for what, values in bridge.maps(surface, shot).items()}
-        rgb, coverage = bridge.draw(surface, shot, spp=64, indirect=ring.indirect)
+        maps = {what: values[0] for what, values in prediction.maps(surface, shot).items()}
+        rgb, coverage = prediction.draw(surface, shot, spp=64, indirect=ring.indirect)
         seen = coverage[0].numpy()[..., None] > 0.5
         diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
         observed = linear_to_srgb(capture.observe([k], scale).rgb[0].numpy())

@@ -47,6 +47,7 @@ _API = {
     "ShapeNet": "nets.shape_net", "Flow": "nets.shape_net", "BRDFNet": "nets.brdf_net", "MaterialNet": "nets.brdf_net",
     "register_network": "nets.registry", "plain_autograd": "nets.mlp",
     "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
+    "Lighting": "fitting.lighting", "choose_lighting": "fitting.light_selection",
 }  # fmt: skip
 
 __all__ = [
@@ -69,8 +70,13 @@ __all__ = [
     "register_network",
 ]  # fmt: skip
 
+#: Names up to version 0.2, with the present ones.
+_RENAMED = {"Ring": "FittedObject", "ReflectanceMap": "MaterialNet"}
+
 
 def __getattr__(name: str) -> object:
+    if name in _RENAMED:
+        raise AttributeError(f"mi_ring.{name} is now mi_ring.{_RENAMED[name]}")
     if name not in _API:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_API[name]}"), name)

@@ -17,7 +17,6 @@ OPTIONAL = {
     "pycolmap": "mi_ring.photos, COLMAP's models, and lens distortion in mi_ring.convert",
     "rawpy": "raw photographs in mi_ring.photos",
     "ray": "mi_ring.batch",
-    "torchdiffeq": "--solver dopri5 of mi_ring.fit",
     "xatlas": "GLB and OBJ, and the object in the report",
 }
 

@@ -89,7 +89,7 @@ def test_an_iteration_has_what_was_predicted_and_observed(capture):
 
 def test_presets_change_and_weights_that_are_not_given_stay():
     fast = mi_ring.Config.preset("fast", weights={"mask": 10.0})
-    off = dict.fromkeys(("normal_variation", "material_variation", "material_rank"), 0.0)
+    off = dict.fromkeys(("normal_variation", "material_rank"), 0.0)
     weights = {"rgb": 1.0, "mask": 10.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03} | off
     assert fast.iterations == 140 and fast.weights == weights
     assert mi_ring.Config(weights={"mask": 10.0}).weights == fast.weights

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from mi_ring.fitting.indirect_average import LATEST, Averages
-from mi_ring.rendering.bridge import Surroundings
+from mi_ring.rendering.global_illumination import GlobalIllumination
 
 RANDOM = np.random.default_rng(3)
 
@@ -12,7 +12,7 @@ RANDOM = np.random.default_rng(3)
 def around(radiance, alpha, factor=2):
     radiance, alpha = torch.tensor(radiance).float(), torch.tensor(alpha).float()
     n, h, w = alpha.shape
-    return Surroundings(radiance, [], radiance, radiance, alpha, torch.ones(n, factor * h, factor * w), factor)
+    return GlobalIllumination(radiance, [], radiance, radiance, alpha, torch.ones(n, factor * h, factor * w), factor)
 
 
 def test_each_photograph_has_the_average_of_its_own_pictures():

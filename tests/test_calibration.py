@@ -17,16 +17,16 @@ from test_poses import posed
 
 import mi_ring
 from mi_ring import InputError, fit
+from mi_ring.calibration.calibration import UNKNOWNS, Calibration, refined_of, rotations
 from mi_ring.capture.decoding import decode, recorded
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import validation
-from mi_ring.fitting.calibration import UNKNOWNS, Calibration, refined_of, rotations
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.calibration_panel import held_out_text
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import BASIS
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
@@ -58,7 +58,7 @@ def move_light(element, offset):
 
 
 def losses(setting, calibration, vertices, spp=16, seed=5):
-    rgb, alpha = bridge.render(
+    rgb, alpha = prediction.render(
         setting.surface, setting.photographs, vertices, setting.material, spp, seed, setting.shadows, calibration
     )
     return (setting.radiance_weight * rgb).sum(), (setting.coverage_weight * alpha).sum()
@@ -74,8 +74,8 @@ def calibration_of(setting):
 
 def test_pictures_are_those_of_the_photographs_own_cameras_and_lights():
     setting = Setting(OFF_CAMERA, shadows=True)
-    given = bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3)
-    same = bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3,
+    given = prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3)
+    same = prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3,
                          calibration=[t.detach() for t in calibration_of(setting)])  # fmt: skip
     for a, b in zip(given, same):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
@@ -108,7 +108,7 @@ def test_gradient_of_the_flashs_cone_equals_finite_differences_and_its_picture_i
     step = tensor([0.02, -0.03])
 
     def picture(falloff):
-        return bridge.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3, False,
+        return prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3, False,
                              [*calibration[:4], falloff])[0]  # fmt: skip
 
     moved = [(falloff + sign * step).detach() for sign in (1, -1)]

@@ -20,7 +20,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.importers.reading import pixels_of
 from mi_ring.objects.ring_file import load_fit, ring_state
-from mi_ring.rendering import bridge
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.files import write_state
 
 
@@ -136,7 +136,7 @@ def test_a_shape_needs_no_id(broken_capture):
     path, edit = broken_capture
     edit(' id="object"', "")
     scene = loading.load_capture(path)
-    bridge.Surface(scene.scene, scene.shape)
+    Surface(scene.scene, scene.shape)
 
 
 def test_declared_encoding_beats_the_default(broken_capture):

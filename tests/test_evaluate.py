@@ -240,11 +240,11 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
     assert scene.lit_room
     ring = FittedObject(CENTER, 25.0, scale=0.5)
     numbers, views = image_errors.compare_photographs(scene, ring, 4)
-    surface = image_errors.bridge.Surface(scene.scene, scene.shape, ring)
+    surface = image_errors.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     for k in range(12):
-        rgb, _ = image_errors.bridge.draw(surface, scene.photograph(k), spp=4)
+        rgb, _ = image_errors.prediction.draw(surface, scene.photograph(k), spp=4)
         guess = np.clip(rgb[0].numpy(), 0, 1)
         guess = np.where(guess <= 0.0031308, 12.92 * guess, 1.055 * guess ** (1 / 2.4) - 0.055)
         inside = scene.masks[k] == 255

@@ -22,6 +22,8 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
+from mi_ring.fitting.restraint import Restraint
+from mi_ring.fitting.rounds import Rounds
 from PIL import Image
 
 from mi_ring import __main__, fit, render
@@ -35,14 +37,13 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import Caution
 from mi_ring.fitting.processes import ALONE, Share
-from mi_ring.fitting.restraint import Restraint
-from mi_ring.fitting.rounds import Rounds
 from mi_ring.fitting.schedule import stages_of
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import results
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.system import files, machine
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
@@ -367,7 +368,7 @@ def test_gradients_of_unknowns_that_are_none_make_no_step(small_capture, monkeyp
 
 
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
-    monkeypatch.setattr(bridge.Surroundings, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
+    monkeypatch.setattr(GlobalIllumination, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
     for options, bright in (([], True), (["--no-indirect"], False)):
         first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *SPHERE, *options]))
         assert (first.step().terms["rgb"] > 100) == bright
@@ -384,8 +385,8 @@ def test_interreflection_is_left_out_where_intensities_cannot_be_true_nor_be_ref
 
 def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatch):
     path, edit = broken_capture
-    genuine, used = bridge.render, []
-    monkeypatch.setattr(bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
+    genuine, used = prediction.render, []
+    monkeypatch.setattr(prediction, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
         Fit(load_capture(path), fit.parse_options([str(path), *SPHERE, *options])).step()

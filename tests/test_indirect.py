@@ -9,7 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mi_ring.rendering import bridge, indirect_light
+from mi_ring.rendering import indirect_light
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.system import machine
@@ -163,7 +164,7 @@ def test_interreflection_is_spread_over_what_the_object_covers(width, diffuse_cu
     drawn = pictures(render_photographs(scene, photographs, 16, 0))
     coverage = torch.from_numpy(drawn[..., 3]).to(machine.device()).requires_grad_()
     surface = SimpleNamespace(scene=scene, table=None, unit=1.0)
-    added = bridge.surroundings(surface, photographs, coverage, 5, width, 1024).interreflection
+    added = GlobalIllumination.of(surface, photographs, coverage, 5, width, 1024).interreflection
     assert added.shape == (2, HEIGHT, WIDTH, 3)
     for k, expected in zip((0, 1), series(indirect_light.BOUNCES)[::-1]):
         even, found = expected * drawn[k, ..., 3:], added[k].detach().cpu().numpy()

@@ -13,11 +13,11 @@ from conftest import photographed_ellipsoid
 from test_bridge import OFF_CAMERA, Setting, tensor
 
 import mi_ring
-from mi_ring.fitting.calibration import Calibration, refined_of
+from mi_ring.calibration.calibration import Calibration, refined_of
 from mi_ring.fitting.covariance import deviations
 from mi_ring.fitting.light_selection import Trials, brightest
 from mi_ring.fitting.lighting import Lighting, lit, moved
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.scene.assembly import lamp_lights, lamps_of, with_lamps
 from mi_ring.scene.lights import Light, emitter_of, light_of, place_lamp, place_of
 
@@ -69,7 +69,9 @@ def test_gradients_of_lamps_equal_finite_differences():
     ball = tensor(np.array([0.3, -0.2, 0.15]) + 0.8 * setting.s)  # convex: nothing is in its own shadow
 
     def loss(lamps):
-        rgb, _ = bridge.render(setting.surface, setting.photographs, ball, setting.material, 16, 3, False, lamps=lamps)
+        rgb, _ = prediction.render(
+            setting.surface, setting.photographs, ball, setting.material, 16, 3, False, lamps=lamps
+        )
         return (setting.radiance_weight * rgb).sum()
 
     lamps = [t.clone().requires_grad_() for t in now]

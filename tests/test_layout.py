@@ -75,7 +75,7 @@ def test_rooms_form_no_circle():
 
 def test_what_the_rules_are_for():
     """The rules, which anybody can loosen in a docstring, hold what the rooms are for."""
-    assert may_import("nets") == {"torch", "torchdiffeq"}
+    assert may_import("nets") == {"torch"}
     assert not may_import("geometry") & {"mitsuba", "drjit"}
     for room in ("plugins", "rendering", "capture", "importers", "metrics", "output"):
         assert "fitting" not in may_import(room)

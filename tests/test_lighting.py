@@ -14,15 +14,15 @@ from conftest import photographed_ellipsoid
 
 import mi_ring
 from mi_ring import export
+from mi_ring.calibration.calibration import Calibration, refined_of
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError
 from mi_ring.fitting import light_selection, priors
-from mi_ring.fitting.calibration import Calibration, refined_of
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, harmonics_in, seen_from_within
 from mi_ring.scene.lights import is_room, shared_emitters
@@ -147,7 +147,7 @@ def test_cameras_are_refined_under_unknown_light(in_an_environment, tmp_path):
     spread = [entry["std"]["turned_degrees"] for entry in summary["photographs"].values()]
     assert np.isfinite(spread).all() and min(spread) > 0
     dark = replace(capture.photograph(0), room=None)
-    rgb, coverage = bridge.draw(fit.surface, dark, 1)
+    rgb, coverage = prediction.draw(fit.surface, dark, 1)
     assert not rgb.any() and coverage.any()
 
 
@@ -354,8 +354,7 @@ def test_a_map_shows_the_radiance_of_harmonics():
     np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)
 
 
-@pytest.mark.parametrize("material_at", ["domain", "surface"])
-def test_light_and_material_settle_where_the_surface_is(material_at, in_an_environment):
+def test_light_and_material_settle_where_the_surface_is(in_an_environment):
     """At the end under an unknown environment: the surface, which is of one material, stays as it is; the light is what
     photographs say from then on, and the material varies less than it did when it made up for errors of the surface."""
 
@@ -365,7 +364,7 @@ def test_light_and_material_settle_where_the_surface_is(material_at, in_an_envir
         return vertices, float((material["diffuse"].std(0) / material["diffuse"].mean(0)).mean())
 
     capture = mi_ring.load_capture(in_an_environment)
-    config = mi_ring.Config.preset("fast", **TINY, light="environment", material_at=material_at)
+    config = mi_ring.Config.preset("fast", **TINY, light="environment")
     lighting = Lighting("environment", plain=0.01)  # of one material, but not for long
     fit = mi_ring.Fit(capture, config, lighting=lighting)
     *_, shaping, settling = fit.stages

@@ -14,7 +14,8 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene import xml_elements
 
 QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
@@ -56,8 +57,8 @@ def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
     assert any("base_color" in name for name in saved.dtype.names)
     loaded = load_capture(out / "scene.xml")
     # As it stands in the file: the shape's own weights, without a ring given
-    surface = bridge.Surface(loaded.scene, loaded.shape)
-    predicted, _ = bridge.draw(surface, loaded.photograph(2), spp=256)
+    surface = Surface(loaded.scene, loaded.shape)
+    predicted, _ = prediction.draw(surface, loaded.photograph(2), spp=256)
     stock = mi.render(loaded.scene, sensor=2, integrator=mi.load_dict({"type": "direct"}), spp=256)
     assert predicted.mean() > 0.01
     stock = np.maximum(np.array(stock)[..., :3], 0)  # a room that was found may be below 0 in places
@@ -71,9 +72,9 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
     ring, pictures = load_fit(out), []
     for path in (out / "scene.xml", small_capture):
         loaded = load_capture(path)
-        surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+        surface = Surface(loaded.scene, loaded.shape, ring)
         surface.show(ring, *ring.domain.sample(3))
-        pictures.append(bridge.draw(surface, loaded.photograph(4), spp=64)[0])
+        pictures.append(prediction.draw(surface, loaded.photograph(4), spp=64)[0])
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
     assert pictures[0].mean() > 0.01
 
@@ -83,7 +84,7 @@ def test_gradients_of_attributes_equal_finite_differences(scene, which):
     loaded = load_capture(scene[0])
     parameters, xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
     ring = FittedObject(*loaded.sphere(), 1.0, None, parameters, xml)
-    surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+    surface = Surface(loaded.scene, loaded.shape, ring)
     s, faces = ring.domain.sample(3)
     surface.set_faces(faces)
     vertices = ring.surface(s).detach()
@@ -96,7 +97,7 @@ def test_gradients_of_attributes_equal_finite_differences(scene, which):
 
     def loss(change):
         moved = material | {which: material[which] + change}
-        return (weight * bridge.render(surface, loaded.photograph(1), vertices, moved, 16, 3)[0]).sum()
+        return (weight * prediction.render(surface, loaded.photograph(1), vertices, moved, 16, 3)[0]).sum()
 
     change = torch.zeros_like(material[which], requires_grad=True)
     loss(change).backward()

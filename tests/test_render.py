@@ -22,8 +22,9 @@ from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import camera_paths
 from mi_ring.output.film import write_film
 from mi_ring.plugins.flash import Flash
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
 from mi_ring.system import command
 
 CENTER, RADIUS, SHIFT = np.array([400.0, -150.0, 90.0]), 20.0, np.array([0.3, -0.5, 0.2])
@@ -296,7 +297,7 @@ def test_the_flow_begins_with_the_domain_and_ends_with_the_object(tmp_path, run)
                                     "bsdf": {"type": "cooktorrance"}},
     })  # fmt: skip
     last = Photographs.of([frames[-1].sensor])
-    expected, _ = bridge.draw(bridge.Surface(plain, plain.shapes()[0]), last, spp=16)
+    expected, _ = prediction.draw(Surface(plain, plain.shapes()[0]), last, spp=16)
     np.testing.assert_allclose(read(tmp_path / "flow" / "004.exr"), expected[0].numpy(), rtol=1e-3, atol=1e-5)
 
 

@@ -11,10 +11,11 @@ import pytest
 import torch
 from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
+from mi_ring.calibration.room_light import RoomLight
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, room_element, room_elements, scene_bytes
-from mi_ring.fitting.room_light import Room
-from mi_ring.rendering import bridge, indirect_light
+from mi_ring.rendering import indirect_light
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to
@@ -173,10 +174,10 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     observed[:, ::9, ::7] *= 30
     observed = torch.from_numpy(observed).to(machine.device())
     direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0))).to(machine.device())
-    room = Room(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
+    room = RoomLight(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
     for seed in range(12):
-        around = bridge.surroundings(surface, photographs, direct[..., 3], seed, 70, 64, room=room.which)
+        around = GlobalIllumination.of(surface, photographs, direct[..., 3], seed, 70, 64, harmonics=room.which)
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
         free = torch.from_numpy(pictures(render_photographs(dark, lit_so_far, 64, 0))).to(direct) - direct
@@ -184,7 +185,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     good = (direct[..., 3] == 1) & ((observed - predicted).abs() < 1).all(-1)
     missing, added = (  # in blocks of 7 × 10 pixels: single ones are noisy
         torch.nn.functional.avg_pool2d((picture * good[..., None]).movedim(-1, 1), (7, 10))
-        for picture in (observed - predicted, around.room(room.harmonics))
+        for picture in (observed - predicted, around.room_light(room.harmonics))
     )
     assert float((added - missing).abs().mean()) < 0.13 * float(missing.abs().mean())
     assert not room.harmonics[truth.sum(1) == 0].any()
@@ -192,9 +193,9 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
 
 def test_without_anything_seen_the_room_is_as_given():
     given = torch.from_numpy(some_room()).float()
-    room = Room(given, 0.3, ("world", "camera"))
+    room = RoomLight(given, 0.3, ("world", "camera"))
     dark = torch.zeros(len(ALL), 1, 5, 7, 3)
-    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), ALL, dark, dark, torch.ones(1, 5, 7), torch.ones(1, 10, 14),
+    around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, dark, dark, torch.ones(1, 5, 7), torch.ones(1, 10, 14),
                                  2)  # fmt: skip
     room.see(around, torch.zeros(1, 10, 14, 3), torch.ones(1, 10, 14, 3), torch.ones(1, 10, 14) > 0)
     torch.testing.assert_close(room.harmonics, given)
@@ -204,14 +205,14 @@ def test_a_room_takes_no_light_away():
     """Photographs that are too dark in red, too bright in green, by what one room would show in both."""
     random = torch.Generator().manual_seed(0)
     harmonics = torch.rand(len(ALL), 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
-    around = bridge.Surroundings(torch.zeros(1, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(1, 5, 7),
+    around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(1, 5, 7),
                                  torch.ones(1, 10, 14), 2)  # fmt: skip
     truth = torch.from_numpy(some_room()).float()[:, :1].repeat(1, 3)
     assert float(truth[0, 0]) > 0
     truth[:, 0] *= -1
     truth[COUNT:] = 0
     missing = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL]).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    room = Room(torch.zeros(BASIS, 3), 0.3)
+    room = RoomLight(torch.zeros(BASIS, 3), 0.3)
     room.see(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
     assert not room.harmonics[:, 0].any()
     found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[ALL, 1]) for part in (room.harmonics, truth))

@@ -20,6 +20,7 @@ from mi_ring.experiments.measures import COURSE, POINTS, evaluated
 from mi_ring.experiments.tables import csv_text, headings, markdown, table_of
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.light_selection import choose_lighting
 from mi_ring.metrics.evaluation import rounded
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.scene.plain_mesh import scene_of
@@ -127,16 +128,17 @@ def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
 
     def look(it: Iteration) -> None:
         if it.number * POINTS // fit.iterations > len(rows):
-            s, faces = fit.ring.domain.sample(fit.config.subdivisions)
+            s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
             with torch.no_grad():
-                vertices = fit.ring.surface(s.to(fit.device)).cpu().numpy()
+                vertices = fit.ring.surface(s.to(fit.problem.device)).cpu().numpy()
             diagonal = float(np.linalg.norm(mesh.extents))
             numbers, _ = compare_surfaces(fit.capture, scene_of(vertices, faces), truth, diagonal)
-            rows.append({"iteration": it.number, "seconds": fit.seconds, **numbers})
+            rows.append({"iteration": it.number, "seconds": fit.course.seconds, **numbers})
 
     with threads_of(made.asked.threads):
         config = run.config(made.asked)
-        fit = Fit(load_capture(made.scene, masks=config.masks), config, callbacks=[look])
+        capture = load_capture(made.scene, masks=config.masks)
+        fit = Fit(capture, config, callbacks=[look], lighting=choose_lighting(capture, config))
         for _ in progress(fit, "iterations", total=fit.iterations):
             pass
         fit.save(job.folder)

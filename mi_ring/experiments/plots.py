@@ -17,7 +17,8 @@ from mi_ring.metrics.surfaces import hits, load_true_mesh
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions, dress
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 WIDTH = 256  #: of pictures, at most [px]
 SPP = 16  #: of theirs
@@ -159,7 +160,9 @@ def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
     assert outcome.made
     capture = load_capture(outcome.made.folder / "scene.xml", images=False)
     scale = -(-capture.sensors[0].size[0] // WIDTH)
-    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
-    rgb, _ = bridge.draw(surface, capture.photograph(0, scale), SPP, shadows=capture.shadows, indirect=ring.indirect)
+    rgb, _ = prediction.draw(
+        surface, capture.photograph(0, scale), SPP, shadows=capture.shadows, indirect=ring.indirect
+    )
     return linear_to_srgb(rgb[0].numpy()).clip(0, 1), scale

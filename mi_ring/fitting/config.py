@@ -12,7 +12,7 @@ from mi_ring.errors import InputError
 #: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
 WEIGHTS = {
     "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03,
-    "normal_variation": 0.0, "material_variation": 0.0, "material_rank": 0.0,
+    "normal_variation": 0.0, "material_rank": 0.0,
 }  # fmt: skip
 
 
@@ -56,10 +56,7 @@ class Config:
     batch: int = 8
     """Photographs per iteration."""
     steps: int = 3
-    """Steps of the flow, the paper's T: Euler's, unless --solver says otherwise."""
-    solver: Literal["euler", "midpoint", "rk4", "dopri5"] = "euler"
-    """How the flow is integrated. midpoint, rk4: steps of second and fourth order, of two and four velocities each;
-    dopri5: as many steps as a tolerance asks for, by the package torchdiffeq."""
+    """Euler steps of the flow, the paper's T."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
     """ring: the paper's flow, one velocity field for all steps. To compare, as many blocks with weights of their own,
     which is no flow: resnet: narrow ones, of as many parameters together; wide-resnet: of the ring's width."""
@@ -67,8 +64,6 @@ class Config:
     """Positional encoding of both networks. linear: frequencies 1, 2, 3, …; octaves: 1, 2, 4, 8, …; none: none."""
     frequencies: int = 16
     """How many frequencies the encoding has."""
-    material_at: Literal["domain", "surface"] = "domain"
-    """What BRDF-Net is a function of: points of the start surface, or, to compare, of the deformed one."""
     resample: bool = True
     """Have the vertices at other points of the start surface in each iteration? The sphere is randomly rotated."""
     spp: int = 1
@@ -88,16 +83,13 @@ class Config:
     """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
     flow is, the paper's lambda; calibration: how far what is refined is from what the scene says; settling: how
     much the material varies, at the end under an unknown environment. Priors, off by default: normal_variation: edges
-    rather than curves; material_variation: patches of one material each; material_rank: mixtures of few basis
-    materials."""
+    rather than curves; material_rank: mixtures of few basis materials."""
     velocity_decay: float = 0.03
     """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
     while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while
     much of the light is unexplained."""
     laplacian_scale: float = 0.01
     """The paper's alpha: how much the regulariser smoothes the velocity field."""
-    blur: float = 0.06
-    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to a pixel."""
     optimizer: Literal["muon", "adam"] = "muon"
     """muon: Muon for the hidden weights, Adam for the rest. adam: Adam for all."""
     learning_rate: float = 3e-3
@@ -158,10 +150,8 @@ class Config:
             require(getattr(self, name) >= 1, name, "at least 1")
         require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
         require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
-        require(self.shape_net == "ring" or self.solver == "euler", "solver", f"euler for --shape-net {self.shape_net}")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
-        for name in ("blur", "laplacian_scale"):
-            require(0 <= getattr(self, name) < math.inf, name, "0 or more")
+        require(0 <= self.laplacian_scale < math.inf, "laplacian_scale", "0 or more")
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")

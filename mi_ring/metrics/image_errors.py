@@ -9,7 +9,8 @@ from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 SPP = 64  #: samples per pixel of predicted photographs, by default
 WINDOW = 11  #: of SSIM [px]
@@ -24,13 +25,15 @@ def compare_photographs(
     of each. What is predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR. In a room
     that was not black only what is wholly object by its mask counts: nobody predicts the rest.
     """
-    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     views: list[dict] = []
     for k in range(len(capture)) if index is None else index:
         name = capture.names[k]
-        rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
+        rgb, _ = prediction.draw(
+            surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect
+        )
         predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
         seen = capture.observe([k])
         observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))

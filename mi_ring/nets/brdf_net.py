@@ -82,7 +82,7 @@ class MaterialNet(nn.Module):
 class BRDFNet(MLP, MaterialNet):
     """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons. Or the parameters of another BSDF.
 
-    On the domain point s, not on the deformed point, unless `FittedObject.material_at` says so.
+    On the domain point s, not on the deformed point.
     """
 
     def __init__(

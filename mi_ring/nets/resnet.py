@@ -7,8 +7,7 @@ from torch import nn
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import WIDTH
 from mi_ring.nets.registry import register_network
-from mi_ring.nets.shape_net import Flow, ShapeNet, VelocityField
-from mi_ring.nets.solvers import Velocity
+from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 
 
 @register_network("resnet")
@@ -55,11 +54,8 @@ def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
     return [narrow + 1] * wide + [narrow] * (blocks - wide)
 
 
-def shape_net_of(kind: str, steps: int, solver: str, encoding: str, frequencies: int) -> Flow:
-    """The network in Shape-Net's place: the `ring`, a `resnet` of as many parameters, a `wide-resnet` of its width.
-
-    Raises InputError if the package that the solver needs is not installed.
-    """
+def shape_net_of(kind: str, steps: int, encoding: str, frequencies: int) -> Flow:
+    """Shape-Net (`ring`), a ResNet with as many parameters (`resnet`), or a ResNet of its width (`wide-resnet`)."""
     if kind == "ring":
-        return ShapeNet(steps, solver, encoding, frequencies)
+        return ShapeNet(steps, encoding, frequencies)
     return ResNet(steps, encoding, frequencies, WIDTH if kind == "wide-resnet" else None)

@@ -1,5 +1,6 @@
 """Shape-Net: a recurrent ResNet that integrates a flow and carries the domain onto the object (paper, section 3)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,9 +11,10 @@ from mi_ring.nets.chunks import backward_in_chunks, forward_in_chunks
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import MLP, WIDTH, Layers, _plain
 from mi_ring.nets.registry import register_network
-from mi_ring.nets.solvers import SOLVERS, Velocity, dopri5, odeint
 
 SPEED = 2.0  #: bound of the velocity, per unit of time: what is opposite on the unit sphere can be reached
+
+Velocity = Callable[[Tensor], Tensor]
 
 
 class Flow(nn.Module):
@@ -24,7 +26,6 @@ class Flow(nn.Module):
     """
 
     steps: int = 20  #: T: steps from the domain to the object
-    solver: str = "euler"  #: one of `mi_ring.nets.solvers.SOLVERS`; dopri5 takes steps of its own
 
     def velocity(self, x: Tensor) -> Tensor:
         """V(x) for (..., 3) points, of the same shape and type."""
@@ -35,18 +36,16 @@ class Flow(nn.Module):
         return self.velocity
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Φ(x, steps / T): the first `steps` of the T steps, Euler's being `x ← x + V(x) / T`, of (V, 3) points."""
-        if self.solver == "dopri5":
-            return dopri5(self.velocity, x, steps / self.steps)
+        """Φ(x, steps / T): the first `steps` of the T steps `x ← x + V(x) / T`, of (V, 3) points."""
         for step in range(steps):
-            x = SOLVERS[self.solver](self.velocity_of(step), x, 1 / self.steps)
+            x = x + self.velocity_of(step)(x) / self.steps
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
         """Φ(x, time), `time` in [0, 1]; where that is between two steps, by a shorter one."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
-        return SOLVERS[self.solver](self.velocity_of(steps), x, rest) if rest else x
+        return x + rest * self.velocity_of(steps)(x) if rest else x
 
 
 class VelocityField(MLP):
@@ -69,24 +68,15 @@ class VelocityField(MLP):
 
 @register_network("shapenet")
 class ShapeNet(VelocityField, Flow):
-    """The paper's flow, of one velocity field for all steps: the ring.
+    """The paper's flow: one velocity field for all steps."""
 
-    Raises InputError if the package that a `solver` needs is not installed.
-    """
-
-    def __init__(
-        self, steps: int = 20, solver: str = "euler", encoding: str = "linear", frequencies: int = 16
-    ) -> None:  # fmt: skip
+    def __init__(self, steps: int = 20, encoding: str = "linear", frequencies: int = 16) -> None:
         super().__init__(PosEnc(frequencies, encoding))
-        if solver not in SOLVERS:
-            raise ValueError(f"solver: is {solver}, must be one of {', '.join(SOLVERS)}")
-        if solver == "dopri5":
-            odeint()
-        self.steps, self.solver = steps, solver
+        self.steps = steps
 
     def arguments(self) -> dict:
         """What makes it anew."""
-        return {"steps": self.steps, "solver": self.solver, **self.encoding.arguments()}
+        return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
         """As `Flow.flow`, in bfloat16 under `torch.autocast`.
@@ -94,7 +84,7 @@ class ShapeNet(VelocityField, Flow):
         Differentiable once and by one backward pass, which frees what was kept for it; within
         `mi_ring.nets.mlp.plain_autograd` as often as one likes.
         """
-        if _plain.get() or self.solver != "euler":
+        if _plain.get():
             return super().flow(x, steps)
         return _Flow.apply(x, SPEED / self.steps, steps, *self.operands(x))
 

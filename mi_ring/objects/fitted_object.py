@@ -15,8 +15,7 @@ class FittedObject(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
 
     `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
-    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `material_at`: BRDF-Net is a
-    function of points of the "domain", or, to compare, of those of the "surface". `subdivisions`: the level to
+    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
     sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
     paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shape_net.Flow` and
     `mi_ring.nets.brdf_net.MaterialNet` say. `ground` (2, 3): a point on the table that the object stands on, and the
@@ -35,11 +34,11 @@ class FittedObject(nn.Module):
         domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE,
         bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
         networks: tuple[Flow, MaterialNet] | None = None, ground: np.ndarray | Tensor | None = None,
-        up: Sequence[float] | np.ndarray | None = None, metres: float | None = None, material_at: str = "domain",
+        up: Sequence[float] | np.ndarray | None = None, metres: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
-        self.bsdf, self.indirect, self.subdivisions, self.material_at = bsdf, indirect, subdivisions, material_at
+        self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.register_buffer("ground", None if ground is None else torch.as_tensor(ground, dtype=torch.float32))
@@ -53,13 +52,11 @@ class FittedObject(nn.Module):
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
         """Parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
-        return self.brdf_net(s if self.material_at == "domain" else self.shape_net(s))
+        return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """`surface` and `material`, by one pass of the flow. The material is that of the end of its time, always."""
-        moved = self.shape_net(s, time)
-        at_end = self.material_at == "surface" and time == 1
-        return self.placed(moved), self.brdf_net(moved) if at_end else self.material(s)
+        """`surface` and `material`."""
+        return self.surface(s, time), self.material(s)
 
     def placed(self, points: Tensor) -> Tensor:
         """Points (V, 3) of the normalised frame in scene units, those below the ground on it."""

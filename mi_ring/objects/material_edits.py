@@ -13,7 +13,6 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.sphere_map import SphericalMap
 from mi_ring.nets.brdf_net import MaterialNet
-from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 
@@ -39,8 +38,7 @@ def dress(ring: FittedObject, options: MaterialOptions) -> None:
     """Give a ring the material that the options ask for. Raises InputError if it cannot have it."""
     if options.material:
         other = load_fit(options.material)
-        ring.bsdf, ring.material_at = other.bsdf, "domain"
-        ring.brdf_net = other.brdf_net if other.material_at == "domain" else OnSurface(other.brdf_net, other.shape_net)
+        ring.bsdf, ring.brdf_net = other.bsdf, other.brdf_net
         if not same_domain(ring, other):
             here = SphericalMap(ring.domain, "--material: the shape")
             there = SphericalMap(other.domain, f"{options.material}: --material")
@@ -83,17 +81,6 @@ def same_domain(a: FittedObject, b: FittedObject) -> bool:
     if isinstance(a.domain, Sphere) or isinstance(b.domain, Sphere):
         return type(a.domain) is type(b.domain)
     return np.array_equal(a.domain.points, b.domain.points) and np.array_equal(a.domain.faces, b.domain.faces)
-
-
-class OnSurface(MaterialNet):
-    """A BRDF-Net that is a function of points of its own object's surface, as one of points of the domain."""
-
-    def __init__(self, net: MaterialNet, shape_net: Flow) -> None:
-        super().__init__(net.bsdf_parameters, float(net.scale))
-        self.net, self.shape_net = net, shape_net
-
-    def forward(self, s: Tensor) -> dict[str, Tensor]:
-        return self.net(self.shape_net(s.reshape(-1, 3)).reshape(s.shape))
 
 
 class Carried(MaterialNet):

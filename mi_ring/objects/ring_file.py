@@ -2,7 +2,6 @@
 
 import io
 import math
-import sys
 import zipfile
 from pathlib import Path
 
@@ -32,28 +31,40 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
         "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
         "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
         "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
-        "up": ring.up, "metres": ring.metres, "material_at": ring.material_at,
+        "up": ring.up, "metres": ring.metres,
     }  # fmt: skip
 
 
 def ring_of(state: dict) -> FittedObject:
     """The inverse of `ring_state`.
 
-    Raises InputError for networks that are not registered here; KeyError, RuntimeError, TypeError or ValueError for
-    what no `ring_state` can be.
+    Raises InputError for networks that are not registered here, and for those of an older version's `--solver` and
+    `--material-at`; KeyError, RuntimeError, TypeError or ValueError for what no `ring_state` can be.
     """
+    refuse("material_at", state.get("material_at", "domain"), "domain")
+    shape_net = state["shape_net"]
+    if shape_net["name"] == "shapenet":
+        arguments = dict(shape_net["arguments"])
+        refuse("solver", arguments.pop("solver", "euler"), "euler")
+        shape_net = {**shape_net, "arguments": arguments}
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
         require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
     ring = FittedObject(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
-        subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
+        subdivisions=state["subdivisions"], networks=(build(shape_net), build(state["brdf_net"])),
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
-        material_at=sys.intern(state.get("material_at", "domain")),  # as that of a fit anew, so that files are equal
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     require_sound(ring)
     return ring
+
+
+def refuse(name: str, found: object, supported: str) -> None:
+    """Raise InputError for a setting of an older version that is not the one still supported."""
+    if found != supported:
+        raise InputError(f"{name}: is {found}, only {supported} is supported; fit again, or use the version of mi_ring "
+                         "that wrote this file")  # fmt: skip
 
 
 def require_sound(ring: FittedObject) -> None:
@@ -68,7 +79,6 @@ def require_sound(ring: FittedObject) -> None:
     require(ring.ground is None or ring.ground.shape == (2, 3), "ground is no place and normal")
     require(ring.up is None or (len(ring.up) == 3 and all(map(math.isfinite, ring.up))), "up is no direction")
     require(isinstance(ring.bsdf, str), "the BSDF is no XML")
-    require(ring.material_at in ("domain", "surface"), f"a material at {ring.material_at}")
     points, faces = ring.domain.points, ring.domain.faces
     require(points.shape[1:] == faces.shape[1:] == (3,) and bool(np.isfinite(points).all()), "the domain is no mesh")
     require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")

@@ -19,9 +19,10 @@ from mi_ring.metrics.image_errors import SPP
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions
 from mi_ring.output.atlas import flowed
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import LANES, Photographs
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.assembly import assembled, is_table, own_emitters
 from mi_ring.scene.lights import Light, is_flash, is_room
 from mi_ring.scene.xml_elements import load_element
@@ -181,15 +182,15 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
     return Camera(to_world, np.full(2, focal), np.array(camera.size) / 2, camera.size), middle
 
 
-def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> bridge.Surface:
+def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
     """The object in its scene, in the light that the options ask for."""
     if config.envmap:
         return under(config.envmap, up_of(capture, config), capture, ring)
-    return bridge.Surface(capture.scene, capture.shape, ring, as_it_is=integrator_of(config) is not None)
+    return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
 
 
 def render_views(
-    surface: bridge.Surface, ring: FittedObject, views: list[View], integrator: mi.Integrator | None, shadows: bool,
+    surface: Surface, ring: FittedObject, views: list[View], integrator: mi.Integrator | None, shadows: bool,
     config: RenderConfig, room: np.ndarray | None = None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """The pictures, (H, W, 3) linear radiance each; `room`: its light, as `Photographs` have it."""
@@ -203,7 +204,7 @@ def render_views(
             yield in_passes(surface.scene, view.sensor, integrator, config.spp, seed=k)
         else:
             one = Photographs.of([view.sensor], room)
-            rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=shadows, indirect=ring.indirect)
+            rgb, _ = prediction.draw(surface, one, spp=config.spp, shadows=shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 
 
@@ -225,7 +226,7 @@ def in_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int,
     return total
 
 
-def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) -> bridge.Surface:
+def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) -> Surface:
     """The object and what else is in the scene but its table, lit by an environment and by fixed lamps."""
     to_world = np.eye(4)
     to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
@@ -238,4 +239,4 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) ->
     lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
-    return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring, as_it_is=True)
+    return Surface(assembled([object_, *others], [light, *lamps]), object_, ring, in_scene_units=True)

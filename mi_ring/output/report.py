@@ -24,9 +24,11 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.metrics.image_errors import comparable
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.output import calibration_panel
+from mi_ring.output.calibration_panel import held_out_text, panel
+from mi_ring.output.fit_result import FitResult
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
 from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
@@ -53,16 +55,12 @@ class PhotographPanel:
     kept_out: bool = False  # of the fit: what is wrong with it, its pose for instance, is not told
 
 
-def report_html(
-    fit: Any, glb: bytes | None = None, unseen: float | None = None, refined: dict[str, Any] | None = None
-) -> str:
-    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer.
-
-    `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
-    """
-    capture, ring = fit.calibrated(), fit.ring
+def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
+    """The page of a fit. `glb`: the object, for the viewer. `unseen`: share of its area that no photograph shows."""
+    capture, ring, refined = result.capture, result.ring, result.calibration
+    surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = in_turn(partial(predicted, fit, capture), partial(panels_of, fit, capture), some)
+    parts = in_turn(partial(predicted, result, surface), partial(panels_of, result), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # Of many photographs those that are shown may all be kept out.
@@ -71,8 +69,8 @@ def report_html(
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     made = f"sRGB, {pixels}, 4 samples each"
-    if any(scale_of(fit, size) > 1 for size in capture.sizes):
-        made += f", at most {fit.config.widths[-1]} px wide"
+    if any(scale_of(result, size) > 1 for size in capture.sizes):
+        made += f", at most {result.width} px wide"
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
@@ -82,9 +80,9 @@ def report_html(
             if masked
             else "no masks of the whole object"
         ),
-        "Iterations": f"{fit.iteration} of {fit.iterations}",
-        "Fit time": f"{fit.seconds:.0f} s",
-        **({"Photographs kept out": calibration_panel.held_out_text(fit.confirmed)} if len(fit.held_out) else {}),
+        "Iterations": f"{result.iteration} of {result.iterations}",
+        "Fit time": f"{result.seconds:.0f} s",
+        **({"Photographs kept out": held_out_text(result.validation)} if len(result.held_out) else {}),
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
         "Made by": f"mi_ring {__version__}",
@@ -93,10 +91,10 @@ def report_html(
     files = resources.files("mi_ring.output")
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
-        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
-        settings=fit.config.settings(),
-        findings=fit_findings(fitted, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
-        refined=refined and calibration_panel.panel(fit.capture, capture, refined),
+        name=scene_name(result.given.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(result),
+        settings=result.settings,
+        findings=fit_findings(fitted, result.iteration, result.iterations, refined, result.unexplained),
+        refined=refined and panel(result.given, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         saturated=SATURATED, viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
@@ -182,23 +180,24 @@ class Prediction(NamedTuple):
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
     coverage: np.ndarray  #: (H, W), in [0, 1]
-    maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
+    maps: dict[str, np.ndarray]  #: normals and material, as `prediction.maps` returns them, smaller
 
 
-def scale_of(fit: Any, size: tuple[int, int]) -> int:
-    """By how much photographs of this size are compared smaller than they are: as the fit has seen them at last."""
-    return -(-size[0] // fit.config.widths[-1])
+def scale_of(result: FitResult, size: tuple[int, int]) -> int:
+    """How many times smaller photographs of this size are compared: as in the last stage of the fit."""
+    return -(-size[0] // result.width)
 
 
-def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]:
-    """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
+def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Prediction]:
+    """Predictions of photographs `index`, all of one size."""
+    capture, ring = result.capture, result.ring
     size = capture.sensors[index[0]].size
-    scale = scale_of(fit, size)
-    rgb, coverage = bridge.draw(
-        fit.surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
+    scale = scale_of(result, size)
+    rgb, coverage = prediction.draw(
+        surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=ring.indirect, paths=4
     )
     small = capture.selected(index, max(scale, max(size) // PICTURE))
-    maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
+    maps = prediction.maps(surface, small, ring.brdf_net.bsdf_parameters)
     return [
         Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
         for n in range(len(index))
@@ -206,15 +205,16 @@ def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]
 
 
 def panels_of(
-    fit: Any, capture: Capture, index: np.ndarray, predictions: Sequence[Prediction]
+    result: FitResult, index: np.ndarray, predictions: Sequence[Prediction]
 ) -> list[tuple[PhotographPanel, float]]:
     """`panel_of` of several photographs."""
-    return [panel_of(fit, capture, int(k), prediction) for k, prediction in zip(index, predictions)]
+    return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
-def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
-    scale = scale_of(fit, capture.sensors[k].size)
+def panel_of(result: FitResult, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
+    """The row of photograph `k`, and its mean squared error in sRGB over the pixels that are `comparable`."""
+    capture, brdf_net = result.capture, result.ring.brdf_net
+    scale = scale_of(result, capture.sensors[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
@@ -232,9 +232,9 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         "4 × difference": 4 * np.abs(photo - guess) * compared[..., None],
         "normals": normal,
     }
-    for p in fit.ring.brdf_net.bsdf_parameters:
+    for p in brdf_net.bsdf_parameters:
         if math.isinf(p.high):
-            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(fit.ring.brdf_net.scale)))
+            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(brdf_net.scale)))
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
@@ -246,7 +246,7 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
         shift=by and (scale * by[0], scale * by[1]),
-        kept_out=k in fit.held_out,
+        kept_out=k in result.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )
     return row, error
@@ -273,24 +273,24 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def loss_curve(fit: Any) -> str:
+def loss_curve(result: FitResult) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()
-    for term in ("loss", *fit.terms):
+    for term in ("loss", *result.terms):
         points = []
-        for entry in fit.log:
+        for entry in result.log:
             weight = 1.0 if term == "loss" else entry["weights"].get(term, 0.0)
             points.append((entry["iteration"], weight * entry.get(term, 0.0)))
         points = [(iteration, value) for iteration, value in points if value > 0]
         if points:
             label = "loss" if term == "loss" else f"weighted {term}"
             axes.semilogy(*zip(*points), label=label, linewidth=2 if term == "loss" else 1)
-    for stage in fit.stages[1:]:
-        if stage.first < fit.iteration:
-            axes.axvline(stage.first, color="0.7", linewidth=1, linestyle=":")
+    for first in result.stage_starts[1:]:
+        if first < result.iteration:
+            axes.axvline(first, color="0.7", linewidth=1, linestyle=":")
     axes.set_xlabel("iteration (dotted: next stage)")
     axes.grid(alpha=0.3)
-    if fit.log:
+    if result.log:
         figure.legend(loc="outside right upper")
     return svg_uri(figure)

@@ -12,7 +12,7 @@ from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_ele
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.photogrammetry.reduced_photographs import View
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
 
@@ -64,6 +64,6 @@ def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress
         fit = Fit(capture, SETTINGS)
         for _ in progress(fit, "a trial fit", fit.iterations):
             pass
-    fit.surface.show(fit.ring, *fit.ring.domain.sample(SETTINGS.subdivisions))
-    drawn = (bridge.draw(fit.surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
+    surface = fit.renderer.showing(fit.model, SETTINGS.subdivisions)
+    drawn = (prediction.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]

@@ -158,9 +158,14 @@ class Photographs:
         return own
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of the selected photographs: their number, height and width [px]."""
+        return len(self), self.size[1], self.size[0]
+
+    @property
     def pixels(self) -> int:
         """Of all selected photographs together."""
-        return len(self) * self.size[0] * self.size[1]
+        return math.prod(self.shape)
 
     def lanes_before(self, spp: int, first: int = 0):
         """The number of the first lane of these photographs, or of pixel `first` of theirs, if a pixel has `spp`."""

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.scene.lights import LAMPS, Light, emitter_of, light_of
+from mi_ring.scene.lights import LAMPS, Light, emitter_of, light_of, place_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.xml_elements import load_bsdf
 
@@ -33,6 +34,12 @@ def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
     before = lamps_of(scene)
     others = [emitter for emitter in own_emitters(scene) if emitter not in before]
     return assembled(scene.shapes(), [*others, *map(emitter_of, lamps)], scene.sensors(), scene.integrator())
+
+
+def place_lamps(scene, places, strengths) -> None:
+    """Change the `lamps_of` a scene, made by `emitter_of`: positions or directions, and RGB, Floats of 3 per lamp."""
+    for k, lamp in enumerate(lamps_of(scene)):
+        place_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
