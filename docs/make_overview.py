@@ -2,8 +2,8 @@
 
 python docs/make_overview.py RUN docs/skull/overview.jpg [--photograph 32]
 
-RUN is a results folder whose photographs are 8-bit files. The mesh is drawn in grey. Everything is rendered by Mitsuba's
-`path`; the three pictures are cropped to the object.
+RUN is a results folder whose photographs are 8-bit files. The mesh is drawn in grey. Mitsuba's `path` renders mesh and
+object. The three pictures are cropped to the object.
 """
 
 import argparse
