@@ -140,10 +140,11 @@ def literal(text: str) -> str:
 
 
 def help_of(command: str, *arguments: str) -> str:
-    """What a command prints when it is asked for help, in lines of at most 100 characters."""
+    """What a command prints when it is asked for all its help, in lines of at most 100 characters."""
+    asked = "--help-all" if command == "fit" else "--help"
     page = io.StringIO()
     with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
-        importlib.import_module(f"mi_ring.{command}").main([*arguments, "--help"])
+        importlib.import_module(f"mi_ring.{command}").main([*arguments, asked])
     lines = (textwrap.wrap(line, 100) or [""] if line[:1].isalpha() else [line] for line in page.getvalue().split("\n"))
     return "\n".join(line for wrapped in lines for line in wrapped).strip()
 

@@ -25,31 +25,33 @@ OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives th
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """Reconstruct many objects, several at a time, on this machine or on those of a Ray cluster.
+    """Reconstruct many objects, several at a time, on this machine or on a Ray cluster.
 
-    Options after -- are those of mi_ring.fit, for all of them. A fit whose process or machine dies goes on from its
-    last checkpoint; one whose input is wrong fails, and the others go on. The same command again goes on with what is
-    unfinished and leaves out what is done, unless its files or options have changed. The exit status is 1 if not all
-    are done.
+    Options after -- are options of mi_ring.fit and hold for all fits. A fit whose process or machine dies continues
+    from its last checkpoint. A fit whose input is wrong fails, and the others continue. The same command again does
+    what is unfinished; finished fits are left out unless their files or options have changed. The exit status is 1 if a
+    fit is not done.
     """
 
     scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE.xml")]]
-    """Mitsuba XML files with the photographs of an object each."""
+    """Mitsuba XML files, each with the photographs of one object."""
     out: Path = Path("out")
-    """Folder of all results: each scene's are in a folder of its name, index.html shows them all, batch/ has what fits
-    have printed. On a cluster all machines must have it, and the scenes, at the same place."""
+    """Folder for all results. Each scene gets a folder of its name, and index.html shows them all.
+    batch/ keeps what each fit has printed. On a cluster, scenes and this folder have the same path on all machines."""
     workers: int = 1
-    """How many fits run at a time."""
+    """Number of fits that run at the same time."""
     cpus: int = 0
-    """Processor cores of each fit; 0: this machine's, shared out among --workers."""
+    """Processor cores for each fit. 0: the cores of this machine, shared among --workers."""
     gpus: float = 0
-    """GPUs of each fit, of which it may share one; give --variant cuda_ad_rgb after --, too."""
+    """GPUs for each fit. 0.5 lets two fits share one.
+    Give --variant cuda_ad_rgb after -- as well."""
     memory: float = 0
-    """Memory that a fit needs [GiB]: no more run on a machine than it has room for. 0: however much."""
+    """Memory that a fit needs [GiB]. A machine gets no more fits than it has memory for.
+    0: no limit."""
     retries: int = 3
-    """How often in a row a fit may die without getting any further."""
+    """How many times in a row a fit may die without progress before it counts as failed."""
     address: str | None = None
-    """Of a Ray cluster, such as auto or 10.0.0.1:6379; by default this machine is used alone."""
+    """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
 
     def __post_init__(self) -> None:
         for name, least in (("workers", 1), ("cpus", 0), ("gpus", 0), ("memory", 0), ("retries", 0)):

@@ -16,10 +16,10 @@ from mi_ring.system.files import require_place, write_file
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Write a sheet of markers, to be printed and put under the object: it tells scale, cameras and white."""
+    """Write a sheet of markers to print and put under the object. In photographs it shows scale, cameras and white."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write, .pdf or .png."""
+    """File to write: .pdf or .png."""
     paper: Literal["a4", "letter"] = "a4"
     """Size of the paper."""
 

@@ -23,7 +23,7 @@ OPTIONAL = {
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Say what this machine lacks for mi_ring, and how to get it. The exit status is 1 if a fit cannot run."""
+    """Say what mi_ring lacks on this machine and how to get it. The exit status is 1 if a fit cannot run."""
 
 
 class Finding(NamedTuple):

@@ -21,7 +21,7 @@ class ExampleConfig:
     """Write a small capture: flash photographs of a pot, their masks and scene file, and the true mesh."""
 
     folder: Positional[Annotated[Path, arg(metavar="DIR")]]
-    """Folder to write; it must not be there yet, or be empty."""
+    """Folder to write. It must be new or empty."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
@@ -30,29 +30,30 @@ FINEST, FINEST_PLY = 8, 10  #: level of a mesh with textures, and of one that ha
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(MaterialOptions):
-    """Write the object of a finished fit for other programs. The file's name says as what.
+    """Write the object of a finished fit for other programs. The suffix of the file chooses the format.
 
-    .ply: the mesh with the parameters of its BSDF as vertex attributes, and whether any photograph shows the vertex.
-    .glb: with a normal map and the material as glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files.
-    .xml: a scene for Mitsuba, with bitmap textures and a stock BSDF, that needs no mi_ring. Positions are in the
-    scene's units and frame; a GLB has a node that makes metres of the units and puts the object upright, as far as the
-    capture says them.
+    .ply: the mesh; vertex attributes are the parameters of its BSDF, and whether any photograph shows the vertex.
+    .glb: the mesh with a normal map and glTF's metallic-roughness material. .obj: the same as OBJ, MTL and PNG files.
+    .xml: a Mitsuba scene with bitmap textures and a stock BSDF, which needs no mi_ring.
+
+    Positions are in the units and the frame of the scene. A GLB has a node that converts to metres and puts the object
+    upright, if the capture says how.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write; OBJ and XML bring others of the same name along."""
+    """File to write. OBJ and XML files come with further files of the same name."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices, up to 10 for .ply, 8 for others. Default: that of the fit; for
-    .glb 5, it has a normal map."""
+    """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
+    Without it: that of the fit, and 5 for .glb, whose normal map has the finer detail."""
     resolution: int = 2048
-    """Texels across the textures."""
+    """Width and height of the textures [texels]."""
     time: float = 1.0
-    """Of the flow: 0 is where it starts, 1 the object."""
+    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
     metres: float | None = None
-    """Length of a scene unit, which scales the GLB to glTF's metres. Default: as the capture says; one with the printed
-    sheet is in millimetres."""
+    """Length of a scene unit [m], for .glb, whose unit is the metre.
+    Without it: as the capture says; captures with the printed sheet are in millimetres."""
 
 
 def require_options(config: ExportConfig) -> None:
@@ -83,7 +84,7 @@ def require_options(config: ExportConfig) -> None:
         raise InputError(f"{config.file}: is a file of the fit or of a capture; choose another name")
 
 
-def seen_from(run: Path) -> list[View] | None:
+def seen_from(run: Path) -> list[MaskedCamera] | None:
     """What each photograph of a fit can show; None where that cannot be read."""
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")

@@ -25,39 +25,43 @@ Name: Any = Literal[tuple(EXPERIMENTS)]
 class PaperConfig:
     """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
 
-    Each run is a fit whose results are in OUT/NAME/runs/, by another preset than default in OUT/NAME-PRESET/runs/;
-    table.csv, table.md and figure.png beside it are there after each. The same command again goes on where it stopped.
-    A run that fails is shown as such and does not stop the others; the exit status is then 1.
+    Each run is a fit with its results in OUT/NAME/runs/, or in OUT/NAME-PRESET/runs/ for another preset than default.
+    table.csv, table.md and figure.png are written after each run. The same command again continues where it stopped. A
+    run that fails is shown as failed, and the others continue; the exit status is then 1.
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
-    """table1: accuracy; table2: DiLiGenT-MV; table3: poses that are refined; specularity: materials of rising gloss;
-    stripes: two materials; views: 5 to 50 photographs; ablation: the ring against plain ResNets; encoding; steps: the
-    paper's T; genus: from a sphere and from a hull; swap: materials exchanged; resolution: one fit at several levels;
-    timing: errors in the course of a fit; single: DiLiGenT's photographs from one side."""
+    """The experiment.
+    table1: accuracy. table2: DiLiGenT-MV. table3: wrong camera poses, refined.
+    specularity: materials from dull to glossy. stripes: two materials on one object. swap: materials exchanged.
+    views: 5 to 50 photographs. genus: from a sphere and from the visual hull.
+    ablation: the flow against plain ResNets. encoding: positional encodings. steps: Euler steps, the paper's T.
+    resolution: one fit at several mesh levels. timing: errors in the course of a fit.
+    single: DiLiGenT's photographs from one side."""
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]] = ()
-    """Folders of captures (scene.xml, truth/mesh.ply) or meshes; one mesh for specularity and stripes; the folder of
-    DiLiGenT-MV for table2, .npz files for single. Default, but for these two: what is at hand, pot2 or the example's
-    pot."""
+    """Captures (folders with scene.xml and truth/mesh.ply) or meshes. specularity and stripes take one mesh.
+    table2 takes the folder of DiLiGenT-MV, single takes .npz files.
+    Without it, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
     materials: tuple[str, ...] = ()
-    """What meshes are made of, as mi-ring synthesize has them: in turn, all on the one mesh of specularity, two in
-    stripes."""
+    """Materials of the meshes, as mi-ring synthesize takes them.
+    Meshes get them in turn. specularity puts all of them on its one mesh, stripes needs two."""
     out: Path = Path("out/paper")
-    """Folder of the results of all experiments, each in a folder of its name and preset, and of the captures that they
-    make."""
+    """Folder for the results of all experiments and for the captures that they make.
+    Each experiment has a folder of its name and preset."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
-    """Of the fits, as mi-ring fit has them. Default: default, and fast with --quick, which goes with no other."""
+    """Preset of the fits, as in mi-ring fit.
+    Without it: default, or fast with --quick, which allows no other."""
     seeds: tuple[int, ...] = (0,)
-    """Random seeds: each run once with each, and the mean."""
+    """Random seeds. Each run is made once with each, and the table has the means."""
     only: tuple[str, ...] = ()
-    """Names of runs to make now, the others later. Default: all."""
+    """Names of the runs to make now. Without it: all."""
     quick: bool = False
-    """A small version of everything, in minutes: few runs, few iterations of small photographs. Its results are in
-    OUT/NAME-quick."""
+    """Make a small version in minutes: few runs, few iterations, small photographs.
+    Its results are in OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
+    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
     threads: int = 0
-    """Processor threads of each fit; 0: all."""
+    """Number of processor threads of each fit. 0: all."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -34,7 +34,7 @@ from mi_ring.photogrammetry.workflow import (
     shots,
     upright,
 )
-from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
 from mi_ring.system.files import locked, write_file
 from mi_ring.system.machine import in_threads
@@ -48,29 +48,33 @@ METRES = 1e-3  #: of a unit of the scene, if there is a sheet
 class PhotosConfig:
     """Find the cameras of photographs, masks of the object and its place, and write a capture to fit.
 
-    The photographs: one object from all around that does not move, lit by a flash beside the lens in a dim room; JPEG,
-    HEIC, PNG, TIFF or raw. With a sheet of `mi-ring board` under the object, the capture is in millimetres and
-    upright. It can be interrupted: the same command goes on.
+    The photographs show one object from all around. It does not move. A flash beside the lens lights it in a dim room.
+    They are JPEG, HEIC, PNG, TIFF or raw files. With a sheet of `mi-ring board` under the object, the capture is in
+    millimetres and upright. After an interruption the same command continues.
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the photographs."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
-    """Folder to write: scene.xml, with what belongs to it; work/ holds what has been found so far."""
+    """Folder to write. It gets scene.xml and the files that this names.
+    work/ in it keeps what has been found so far; an interrupted command continues from there."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the flash from the lens, in the camera's axes (x right, y down, z forward) as most photographs are shown: of
-    those held otherwise it turns with the camera [mm with a sheet, which tells it more exactly; else the unit is the
-    median distance from the cameras to the object]."""
+    """Position of the flash relative to the lens: right, down and forward.
+    With a sheet the unit is mm, and the sheet refines it.
+    Without a sheet the unit is the median distance from the cameras to the object.
+    It is for photographs as most of them are held; for those held otherwise it turns with the camera."""
     turntable: bool = False
-    """Did the object turn, with the sheet under it, while camera and flash stood?"""
+    """Use it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
-    """auto: find masks; alpha: the photographs' alpha channels; rembg: by the package of that name, if it is installed;
-    else a folder of masks, each called like its photograph with .png added, or instead of its suffix."""
+    """Where the masks come from.
+    auto: they are found. alpha: the alpha channels of the photographs. rembg: the package rembg, if it is installed.
+    Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Lowest and highest x, y and z of the object, XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, in the frame of the sheet [mm], to
-    cut off what belongs to it in the photographs but should not."""
+    """Box around the object in the frame of the sheet [mm], as XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
+    Use it to cut off what touches the object in the photographs but is not part of it."""
     square_mm: float = SQUARE
-    """How long a square of the printed sheet is, measured with a ruler over several of them."""
+    """Length of one square of the printed sheet [mm].
+    Measure several squares with a ruler if the printer does not print at 100 %."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
@@ -215,7 +219,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     # Only where the flash's power is known is the reflectance, too, of which Fresnel's depends.
     root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
-        harmonics = np.zeros((COUNT, 3))
+        harmonics = np.zeros((PER_FRAME, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:

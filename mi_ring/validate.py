@@ -20,34 +20,35 @@ from mi_ring.system.progress import progress
 
 @dataclass(frozen=True)
 class ValidateConfig:
-    """Compare `photometric` with Mitsuba's path tracer on every photograph: shadows, interreflection, disagreement.
+    """Compare `photometric` with Mitsuba's path tracer on every photograph.
 
-    Prints a line for each photograph and one for all. In % of path's mean radiance: the mean difference of the two, the
-    mean of its absolute value and how much of that Monte Carlo noise explains, what shadows take away, what
-    interreflection adds, and what is left unexplained, the difference of direct light. "p direct" is how likely so
-    large a difference is if both renderers' direct light is the same, "p path" likewise of photometric and all light of
-    path: tiny where there is interreflection.
+    Prints a line for each photograph and one for all, in % of the path tracer's mean radiance: the mean difference and
+    the mean absolute difference; how much of it Monte Carlo noise explains; what shadows remove; what interreflection
+    adds; the difference of direct light, which is left unexplained. "p direct" is the probability of so large a
+    difference if both renderers' direct light is the same. "p path" is the same for photometric and all light of the
+    path tracer; it is tiny where there is interreflection.
 
-    Writes validate.png, a contact sheet, and validate.json, all numbers. Exit status: 1 if the direct light of the two
-    differs by more than Monte Carlo noise, 2 if there is nothing to compare.
+    Writes validate.png, a contact sheet, and validate.json, all numbers. The exit status is 1 if the direct light
+    differs by more than Monte Carlo noise, and 2 if there is nothing to compare.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
     """Mitsuba XML file with photographs, or results folder of a fit."""
     out: Path | None = None
-    """Folder of the results. Default: RUN/validate, for a scene file out/validate/<name>."""
+    """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file."""
     photographs: tuple[str, ...] = ()
-    """Only these, by id or name of the image file. Default: all."""
+    """Ids or image names of the photographs to compare. Without it: all."""
     width: int = 128
-    """Width and height of the pictures, at most [px]."""
+    """Largest width and height of the pictures [px]."""
     spp: int = 64
-    """Samples per pixel, rounded up to a multiple of 16."""
+    """Samples per pixel, rounded up to a multiple of 16. More find smaller differences."""
     depth: int = 6
-    """Longest paths, `max_depth` of the path tracer: 3 or more, for 2 is direct light. -1: no limit."""
+    """Longest paths, `max_depth` of the path tracer. 2 is direct light, so it is 3 or more.
+    -1: no limit."""
     significance: float = 0.01
-    """Chance that renderers which agree are said to disagree."""
+    """Probability of a false alarm: that two renderers which agree are reported to differ."""
     seed: int = 0
-    """Of all samples."""
+    """Random seed of all samples."""
 
     def __post_init__(self) -> None:
         for name in ("width", "spp"):

@@ -250,9 +250,9 @@ def test_snippets_load_and_say_the_same(name, tmp_path):
 
 
 def help_of(name: str, *arguments: str) -> str:
-    page = io.StringIO()
+    page, asked = io.StringIO(), "--help-all" if name == "fit" else "--help"
     with contextlib.redirect_stdout(page), pytest.raises(SystemExit) as stop:
-        importlib.import_module(f"mi_ring.{name}").main([*arguments, "--help"])
+        importlib.import_module(f"mi_ring.{name}").main([*arguments, asked])
     assert not stop.value.code
     return page.getvalue()
 

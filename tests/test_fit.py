@@ -921,15 +921,6 @@ def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up_unl
     assert state.calm == pytest.approx(0.4 + 20 * 0.005)
 
 
-def test_help_names_every_option(capsys):
-    with pytest.raises(SystemExit) as stop:
-        fit.parse_options(["--help"])
-    text = capsys.readouterr().out
-    assert stop.value.code == 0
-    for name in fit.FitConfig.__dataclass_fields__:
-        assert name == "scene" or f"--{name.replace('_', '-')}" in text
-
-
 def test_program_lists_its_commands():
     done = subprocess.run([sys.executable, "-c", "import sys; sys.argv[1:] = ['--help']; "
                            "from mi_ring.__main__ import main; main()"], capture_output=True, text=True)  # fmt: skip

@@ -32,7 +32,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import default_folder, read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured_brdf import Network
+from mi_ring.rendering.measured_brdf import MerlNetwork
 from mi_ring.system.files import write_state
 
 HUGE = 60_000  #: sides of a picture of 10 GB [px]
@@ -173,13 +173,13 @@ def test_networks_that_are_damaged(tmp_path):
     for given in ({"w2": arrays["w2"].astype(str)}, {"names": np.array(3.0), "w1": np.ones(3)}):
         np.savez(path, **{"names": ["one"], **arrays, **given})
         with pytest.raises(InputError, match=r"nets.npz: w\d is of shape"):
-            Network(path, "one")
+            MerlNetwork(path, "one")
     np.savez(path, names=["one"], **arrays)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with pytest.raises(InputError, match="nets.npz: cannot be read"):
-        Network(path, "one")
+        MerlNetwork(path, "one")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".stl", ".obj"])

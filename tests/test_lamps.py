@@ -19,7 +19,7 @@ from mi_ring.fitting.light_selection import Trials, brightest
 from mi_ring.fitting.lighting import Lighting, lit, moved
 from mi_ring.rendering import prediction
 from mi_ring.scene.assembly import lamp_lights, lamps_of, with_lamps
-from mi_ring.scene.lights import Light, emitter_of, light_of, place_lamp, place_of
+from mi_ring.scene.lights import Light, emitter_of, light_of, move_lamp, position_of
 
 LAMPS = [
     Light("point", np.array([-1.9, 2.4, 1.8]), np.array([9.0, 12.0, 7.0])),
@@ -48,13 +48,13 @@ def test_an_emitter_is_what_its_numbers_say(light):
     np.testing.assert_allclose(found.rgb, light.rgb, rtol=1e-5)
     place = mi.Vector3f(mi.Float(0.36), mi.Float(-0.48), mi.Float(0.8))
     dr.enable_grad(place)
-    place_lamp(emitter, place, mi.Color3f(3, 4, 5))
+    move_lamp(emitter, place, mi.Color3f(3, 4, 5))
     moved = light_of(emitter)
     np.testing.assert_allclose(
         moved.vector, np.array([0.36, -0.48, 0.8]) * (1 if light.kind == "point" else -1), rtol=1e-5
     )
     np.testing.assert_allclose(moved.rgb, [3, 4, 5])
-    where, _ = place_of(emitter)
+    where, _ = position_of(emitter)
     dr.backward(dr.dot(where, mi.Vector3f(1, 2, 3)))
     np.testing.assert_allclose(np.ravel(dr.grad(place)), [1, 2, 3], atol=1e-5)
 

@@ -24,7 +24,7 @@ from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, harmonics_in, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, room_envmap, world_harmonics
 from mi_ring.scene.lights import is_room, shared_emitters
 from mi_ring.scene.xml_elements import load_element
 
@@ -294,7 +294,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture):
         iterations = 60
         harmonics = torch.zeros(BASIS, 3)
         harmonics[:25] = torch.from_numpy(
-            harmonics_in(np.eye(3)) @ np.diag([3.0, 2.0, 1.0]).sum(1, keepdims=True)
+            world_harmonics(np.eye(3)) @ np.diag([3.0, 2.0, 1.0]).sum(1, keepdims=True)
         ).float()
         calibration = SimpleNamespace(
             room=SimpleNamespace(harmonics=harmonics, matrix=torch.eye(BASIS).expand(3, -1, -1))
@@ -348,7 +348,7 @@ def test_a_map_shows_the_radiance_of_harmonics():
     """Of l = 0 the same everywhere; of l = 1 the cosine to an axis."""
     room = np.zeros((BASIS, 3))
     room[0], room[2] = np.sqrt(4 * np.pi) * np.array([1, 2, 3]), np.sqrt(4 * np.pi / 3)  # 1, 2, 3 and z
-    seen = seen_from_within(room, np.eye(4), 16)
+    seen = room_envmap(room, np.eye(4), 16)
     v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
     z = -np.sin(np.pi * v) * np.cos(2 * np.pi * u)
     np.testing.assert_allclose(seen, np.array([1, 2, 3]) + z[..., None], atol=1e-5)

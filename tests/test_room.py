@@ -18,7 +18,15 @@ from mi_ring.rendering import indirect_light
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, FRAMES, ORDER, frames_of, room_of, up_to
+from mi_ring.rendering.spherical_harmonics import (
+    BASIS,
+    FRAMES,
+    MAX_ORDER,
+    PER_FRAME,
+    frames_of,
+    harmonics_up_to,
+    room_of,
+)
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.system import machine
 
@@ -27,13 +35,13 @@ LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value":
 POSES = np.stack([np.array(mi.ScalarTransform4f(photograph(k, LIGHTS[k])["to_world"]).matrix) for k in (0, 1)])
 
 
-ALL = up_to(2, FRAMES)  #: a room beside the photographs' light has no others
+ALL = harmonics_up_to(2, FRAMES)  #: a room beside the photographs' light has no others
 
 
 def some_room(seed=3, order=2):
     """(BASIS, 3), nowhere negative."""
     harmonics = np.zeros((BASIS, 3))
-    which = up_to(order, FRAMES)
+    which = harmonics_up_to(order, FRAMES)
     harmonics[which] = np.random.default_rng(seed).normal(0, 0.1 / np.sqrt(len(which)), (len(which), 3))
     harmonics[0] += 0.6
     return harmonics
@@ -47,8 +55,8 @@ def shown(channels, which=ALL):
 
 def emitters(room):
     """Of a scene."""
-    camera = np.vstack([[[0.1, 0, 0]], room[COUNT:]])  # of what is the same in both frames, a part in each
-    world = np.vstack([room[:1] - camera[:1], room[1:COUNT]])
+    camera = np.vstack([[[0.1, 0, 0]], room[PER_FRAME:]])  # of what is the same in both frames, a part in each
+    world = np.vstack([room[:1] - camera[:1], room[1:PER_FRAME]])
     return {f"room_{frame}": {"type": "room", "frame": frame, "harmonics": " ".join(map(str, harmonics.ravel()))}
             for frame, harmonics in (("world", world), ("camera", camera))}  # fmt: skip
 
@@ -68,7 +76,7 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
     ball = {"type": "sphere", "center": CENTER.tolist(), "radius": 0.5, "bsdf": material(ALBEDO / np.pi)}
     scene = load(LIGHTS, ball=ball)
     photographs = Photographs.of(scene.sensors())
-    channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, room=ALL)
+    channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, harmonics=ALL)
     images, free = (np.moveaxis(part, 0, 3) for part in shown(channels))
     inside = pictures(channels[:4])[..., 3] == 1
     assert inside[0].sum() > 60 and inside[1].sum() > 60
@@ -94,7 +102,7 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
     """A glossy cup with a ball in it, by `path`: the room's light, once reflected and more often."""
     ball = {"type": "sphere", "center": [0.5, -0.3, -0.1], "radius": 0.3, "bsdf": material([0.1, 0.2, 0.2], 0.05)}
     parts = {"cup": cup(material(0.8 * ALBEDO / np.pi, 0.04)), "ball": ball}
-    room, which = some_room(order=ORDER), up_to(ORDER, FRAMES)
+    room, which = some_room(order=MAX_ORDER), harmonics_up_to(MAX_ORDER, FRAMES)
     lit, dark = load(LIGHTS, **parts, **emitters(room)), load(LIGHTS, **parts)
     np.testing.assert_allclose(room_of(lit), room, atol=1e-6)
     assert room_of(dark) is None
@@ -106,7 +114,7 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
                          for k in range(2)])  # fmt: skip
 
     def ours(seed):
-        channels = indirect_light.render_indirect(dark, photographs, 64, seed, room=which)
+        channels = indirect_light.render_indirect(dark, photographs, 64, seed, harmonics=which)
         return np.einsum("jnhwc,jc->nhwc", shown(channels, which)[0], room[which])
 
     def regions(picture):
@@ -131,7 +139,7 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=256, seed=2))
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
-    channels = indirect_light.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, room=ALL)
+    channels = indirect_light.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, harmonics=ALL)
     ours = np.einsum("jnhwc,jc->nhwc", shown(channels)[0], room[ALL])[1]
     np.testing.assert_allclose(added.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
 
@@ -210,7 +218,7 @@ def test_a_room_takes_no_light_away():
     truth = torch.from_numpy(some_room()).float()[:, :1].repeat(1, 3)
     assert float(truth[0, 0]) > 0
     truth[:, 0] *= -1
-    truth[COUNT:] = 0
+    truth[PER_FRAME:] = 0
     missing = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL]).repeat_interleave(2, 1).repeat_interleave(2, 2)
     room = RoomLight(torch.zeros(BASIS, 3), 0.3)
     room.see(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
@@ -246,7 +254,7 @@ def test_a_turntable_stays_one_though_its_room_is_dark_or_alike_from_all_sides(s
     """It is told by a room in the camera's axes."""
     sensors = load_capture(small_capture, images=False).sensors
     root = ElementTree.fromstring(small_capture.read_bytes())
-    root.append(room_element("camera", np.zeros((COUNT, 3))))
+    root.append(room_element("camera", np.zeros((PER_FRAME, 3))))
     room = np.zeros((BASIS, 3))
     room[0] = light
     fitted = ElementTree.fromstring(recalibrated_xml(scene_bytes(root), sensors, room))

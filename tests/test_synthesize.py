@@ -22,7 +22,7 @@ from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.photogrammetry.marker_sheet import Board
 from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of, scene_of
 from mi_ring.synthesis import light_sources
@@ -115,7 +115,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     camera = camera_at([5, 9, -14], [0.05, 0.02, 0], (27, 21))
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
     room = light_sources.room_of("harmonics", in_camera, np.random.default_rng(4))
-    lamp = light_sources.environment_of(light_sources.seen_from_within(room, camera.to_world))
+    lamp = light_sources.environment_of(light_sources.room_envmap(room, camera.to_world))
     found = stage.radiance(Shot(camera), lamp, 256, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
@@ -126,7 +126,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     direction = mi.Vector3f(*own.reshape(-1, 3).T.astype(np.float32))
     basis = [np.array(h) + np.zeros(hit.size) for h in dr.sh_eval(direction, 2)]
     order = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4], [1, 3, 5])
-    harmonics = np.vstack([room[:1], room[COUNT : COUNT + 8]]) if in_camera else room[:9]
+    harmonics = np.vstack([room[:1], room[PER_FRAME : PER_FRAME + 8]]) if in_camera else room[:9]
     irradiance = (np.array(basis).T @ (order[:, None] * harmonics)).reshape(*hit.shape, 3)
     assert hit.sum() > 100
     error = (found / np.maximum(ALBEDO / np.pi * irradiance, 1e-9) - 1)[hit]  # of 256 paths: 1.5 % each

@@ -17,7 +17,7 @@ from mi_ring.photogrammetry.reduced_photographs import camera_of
 from mi_ring.photogrammetry.table_plane import Ground, Plane, reflectance
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
-from mi_ring.scene.assembly import parted
+from mi_ring.scene.assembly import split_tables
 from mi_ring.scene.lights import Light
 from mi_ring.system import machine
 
@@ -56,7 +56,7 @@ def write(folder, table=True, more=""):
 def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
     scene = load_capture(write(tmp_path), images=False).scene
     table = next(shape for shape in scene.shapes() if getattr(shape, "of_tables", False))
-    alone = parted(scene)[1]
+    alone = split_tables(scene)[1]
     x, y = 2 * (6 + 0.5) / 7 - 1, 2 * 0.5 / 5 - 1  # the middle of the last pixel of the first row
     place, up = TURNED @ mi.ScalarPoint3f(x, y, 0), TURNED @ mi.ScalarNormal3f(0, 0, 1)
     si = alone.ray_intersect(mi.Ray3f(mi.Point3f(place) + mi.Vector3f(up), -mi.Vector3f(up)))
@@ -100,7 +100,7 @@ def test_without_interreflection_a_table_changes_nothing(tmp_path):
         capture = load_capture(write(tmp_path, table, ROOM), images=False)
         surface = Surface(capture.scene, capture.shape)
         pictures.append(prediction.draw(surface, capture.photograph(0), spp=16)[0].numpy())
-        assert not parted(open_lit_scene(tmp_path / "try.xml")[0])[1]  # nor does it to `validate`
+        assert not split_tables(open_lit_scene(tmp_path / "try.xml")[0])[1]  # nor does it to `validate`
     np.testing.assert_allclose(*pictures, rtol=1e-5)
 
 
@@ -186,7 +186,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
     root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))
     writer.close()
-    _, table = parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False, parallel=False))
+    _, table = split_tables(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False, parallel=False))
     across = PLANE.axes()[:2]
     below = CENTER - PLANE.height(CENTER) * UP
     points = below + np.random.default_rng(1).uniform(-4, 4, (200, 2)) @ across

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mi_ring.rendering.global_illumination import GlobalIllumination
-from mi_ring.rendering.spherical_harmonics import BASIS, ORDER, up_to
+from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER, harmonics_up_to
 
 MEMORY = 0.95  #: factor per iteration of earlier normal equations, which belong to an earlier surface
 RIDGE = 0.01  #: ridge toward the values of the capture, relative to the mean diagonal of the normal equations
@@ -36,7 +36,7 @@ class RoomLight(nn.Module):
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
-        free = up_to(ORDER if alone else BESIDE_FLASH, frames)
+        free = harmonics_up_to(MAX_ORDER if alone else BESIDE_FLASH, frames)
         self.which = sorted({*free, *given.abs().sum(1).nonzero()[:, 0].tolist()})
         self.register_buffer("given", given, persistent=False)
         self.register_buffer("harmonics", given.clone())
@@ -93,7 +93,7 @@ class RoomLight(nn.Module):
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, which].mean(1)
         ridge = RIDGE * told[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
-            free = up_to(ORDER if self.alone and progress >= FINE else BESIDE_FLASH, self.frames)
+            free = harmonics_up_to(MAX_ORDER if self.alone and progress >= FINE else BESIDE_FLASH, self.frames)
             right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
             self.harmonics = self.given.clone()

@@ -20,7 +20,7 @@ from mi_ring.geometry.camera import NoParallax, nearest_point
 from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
 from mi_ring.images import blur, box_filter
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 
 #: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
 REMEMBERED_PIXELS = 2**23
@@ -225,7 +225,7 @@ class Capture:
         ]
 
     @property
-    def views(self) -> list[View]:
+    def views(self) -> list[MaskedCamera]:
         """What each photograph can show."""
         return views_of(self.sensors, self.valid)
 
@@ -256,14 +256,16 @@ class Capture:
         return center, radius
 
 
-def views_of(sensors: Sequence, valid: Pixels) -> list[View]:
+def views_of(sensors: Sequence, valid: Pixels) -> list[MaskedCamera]:
     """What photographs can show that have these masks of what is valid, which are made small."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
             small[reader] = shrink_mask(valid[k], WIDTH)
     found = [small[reader] for reader in valid.readers]
-    return [View(sensor.camera.shrunk(scale), mask) for sensor, (mask, scale) in zip(sensors, found, strict=True)]
+    return [
+        MaskedCamera(sensor.camera.shrunk(scale), mask) for sensor, (mask, scale) in zip(sensors, found, strict=True)
+    ]
 
 
 def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:

@@ -20,7 +20,7 @@ from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import room_of
 from mi_ring.scene.mesh_attributes import require_attributes
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system import llvm
 from mi_ring.system.progress import progress
@@ -147,7 +147,7 @@ def require_xml(path: Path) -> None:
                                  "out if that is at the camera")  # fmt: skip
 
 
-def load_views(path: Path) -> list[View]:
+def load_views(path: Path) -> list[MaskedCamera]:
     """What each photograph of a scene file can show, without opening it. Raises InputError if it cannot be read."""
     _, sensors = open_scene(path)
     return views_of(sensors, masks_of(sensors, "valid", path))

@@ -10,7 +10,7 @@ import numpy as np
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
 from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
-from mi_ring.scene.mesh_attributes import attributes_of, constants
+from mi_ring.scene.mesh_attributes import attributes_of, constant_values
 from mi_ring.scene.xml_elements import load_bsdf
 
 
@@ -31,7 +31,7 @@ def predicted_parameters(
             raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
-    textures = constants(bsdf)
+    textures = constant_values(bsdf)
     own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
     names = ", ".join([*textures, *own])
     if not ranges and kind != "cooktorrance":

@@ -13,7 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
 from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import COUNT, ORDER
+from mi_ring.rendering.spherical_harmonics import MAX_ORDER, PER_FRAME
 from mi_ring.scene.lights import Light
 from mi_ring.system.files import relative_to
 
@@ -213,17 +213,17 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
     `frames`: of rooms that there were; they are kept, even without light.
     """
-    world, camera = room[:COUNT], np.vstack([np.zeros_like(room[:1]), room[COUNT:]])
+    world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
     # What is alike from all sides is of both.
     if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
-        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[COUNT:])])
+        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[PER_FRAME:])])
     parts = {"world": world, "camera": camera}
     return [room_element(frame, part) for frame, part in parts.items() if part.any() or frame in frames]
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
     """A `room` as XML: `harmonics` (COUNT, 3), or fewer, in the axes of the world or of the camera."""
-    orders = [(order + 1) ** 2 for order in range(2, ORDER + 1)]
+    orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
     ElementTree.SubElement(element, "string", name="frame", value=frame)

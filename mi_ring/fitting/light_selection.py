@@ -14,7 +14,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.lighting import Lighting, exposures, moved, require_compatible, unlit
 from mi_ring.fitting.problem import held_out_photographs
-from mi_ring.rendering.spherical_harmonics import COUNT, directions_of, harmonics_in
+from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
 #: Settings of a coarse fit. They do not depend on those of the fit, so that the choice does not either.
@@ -87,7 +87,7 @@ class Trials:
         self.errors: dict[Lighting, float] = {}  #: mean error of each
         self.found: dict[Lighting, Lighting] = {}  #: each with the lamps that its fit has found
         self.failures: list[InputError] = []  #: of fits that failed
-        #: harmonics (COUNT, 3) that a fit under an environment has found, and the information about each (COUNT,)
+        #: harmonics (PER_FRAME, 3) of the environment that a fit has found, and information about each (PER_FRAME,)
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
@@ -109,7 +109,7 @@ class Trials:
         if lighting == Lighting("environment") and fit.model.calibration:
             room = fit.model.calibration.room
             information = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
-            self.environment = room.harmonics.numpy(force=True)[:COUNT], information.numpy(force=True)[:COUNT]
+            self.environment = room.harmonics.numpy(force=True)[:PER_FRAME], information.numpy(force=True)[:PER_FRAME]
         finite = [error for error in errors if math.isfinite(error)]  # a renderer produces a NaN now and then
         self.errors[lighting] = float(np.mean(finite)) if finite else math.inf
         if not finite:
@@ -169,14 +169,14 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
 
     Colours are relative to the first lamp, which is white: its colour cannot be told from the object's. `harmonics`
-    (COUNT, 3): of the environment. `certainty` (COUNT,): information about each. Least squares, together with constant
+    (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
     light: each direction in turn moves to its best place, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics
-    directions, _ = directions_of(ROWS)
-    lobes = shown * harmonics_in(directions)  # (harmonics, directions)
-    grey = shown * np.eye(COUNT)[:, :1]
+    directions, _ = envmap_directions(ROWS)
+    lobes = shown * world_harmonics(directions)  # (harmonics, directions)
+    grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
         """Strengths (n + 1, C) and what is left."""

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import torch
 
@@ -23,7 +23,7 @@ class Problem:
     given: Capture  #: the capture as it was handed in
     capture: Capture  #: lit by `lighting`
     seen: Capture  #: of it the photographs that are fitted
-    scene: Any  #: the mi.Scene to render, without the environment that is among the room's harmonics
+    scene: mi.Scene  #: to render, without an environment that is among the room's harmonics
     config: Config
     lighting: Lighting
     environment: np.ndarray | None  #: (BASIS, 3) harmonics of the scene's own environment, if it was made one

@@ -57,7 +57,7 @@ class Renderer:
         return self.surface
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
-        """Prediction of photograph `k`: (H, W, 3) linear radiance, at most `width` pixels wide; `level`: of the mesh."""
+        """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
         photograph = capture.photograph(k, -(-capture.sensors[k].size[0] // width))
         rgb, _ = prediction.draw(self.showing(model, level), photograph, spp, shadows=capture.shadows,
                                  indirect=model.ring.indirect)  # fmt: skip

@@ -25,9 +25,9 @@ pycolmap.Reconstruction(sys.argv[1])
 
 @dataclass(frozen=True)
 class Colmap(Photogrammetry):
-    """COLMAP, text or binary; the light is beside the camera.
+    """COLMAP, text or binary. The light is beside the camera.
 
-    SRC is the folder of the model (cameras, images), or one that holds it as sparse/0 or sparse.
+    SRC is the folder of the model (cameras, images), or a folder that has the model in sparse/0 or sparse.
     """
 
     @staticmethod

@@ -66,16 +66,17 @@ class Source:
     """What all formats have in common."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
-    """Where the data is."""
+    """Data of the other tool: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Scene file to write. What belongs to it and is no file yet goes into a folder of its name."""
+    """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
-    """Copy the photographs beside the scene file instead of referring to where they are."""
+    """Copy the photographs beside the scene file. Without it the scene refers to them where they are."""
     encoding: Literal["auto", "srgb", "linear"] = "auto"
-    """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
-    are written anew with 16."""
+    """How the photographs are encoded.
+    auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
+    Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
-    """Those that are meant: cameras of others are left out. By default each camera must have its photograph."""
+    """The photographs to take; cameras of others are left out. Without it each camera must have its photograph."""
 
     def frames(self) -> Iterator[Frame]:
         """The photographs that have a pose. Raises InputError for what is no data of the format."""

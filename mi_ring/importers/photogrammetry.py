@@ -23,13 +23,13 @@ class Photogrammetry(Source):
     """Photographs with poses from photogrammetry; formats say where from in `posed`."""
 
     images: Path | None = None
-    """Folder of the photographs. Default: the nearest `images` beside or above SRC, else the folder of SRC."""
+    """Folder of the photographs. Without it: the nearest `images` beside or above SRC, else the folder of SRC."""
     masks: Path | None = None
-    """Folder of masks, each called like its photograph with .png added, as COLMAP's are, or instead of its suffix."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the light from the camera, in the camera's axes (x right, y down, z forward) [scene units]."""
+    """Position of the light relative to the camera: right, down and forward [scene units]."""
     exif: bool = True
-    """Bring the photographs to one scale by the exposure time, ISO and aperture in their EXIF data."""
+    """Bring the photographs to one brightness by exposure time, ISO and aperture of their EXIF data."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
         """Photographs that have a pose, each with its name, by which its mask is called."""

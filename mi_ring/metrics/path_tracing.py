@@ -13,7 +13,7 @@ from mi_ring.errors import InputError, SceneError
 from mi_ring.plugins import flash, photograph, shapenet
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs, pixel_rays
-from mi_ring.scene.assembly import assembled, own_emitters, parted
+from mi_ring.scene.assembly import assembled, split_tables, top_level_emitters
 from mi_ring.scene.lights import is_room
 from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
 
@@ -40,14 +40,14 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(sensors)
-        return with_flash(without_rooms(parted(scene)[0])), sensors
+        return with_flash(without_rooms(split_tables(scene)[0])), sensors
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def without_rooms(scene: mi.Scene) -> mi.Scene:
     """The scene without `room` emitters: what they add is path traced either way (`render_indirect`)."""
-    emitters = own_emitters(scene)
+    emitters = top_level_emitters(scene)
     if not any(map(is_room, emitters)):
         return scene
     return assembled(scene.shapes(), [emitter for emitter in emitters if not is_room(emitter)])
@@ -65,7 +65,7 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
                          'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
     if count == 1:
         return scene
-    return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *own_emitters(scene)])
+    return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *top_level_emitters(scene)])
 
 
 def render_both(

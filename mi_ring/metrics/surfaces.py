@@ -15,7 +15,7 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.scene.plain_mesh import scene_of
-from mi_ring.scene.visibility import View, Visibility
+from mi_ring.scene.visibility import MaskedCamera, Visibility
 from mi_ring.system.optional import need
 
 POINTS = 100_000  #: on each of two surfaces whose distance is measured
@@ -110,7 +110,10 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
 
 
 def compare_shapes(
-    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[View] | None = None, diagonal: float | None = None
+    guess: trimesh.Trimesh,
+    truth: trimesh.Trimesh,
+    views: Sequence[MaskedCamera] | None = None,
+    diagonal: float | None = None,
 ) -> dict[str, float]:
     """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two whole surfaces.
 
@@ -133,7 +136,7 @@ def compare_shapes(
 
 
 def distances(
-    start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[View] | None = None
+    start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
     """Of points of one surface from another (POINTS,), or of those that one of the views shows.
 
@@ -141,7 +144,7 @@ def distances(
     """
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
-        points = points[Visibility(start.vertices, start.faces, views).of(points, start.face_normals[faces])]
+        points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]
         if not len(points):
             raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
                              "same frame, and do the faces of both point outwards?")  # fmt: skip

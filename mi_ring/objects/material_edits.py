@@ -24,14 +24,14 @@ class MaterialOptions:
     """Another material for the object."""
 
     material: Path | None = None
-    """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain, or
-    from surfaces without handles; these meet on the sphere, where long limbs are small."""
+    """Results folder of another fit, whose material this object gets.
+    Both fits must start from the same domain or from surfaces without handles."""
     specular_scale: float = 1.0
-    """Factor of the specular reflectance."""
+    """Factor for the specular reflectance."""
     roughness_add: float = 0.0
-    """Is added to the roughness."""
+    """Number that is added to the roughness."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors of red, green and blue."""
+    """Factors for red, green and blue."""
 
 
 def dress(ring: FittedObject, options: MaterialOptions) -> None:

@@ -23,7 +23,7 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.photographs import LANES, Photographs
 from mi_ring.rendering.surface import Surface
-from mi_ring.scene.assembly import assembled, is_table, own_emitters
+from mi_ring.scene.assembly import assembled, is_table, top_level_emitters
 from mi_ring.scene.lights import Light, is_flash, is_room
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.system.progress import progress
@@ -35,43 +35,48 @@ SLANT = 45.0  #: between the light and the camera in a light orbit, seen from th
 class RenderConfig(MaterialOptions):
     """Render every photograph of a scene with the object of a finished fit, under the same file names.
 
-    Or a film of it: the camera goes round, the light does, or the start surface flows into the object. OUT is then a
-    folder of numbered pictures, or an MP4 file.
+    Or render a film: the camera goes around the object, the light does, or the start surface flows into the object. OUT
+    is then a folder of numbered pictures, or an MP4 file.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs to take; their image files need not exist."""
+    """Mitsuba XML file with the photographs to render. Their image files need not exist."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG. Or FILE.mp4."""
+    """Folder for the pictures, or a file FILE.mp4 for a film.
+    A picture is linear if the scene names an EXR file, and 8-bit sRGB if it names PNG or JPEG."""
     turntable: int = 0
-    """So many pictures from a camera that goes once around the object, and its light with it."""
+    """Number of pictures from a camera that goes once around the object, together with its light."""
     light_orbit: int = 0
-    """So many pictures with a light that goes once around the line from the object to the camera, at 45°."""
+    """Number of pictures with a light that goes once around the line from the object to the camera.
+    The light is 45 degrees away from that line."""
     flow: int = 0
-    """So many pictures of the flow, from where the fit started to the object."""
+    """Number of pictures of the flow, from the surface where the fit started to the object."""
     view: str | None = None
-    """File name of the photograph from whose place, and under whose light, these three are seen. Default: the first."""
+    """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
+    Without it: the first photograph."""
     width: int | None = None
-    """Pixels across the pictures of these three. Default: as many as that photograph has."""
+    """Width of the pictures of --turntable, --light-orbit and --flow [px].
+    Without it: the width of that photograph."""
     up: tuple[float, float, float] | None = None
-    """Axis of the turntable, and up in the environment. Default: the mean up of the cameras."""
+    """Axis of the turntable, which is also up for --envmap.
+    Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
-    """Environment, an EXR or HDR file of latitude and longitude, to light the object instead."""
+    """Environment map that lights the object in place of the scene's lights: EXR or HDR, latitude and longitude."""
     integrator: str | None = None
-    """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection. A
-    `table` is part of photometric's pictures alone."""
+    """Mitsuba's name of the integrator.
+    Without it: photometric, or path with --envmap. path shows all interreflection, but no `table`."""
     format: Literal["png", "exr"] | None = None
-    """Of the pictures. Default: as the scene's file names say; png for the three films."""
+    """Format of the pictures. Without it: as the scene's file names say, and png for the three films."""
     fps: float = 24.0
-    """Pictures per second of an MP4 file."""
+    """Pictures per second of a film."""
     time: float = 1.0
-    """Of the flow: 0 is where it starts, 1 the object."""
+    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices. Default: that of the fit."""
+    """Level of the mesh, with about 10 · 4^level vertices. Without it: that of the fit."""
     spp: int = SPP
-    """Samples per pixel."""
+    """Samples per pixel. More give less noise."""
 
     @property
     def count(self) -> int:
@@ -236,7 +241,7 @@ def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) ->
         light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
     except RuntimeError as error:
         raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
-    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
+    lamps = [e for e in top_level_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
     others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
     object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     return Surface(assembled([object_, *others], [light, *lamps]), object_, ring, in_scene_units=True)

@@ -17,8 +17,8 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
-from mi_ring.scene.mesh_attributes import constants
-from mi_ring.scene.visibility import View, seen_of
+from mi_ring.scene.mesh_attributes import constant_values
+from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.scene.xml_elements import load_bsdf
 
 LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled`, but for glTF's
@@ -51,7 +51,7 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     """
     loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")
-    fixed, params = constants(loaded), mi.traverse(loaded)
+    fixed, params = constant_values(loaded), mi.traverse(loaded)
     count = len(next(iter(values.values())))
 
     def value(name: str, channels: int = 1) -> np.ndarray:
@@ -107,7 +107,7 @@ def png(image: np.ndarray) -> bytes:
 
 def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
-    views: Sequence[View] | None = None, up: Sequence[float] | None = None,
+    views: Sequence[MaskedCamera] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The object as a GLB file with textures of `resolution` texels a side.
 
@@ -124,7 +124,7 @@ def glb(
     if views is not None:
         s = np.zeros((atlas.whole.max() + 1, 3), np.float32)
         s[atlas.whole] = atlas.s
-        seen = seen_of(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
+        seen = visible_points(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
     return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen, up)
 
 

@@ -15,7 +15,7 @@ from mi_ring.output import gltf
 from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
 from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import room_of, seen_from_within
+from mi_ring.rendering.spherical_harmonics import room_envmap, room_of
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.files import write_file
 
@@ -89,7 +89,7 @@ def write_scene(
         scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
     elif room is not None:
         files.append(path.with_name(f"{path.stem}_environment.exr"))
-        radiance = seen_from_within(room, photograph.camera.to_world).clip(min=0) / scale
+        radiance = room_envmap(room, photograph.camera.to_world).clip(min=0) / scale
         write_image(radiance.astype(np.float32), files[-1])
         environment = ElementTree.SubElement(scene, "emitter", type="envmap")
         ElementTree.SubElement(environment, "string", name="filename", value=files[-1].name)

@@ -8,12 +8,12 @@ import torch
 
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.scene.plain_mesh import mesh_of
-from mi_ring.scene.visibility import View, seen_of
+from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.system.files import write_file
 
 
 def write_mesh(
-    ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[View] | None = None
+    ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[MaskedCamera] | None = None
 ) -> float | None:
     """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …).
 
@@ -27,7 +27,7 @@ def write_mesh(
     mesh = mesh_of(vertices.cpu().numpy(), faces)
     unseen = None
     if views is not None:
-        seen, unseen = seen_of(ring, s.cpu().numpy(), faces, views)
+        seen, unseen = visible_points(ring, s.cpu().numpy(), faces, views)
         material = {"seen": torch.from_numpy(seen).float(), **material}
     for name, value in material.items():
         mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())

@@ -33,13 +33,16 @@ from mi_ring.system.command import scene_name
 from mi_ring.system.machine import in_turn
 from mi_ring.version import __version__
 
-REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
+REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
 TOGETHER = 4  # photographs that are drawn at once
-PICTURE = 480  # width and height of the pictures, at most [px]
-MISFIT, COVERED = 3.0, 0.9  # a PSNR this far below the others' [dB], IoU: say so
-UNTRUE, TELLING = 0.3, 60  # share of the object's light, of fits with so many iterations; good ones end at .07 to .15
-SATURATED = 0.25  # share of the object's pixels: more than mi_ring.check allows, for that is of the median photograph
-SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
+PICTURE = 480  # largest side of the pictures on the page [px]
+
+# From these values on the page says that something stands out.
+LOW_PSNR, LOW_IOU = 3.0, 0.9  # PSNR below the median of all photographs [dB]; overlap of prediction and mask
+UNEXPLAINED = 0.3  # share of the object's light; good fits end at 0.07 to 0.15
+FEW_ITERATIONS = 60
+SATURATED = 0.25  # share of the object's pixels; mi-ring check allows less, but in the median photograph
+SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph from the others, and of all photographs [px]
 
 
 @dataclass
@@ -52,7 +55,7 @@ class PhotographPanel:
     saturated: float  # share of the object's pixels
     shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
     pictures: dict[str, str]
-    kept_out: bool = False  # of the fit: what is wrong with it, its pose for instance, is not told
+    held_out: bool = False  # of the fit; then the page does not say what is wrong with it
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
@@ -63,8 +66,8 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     parts = in_turn(partial(predicted, result, surface), partial(panels_of, result), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
-    # Of many photographs those that are shown may all be kept out.
-    fitted, errors = zip(*([panel for panel in panels if not panel[0].kept_out] or panels))
+    # All photographs on the page may be held-out ones.
+    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
@@ -101,7 +104,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
 
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
-    """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
+    """The viewer's first view, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
     eye = capture.sensors[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
@@ -113,26 +116,26 @@ def fit_findings(
     rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
-    """What stands out, each in one sentence that says what to do.
+    """Sentences about what stands out, each with what to do about it.
 
     `refined`: the fit's `summary`; `unexplained`: share of the object's light that is not as predicted.
     """
     found = []
-    if iteration == iterations >= TELLING and unexplained > UNTRUE:
+    if iteration == iterations >= FEW_ITERATIONS and unexplained > UNEXPLAINED:
         found.append(f"{unexplained:.0%} of the object's light is not as predicted: this surface is not to be trusted. "
                      "Cameras, masks or lights are wrong; look at the contact sheet of mi-ring check.")  # fmt: skip
-    if iteration == iterations < TELLING:
+    if iteration == iterations < FEW_ITERATIONS:
         found.append(f"The fit had {iterations} iterations, too few for a surface that is to be trusted.")
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
 
     typical, scatter = middle([row.psnr for row in rows])
-    limit = typical - max(MISFIT, 3 * scatter)
+    limit = typical - max(LOW_PSNR, 3 * scatter)
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
         found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
                      "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
     covers = [(row.iou, row.name) for row in rows if row.iou is not None]
-    if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < COVERED):
+    if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < LOW_IOU):
         found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
                      "and pose are right.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
@@ -159,24 +162,24 @@ def fit_findings(
 
 
 def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Median of values (n, ...) and, from the median absolute deviation, their standard deviation."""
+    """Median of values (n, ...), and their standard deviation estimated by the median absolute deviation."""
     median = np.median(values, axis=0)
     return median, 1.4826 * np.median(np.abs(np.subtract(values, median)), axis=0)
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """Names and numbers of the lowest (rank, name, number), in one line; empty if there are none."""
+    """One line with names and numbers of the lowest (rank, name, number); empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """A shift in words."""
+    """Words for a shift [px]."""
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
 class Prediction(NamedTuple):
-    """What a photograph should look like."""
+    """The prediction of one photograph."""
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
     coverage: np.ndarray  #: (H, W), in [0, 1]
@@ -246,7 +249,7 @@ def panel_of(result: FitResult, k: int, prediction: Prediction) -> tuple[Photogr
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
         shift=by and (scale * by[0], scale * by[1]),
-        kept_out=k in result.held_out,
+        held_out=k in result.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )
     return row, error

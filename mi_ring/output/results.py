@@ -19,15 +19,15 @@ from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.fit_result import FitResult
 from mi_ring.output.ply import write_mesh
 from mi_ring.rendering import prediction
-from mi_ring.rendering.spherical_harmonics import seen_from_within
+from mi_ring.rendering.spherical_harmonics import room_envmap
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import shared_emitters
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
-PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
-VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
+PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is moved aside
+VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, and width of its textures [px]
 
 
 def default_folder(scene: Path) -> Path:
@@ -42,7 +42,7 @@ def default_folder(scene: Path) -> Path:
 
 
 def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the folder and write config.json: the options as used, the scene's file relative to the folder.
+    """Make the folder and write config.json: the options, and the scene file relative to the folder.
 
     A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
     written or holds the scene.
@@ -61,7 +61,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def move_aside(folder: Path) -> None:
-    """Rename a folder, so that other results can go to its place."""
+    """Rename a folder to make room for other results."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
@@ -83,19 +83,19 @@ def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
 
 
 def write_log(folder: Path, entries: Iterable[dict]) -> None:
-    """log.jsonl of so many entries."""
+    """Write log.jsonl."""
     write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def add_to_log(folder: Path, entry: dict) -> None:
-    """One more line of log.jsonl."""
+    """Append an entry to log.jsonl."""
     path = folder / "log.jsonl"
     with writing(path), path.open("a") as file:
         file.write(json.dumps(entry) + "\n")
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The entries of log.jsonl; a line that was cut off, when the process was killed or the disk was full, is none."""
+    """The entries of log.jsonl, without a last line that a kill or a full disk cut off."""
     entries = []
     for line in (folder / "log.jsonl").read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):
@@ -141,7 +141,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     write_file(folder / "scene.xml", scene)
     if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
         # The room is the only light.
-        radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
+        radiance = room_envmap(capture.photographs.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)
     names = [capture.names[k] for k in result.held_out]
@@ -156,7 +156,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Files of the masks of these photographs, each called like its photograph with .png added.
+    """Write the masks of these photographs, each named like its photograph with .png added.
 
     Returns their names, by index, as a scene beside `folder` has them.
     """
@@ -172,8 +172,8 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
     return names
 
 
-def viewed(ring: FittedObject, views: Sequence[View] | None = None) -> bytes | None:
-    """The object for the report's viewer as GLB, where that is possible."""
+def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
+    """The object as GLB for the report's viewer; None, with a printed line, if that fails."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)

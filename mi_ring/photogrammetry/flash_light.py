@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from mi_ring.geometry.hull import evenly
 from mi_ring.photogrammetry.marker_sheet import White
-from mi_ring.rendering.photograph_lights import SIDEWAYS
+from mi_ring.rendering.photograph_lights import MIN_FLASH_COSINE
 
 PAPER = 0.8  #: albedo of white paper
 #: Standard deviations of priors: of the flash's place across the lens and along its axis [median distance from the
@@ -72,7 +72,7 @@ def irradiance(way: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff
     It looks `forward` (3,) or (n, 3), and shines like the cosine from there to the power of `falloff`.
     """
     away = np.linalg.norm(way, axis=1)
-    cosine = np.maximum(-(way * forward).sum(1) / away, SIDEWAYS)
+    cosine = np.maximum(-(way * forward).sum(1) / away, MIN_FLASH_COSINE)
     return cosine**falloff * np.maximum(way @ normal, 0) / away**3
 
 

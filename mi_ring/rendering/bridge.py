@@ -2,22 +2,12 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-
-
-class Writable(Protocol):
-    """Something that a Dr.Jit program writes its input to."""
-
-    written: int  #: how many times it was written
-
-
-Program = Callable[[list[mi.Float]], list[mi.Float]]
 
 
 def to_drjit(tensor: Tensor) -> mi.Float:
@@ -36,11 +26,11 @@ def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
     return [to_torch(array) for array in arrays]
 
 
-def differentiable(program: Program, tensors: Sequence[Tensor], target: Writable) -> tuple[Tensor, ...]:
-    """The output of a Dr.Jit program as tensors (n,), differentiable with respect to the tensors given.
+def differentiable(program: Callable, tensors: Sequence[Tensor], target) -> tuple[Tensor, ...]:
+    """The output of a Dr.Jit program as tensors (n,), differentiable with respect to `tensors`.
 
-    `program` takes the tensors as flat Floats, those that require a gradient attached, and returns Floats. It writes
-    its input to `target`.
+    `program` takes a list of flat Floats, those attached whose tensors require a gradient, and returns a list of
+    Floats. It writes its input to `target`, which counts this in `written`.
 
     The backward pass raises RuntimeError the second time, and if `target` was written again since.
     """

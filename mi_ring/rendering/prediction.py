@@ -27,8 +27,8 @@ def render(
 
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
-    samples. `calibration`: other cameras and lights of all photographs, as `Photographs.moved` takes them: (P, 3, 4),
-    (P, 4) [px of these sizes], (P, 3), (P, 3), and (P,) each if flashes have cones and lenses distortion. `lamps`:
+    samples. `calibration`: other cameras and lights of all P photographs, as `Photographs.with_calibration` takes them:
+    (P, 3, 4), (P, 4) [px of these sizes], (P, 3), (P, 3), and optionally falloff and distortion (P,) each. `lamps`:
     other places and strengths (L, 3) of the scene's L lamps, as `Surface.relight` takes them.
 
     Returns linear radiance (N, H, W, 3) and coverage (N, H, W) in [0, 1]. Gradients with respect to all tensors are
@@ -43,7 +43,7 @@ def render(
         others = arrays[len(parameters) :]
         if lamps:
             surface.relight(*others[len(calibration) :])
-        moved = photographs.moved(*others[: len(calibration)]) if calibration else photographs
+        moved = photographs.with_calibration(*others[: len(calibration)]) if calibration else photographs
         if moving:  # gradients with respect to the material alone need no edges
             surface.edges = Edges.of(surface.scene, surface.edges)
         edges = surface.edges if moving else None
@@ -76,7 +76,7 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
 
 def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photographs:
     """Photographs with other cameras and lights, as `render` takes them, without gradients."""
-    return photographs.moved(*map(to_drjit, calibration))
+    return photographs.with_calibration(*map(to_drjit, calibration))
 
 
 def draw(

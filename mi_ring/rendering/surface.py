@@ -10,7 +10,7 @@ from torch import Tensor
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.edge_selection import Edges
-from mi_ring.scene.assembly import dressed, lamp_lights, parted, place_lamps, with_lamps
+from mi_ring.scene.assembly import lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
@@ -33,13 +33,13 @@ class Surface:
     def __init__(
         self, scene: mi.Scene, shape: mi.Mesh, ring: FittedObject | None = None, in_scene_units: bool = False
     ) -> None:
-        scene, self.table = parted(scene)
+        scene, self.table = split_tables(scene)
         self.unit = 1.0
         if ring is not None:
             alone = self.table is None and len(scene.shapes()) == 1
             if alone and not in_scene_units and all(lamp.is_environment() for lamp in shared_emitters(scene)):
                 self.unit = unit_for(float(ring.radius))
-            scene, shape = dressed(scene, shape, ring, self.unit)
+            scene, shape = with_fitted_shape(scene, shape, ring, self.unit)
         self.scene, self.shape = scene, shape
         self.params = mi.traverse(scene)
         self.owns_lamps = False  #: False while the lamps are those of the given scene, which must not be changed
@@ -101,7 +101,7 @@ class Surface:
         if not self.owns_lamps:
             self.scene, self.owns_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
             self.params = mi.traverse(self.scene)
-        place_lamps(self.scene, places, strengths)
+        move_lamps(self.scene, places, strengths)
 
     def show(self, ring: FittedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
         """Write a `FittedObject` at domain points (V, 3) with triangles (F, 3), at a `time` of the flow in [0, 1]."""

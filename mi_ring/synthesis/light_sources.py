@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera
-from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME, room_envmap
 from mi_ring.scene.lights import Light
 
 LightKind = Literal["flash", "point", "distant", "lamp"]
@@ -75,11 +75,11 @@ def room_of(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.
     harmonics[0] = colour * np.sqrt(4 * np.pi)  # times the first harmonic, which is 1 / sqrt(4 pi)
     if kind == "harmonics":
         waves = random.normal(0, WAVES, (SLOW - 1, 1)) * colour
-        darkest = (seen_from_within(np.vstack([0 * waves[:1], waves]), np.eye(4)) / colour).min()
+        darkest = (room_envmap(np.vstack([0 * waves[:1], waves]), np.eye(4)) / colour).min()
         harmonics[1:] = waves * min(1.0, (1 - DARKEST) / -darkest)
     room = np.zeros((BASIS, 3))
     room[0] = harmonics[0]
-    first = COUNT if in_camera else 1
+    first = PER_FRAME if in_camera else 1
     room[first : first + SLOW - 1] = harmonics[1:]
     return room
 

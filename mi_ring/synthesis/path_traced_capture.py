@@ -146,9 +146,7 @@ class Production:
         if not config.room:
             return picture, 0.0
         # Apart: paths that choose between two lights are much noisier.
-        seen = light_sources.environment_of(
-            self.room_level * light_sources.seen_from_within(self.room, camera.to_world)
-        )
+        seen = light_sources.environment_of(self.room_level * light_sources.room_envmap(self.room, camera.to_world))
         return picture, stage.radiance(shot, seen, spp, view.seed + 1, config.depth)
 
     @property
