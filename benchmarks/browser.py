@@ -26,14 +26,13 @@ from mi_ring.capture import loading
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.rendering import prediction
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.surface import Surface
 
 
-def photograph(sensor) -> dict:
+def photograph(shot) -> dict:
     """A photograph as the viewer's `draw` takes it. Raises ValueError if its light is no point."""
-    matrix, (fx, fy), (cx, cy), (width, height), _ = sensor.camera
-    light = Lights.of([sensor])[0]
+    matrix, (fx, fy), (cx, cy), (width, height), _ = shot.camera
+    light = shot.own_light
     if light.kind == "directional":
         raise ValueError("the viewer has a point light, this photograph a distant one")
     return {
@@ -42,7 +41,7 @@ def photograph(sensor) -> dict:
     }  # fmt: skip
 
 
-def drawn(page_file: Path, sensors) -> list[np.ndarray]:
+def drawn(page_file: Path, shots) -> list[np.ndarray]:
     """The photographs (H, W, 3) that the viewer of a report draws, sRGB in [0, 1]."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
@@ -53,8 +52,8 @@ def drawn(page_file: Path, sensors) -> list[np.ndarray]:
         page.goto(page_file.resolve().as_uri())
         page.wait_for_function("window.viewer !== undefined")
         pictures = []
-        for sensor in sensors:
-            url = page.evaluate("photograph => window.viewer.draw(photograph)", photograph(sensor))
+        for shot in shots:
+            url = page.evaluate("photograph => window.viewer.draw(photograph)", photograph(shot))
             pictures.append(imageio.imread(io.BytesIO(base64.b64decode(url.split(",")[1])))[..., :3] / 255)
         browser.close()
     return pictures
@@ -67,7 +66,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="file for a picture of three photographs")
     arguments = parser.parse_args()
     scene, ring = loading.load_capture(arguments.run / "scene.xml", images=False), load_fit(arguments.run)
-    theirs = drawn(arguments.run / "report.html", scene.sensors)
+    theirs = drawn(arguments.run / "report.html", scene.shots)
     surface = Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     print(f"{processor()}; {datetime.date.today()}; {arguments.run.name}, {len(theirs)} photographs\n")

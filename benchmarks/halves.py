@@ -61,7 +61,7 @@ def main() -> None:
     capture = mi_ring.load_capture(arguments.scene)
     (one, _), (other, _) = (load_true_mesh(out / "mesh.ply") for out in outs)
     center = other.bounds.mean(0)
-    distance = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors])
+    distance = np.median([np.linalg.norm(shot.camera.position - center) for shot in capture.shots])
     flashes = [np.array(record["unknowns"]["light"]["after"]) for record in found]
     apart = np.degrees(np.linalg.norm((flashes[1] - flashes[0])[:2]) / distance)
     above = [np.degrees(np.arctan2(flash[1], distance)) for flash in flashes]

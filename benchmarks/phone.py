@@ -31,7 +31,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import phone_stage
-from phone_stage import Shot, Stage
+from phone_stage import LensCamera, Stage
 
 # isort: split
 import mitsuba as mi
@@ -46,6 +46,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.photogrammetry.capture_files import windows
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
 
 DISTURBANCES = (
     "sheet", "ambient", "offset", "cone", "lens", "principal", "exposure", "jpeg", "noise", "blur", "failures"
@@ -122,7 +123,7 @@ def poses(settings: Settings, height: float) -> Iterator[tuple[np.ndarray, float
         yield to_world, azimuth if settings.turntable else 0.0
 
 
-def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> Shot:
+def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> LensCamera:
     """Photograph `k`: its camera, lens and motion."""
     width, height = settings.size
     focal = width / 2 / np.tan(np.radians(VIEW_ANGLE / 2))
@@ -130,7 +131,7 @@ def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> Shot:
     length = BLUR if settings.has("blur") else 0.0
     length = SHAKEN * width if settings.failed.get(k) == "blurred" else length
     angle = settings.rng(3, k).uniform(0, 2 * np.pi)
-    return Shot(Camera(to_world, np.full(2, focal), centre, settings.size),
+    return LensCamera(Camera(to_world, np.full(2, focal), centre, settings.size),
                 DISTORTION if settings.has("lens") else (0.0, 0.0),
                 (length * np.cos(angle), length * np.sin(angle)))  # fmt: skip
 
@@ -152,7 +153,7 @@ def flash_at(settings: Settings, camera: Camera) -> np.ndarray:
     return camera.position + (camera.to_world[:3, :3] @ FLASH if settings.has("offset") else 0)
 
 
-def photograph(stage: Stage, settings: Settings, shot: Shot, k: int) -> np.ndarray:
+def photograph(stage: Stage, settings: Settings, shot: LensCamera, k: int) -> np.ndarray:
     """What the sensor sees of photograph `k`: linear (H, W, 3), 1 = full scale, noise and all."""
     camera = shot.camera
     power = CONE if settings.has("cone") else 0.0
@@ -235,7 +236,7 @@ def make_capture(out: Path, settings: Settings) -> None:
             stage.turn(angle)
         exposure, balance = gains(settings, k)
         write_photograph(photos / (name + suffix), photograph(stage, settings, shot, k), exposure)
-        write_mask(truth / "masks" / f"{name}.png", stage.coverage(Shot(shot.camera, shot.distortion)))
+        write_mask(truth / "masks" / f"{name}.png", stage.coverage(LensCamera(shot.camera, shot.distortion)))
         taken[name + suffix] = {"exposure": exposure, "balance": balance.tolist(), "failed": settings.failed.get(k)}
         if k in settings.failed:
             continue
@@ -247,14 +248,14 @@ def make_capture(out: Path, settings: Settings) -> None:
         })  # fmt: skip
         if not settings.exact:
             continue
-        pinhole = Shot(camera)
+        pinhole = LensCamera(camera)
         alone.flash.aim(camera.position, camera.forward, intensity(), 0.0)
         linear = alone.radiance(pinhole, max(settings.spp, 9), settings.seed * 10_000 + 2 * k + 1)
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
         light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
-                                           calibrated=True))  # fmt: skip
+        files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
+        elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
         (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

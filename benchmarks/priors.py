@@ -24,14 +24,15 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.geometry.domain import carried, gpytoolbox
+from mi_ring.geometry.domain import gpytoolbox, transfer_points
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis import example_pot
-from mi_ring.synthesis.stage import Stage
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.object_on_table import ObjectOnTable
+from mi_ring.synthesis.tracing import LensCamera
 
 # isort: split
 import mitsuba as mi
@@ -72,16 +73,16 @@ def write_capture(name: str, folder: Path) -> None:
     mesh.set_bsdf(mi.load_dict({"type": "cooktorrance", **textures}))
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
-    stage, random, elements = Stage(mesh, truth.vertices), np.random.default_rng(0), []
+    scene, random, elements = ObjectOnTable(mesh, truth.vertices), np.random.default_rng(0), []
     for k, camera in enumerate(example_pot.cameras()[::EVERY]):
         position = camera.position + camera.to_world[:3, :3] @ example_pot.FLASH
         light = Light("point", position, np.full(3, 2 * example_pot.DISTANCE**2))
-        picture = stage.radiance(Shot(camera), light, 36, k, 2)
+        picture = scene.radiance(LensCamera(camera), light, 36, k, 2)
         noisy = picture + random.normal(0, NOISE, picture.shape)
-        files = f"images/{k:03}.png", f"masks/{k:03}.png"
-        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files[0])
-        write_image(to_bytes(stage.coverage(Shot(camera))[..., None] >= 0.5), folder / files[1])
-        elements.append(photograph_element(f"{k:03}", files[0], camera, light, files[1], calibrated=True))
+        files = Files(Path(f"images/{k:03}.png"), Path(f"masks/{k:03}.png"))
+        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files.filename)
+        write_image(to_bytes(scene.coverage(LensCamera(camera))[..., None] >= 0.5), folder / files.mask)
+        elements.append(photograph_element(Shot(f"{k:03}", camera, light, files=files, calibrated=True)))
     truth.export(folder / "truth.ply")
     np.savez(folder / "truth.npz", **material)
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
@@ -100,7 +101,7 @@ def errors(fit: Fit, folder: Path) -> list[float]:
     result = [float(np.degrees(np.arccos(cosines.clip(-1, 1))).mean())]
     for name in ("diffuse", "specular", "roughness"):
         values = material[name].reshape(len(truth.vertices), -1)
-        wanted = carried(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
+        wanted = transfer_points(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
         given = found[name].numpy().reshape(len(s), -1)
         result.append(float(np.abs(given - wanted).mean() / values.mean()))
     return result

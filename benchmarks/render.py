@@ -82,7 +82,8 @@ class Scene:
         v, u = np.mgrid[:SIZE, :SIZE]
         waves = [np.sin(0.05 * u + 0.04 * v + k + 1.3 * c) for k in range(VIEWS) for c in range(3)]
         self.weights = np.stack(waves).reshape(VIEWS, 3, SIZE, SIZE).astype(np.float32)
-        self.photographs = Photographs.of(self.scene.sensors()) if integrator["type"] == "photometric" else None
+        ours = integrator["type"] == "photometric"
+        self.photographs = Photographs.of([sensor.shot for sensor in self.scene.sensors()]) if ours else None
         self.edges = None
 
     def gradient(self, seed):

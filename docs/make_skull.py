@@ -76,11 +76,11 @@ def results(out: Path) -> np.ndarray:
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     rows = []
     for name in HELD_OUT:
-        k = next(k for k, sensor in enumerate(capture.sensors) if sensor.id() == name)
-        scale = -(-capture.sensors[k].size[0] // WIDTH)
-        shot = capture.photograph(k, scale)
-        maps = {what: values[0] for what, values in prediction.maps(surface, shot).items()}
-        rgb, coverage = prediction.draw(surface, shot, spp=64, indirect=ring.indirect)
+        k = next(k for k, shot in enumerate(capture.shots) if shot.name == name)
+        scale = -(-capture.shots[k].size[0] // WIDTH)
+        photograph = capture.photograph(k, scale)
+        maps = {what: values[0] for what, values in prediction.maps(surface, photograph).items()}
+        rgb, coverage = prediction.draw(surface, photograph, spp=64, indirect=ring.indirect)
         seen = coverage[0].numpy()[..., None] > 0.5
         diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
         observed = linear_to_srgb(capture.observe([k], scale).rgb[0].numpy())

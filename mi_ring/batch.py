@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import require_capture
 from mi_ring.collection.cluster import Resources, fit_all
-from mi_ring.collection.jobs import Job, jobs_of
+from mi_ring.collection.jobs import Job, make_jobs
 from mi_ring.errors import InputError
 from mi_ring.fit_config import parse_options
 from mi_ring.output.index import Entry, write_index
@@ -18,9 +18,9 @@ from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import cores, set_variant
 from mi_ring.system.optional import need
-from mi_ring.system.progress import outliving_readers, progress
+from mi_ring.system.progress import progress, tolerating_closed_output
 
-OWN = "--out", "--resume", "--threads"  #: options of fits that a batch gives them itself
+RESERVED = "--out", "--resume", "--threads"  #: options of fits that the batch sets
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class BatchConfig:
 
     @property
     def resources(self) -> Resources:
-        """What each fit is given."""
+        """Workers, and what each fit gets."""
         cpus = self.cpus or max(1, cores() // self.workers)
         return Resources(self.workers, cpus, self.gpus, self.memory, self.address)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if a fit is not done."""
+    """Run the command. Returns its exit status: 1 if not all fits are done."""
     own, options = list(arguments), []
     if "--" in own:
         own, options = own[: own.index("--")], own[own.index("--") + 1 :]
@@ -78,26 +78,33 @@ def main(arguments: Sequence[str]) -> int:
         if str(error).startswith("Unrecognized") and "--" not in arguments:
             raise InputError(f"{error}; options of fits come after --, as in -- --preset fast") from None
         raise
-    if wrong := [option for option in options if option.split("=")[0] in OWN]:
+    if wrong := [option for option in options if option.split("=")[0] in RESERVED]:
         raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
-    jobs = jobs_of(config.scenes, config.out, options)
+    jobs = make_jobs(config.scenes, config.out, options)
     try:
-        fit = parse_options([str(jobs[0].scene), *options])  # what is wrong with them is wrong for all
+        fit = parse_options([str(jobs[0].scene), *options])  # a wrong option is wrong for every fit
     except InputError as error:
         raise InputError(f"options of fits, after --: {error}") from None
     need("ray", "mi-ring batch")
     set_variant("llvm_ad_rgb")
-    with locked(config.out / "batch"), outliving_readers(), command.going_on():
-        todo = waiting(jobs, fit.masks)
-        show(jobs, config.out, True)
-        with noting_the_end(todo, jobs, config.out):
+    with locked(config.out / "batch"), tolerating_closed_output(), command.resumable():
+        todo = unfinished(jobs, fit.masks)
+        write_page(jobs, config.out, running=True)
+        with recording_interrupts(todo, jobs, config.out):
             if todo:
-                follow(todo, jobs, config)
-        return finish(jobs, config.out)
+                fit_and_report(todo, jobs, config)
+        write_page(jobs, config.out, running=False)
+        left = [job.name for job in jobs if job.record.state != "done"]
+        missing = f", not {', '.join(left)}" * bool(left)
+        print(f"{len(jobs) - len(left)} of {len(jobs)} done{missing}: {config.out}/index.html")
+    return int(bool(left))
 
 
-def waiting(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """What is to be fitted, with fingerprints: what is not done already, nor wrong. What is in the records, too."""
+def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
+    """The jobs to fit, with their fingerprints. Writes the record of every job: waiting, done or failed.
+
+    `masks`: as for `load_capture`. A job whose capture is wrong fails here, before any long work.
+    """
     todo: dict[Job, str] = {}
     done = 0
     for job in progress(jobs, "comparing", unit="scene"):
@@ -108,58 +115,58 @@ def waiting(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
             try:
                 require_capture(job.scene, masks)
                 todo[job] = fingerprint
-            except (InputError, OSError) as error:  # now, rather than at night when its turn comes
+            except (InputError, OSError) as error:
                 state, message = "failed", command.one_line(str(error))
                 print(f"{job.name}: failed: {message}", flush=True)
-        job.note(replace(job.record, state=state, message=message, tries=0))
+        job.save(replace(job.record, state=state, message=message, tries=0))
     if done:
         print(f"{done} of {len(jobs)} are done already")
     return todo
 
 
 @contextlib.contextmanager
-def noting_the_end(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
-    """Within it whatever ends all fits early is in their records and in index.html, too, if a full disk lets it."""
+def recording_interrupts(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
+    """If anything ends the batch early, records and index.html say so, unless the disk is full."""
     try:
         yield
     except BaseException:
         with contextlib.suppress(InputError):
             for job in todo:
                 if job.record.state == "running":
-                    job.note(replace(job.record, state="interrupted"))
-            show(jobs, out, False)
+                    job.save(replace(job.record, state="interrupted"))
+            write_page(jobs, out, running=False)
         raise
 
 
-def follow(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
-    """Fit them, and say what goes on."""
-    before = {job.name: "waiting" for job in todo}
-    begun: dict[str, tuple[int, int]] = {}  #: by the iteration and the tries since
+def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
+    """Fit the jobs `todo`. Prints each change of state and keeps index.html up to date."""
+    states = {job.name: "waiting" for job in todo}
+    starts: dict[str, tuple[int, int]] = {}  #: iteration and number of tries at the last start of each fit
     with progress(None, "fits", total=len(todo), leave=True) as bar:
 
-        def look() -> None:
+        def report() -> None:
             changed = False
             for job in todo:
                 record = job.record
-                if record.state != before[job.name]:
-                    changed, before[job.name] = True, record.state
+                if record.state != states[job.name]:
+                    changed, states[job.name] = True, record.state
                     bar.write(f"{job.name}: {record.state}{': ' * bool(record.message)}{record.message}")
                     bar.update(record.state in ("failed", "done"))
                 if record.state == "running":
-                    last = record.iteration, record.tries
-                    if begun.setdefault(job.name, last) != last:
-                        begun[job.name] = last
+                    start = record.iteration, record.tries
+                    if starts.setdefault(job.name, start) != start:
+                        starts[job.name] = start
                         bar.write(f"{job.name}: has died, goes on from iteration {record.iteration} or a little before")
-            now = [f"{job.name} {job.progress}" for job in todo if before[job.name] == "running"]
-            bar.set_postfix_str("; ".join(now))
+            running = [f"{job.name} {job.progress}" for job in todo if states[job.name] == "running"]
+            bar.set_postfix_str("; ".join(running))
             if changed:
                 with contextlib.suppress(InputError):  # a disk that is full for a while ends no fit
-                    show(jobs, config.out, True)
+                    write_page(jobs, config.out, running=True)
 
-        fit_all(todo, config.resources, config.retries, look)
+        fit_all(todo, config.resources, config.retries, report)
 
 
-def show(jobs: Sequence[Job], out: Path, running: bool) -> None:
+def write_page(jobs: Sequence[Job], out: Path, running: bool) -> None:
     """Write index.html."""
     entries = []
     for job in jobs:
@@ -167,14 +174,6 @@ def show(jobs: Sequence[Job], out: Path, running: bool) -> None:
         text = record.message or (job.progress if record.state == "running" else "")
         entries.append(Entry(job.name, record.state, text, job.folder, job.output))
     write_index(out, entries, running)
-
-
-def finish(jobs: Sequence[Job], out: Path) -> int:
-    """Say what became of each. Returns the exit status."""
-    show(jobs, out, False)
-    left = [job.name for job in jobs if job.record.state != "done"]
-    print(f"{len(jobs) - len(left)} of {len(jobs)} done{', not ' * bool(left)}{', '.join(left)}: {out}/index.html")
-    return int(bool(left))
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     capture = load_capture(config.scene, masks=config.masks)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")
-    if out.resolve() in {file for sensor in capture.sensors for file in sensor.files}:
+    if out.resolve() in {file.resolve() for shot in capture.shots for file in shot.files if file}:
         raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
     files.require_place(out, "--out")
     inspection = inspect(capture)

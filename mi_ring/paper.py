@@ -10,8 +10,8 @@ from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
 from mi_ring.experiments.catalogue import EXPERIMENTS
-from mi_ring.experiments.engine import perform
-from mi_ring.experiments.experiment import Asked
+from mi_ring.experiments.engine import run_experiment
+from mi_ring.experiments.experiment import ExperimentOptions
 from mi_ring.fit_config import MOST_THREADS
 from mi_ring.fitting.config import as_typed
 from mi_ring.system import command
@@ -65,32 +65,36 @@ class PaperConfig:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if a run has failed."""
+    """Run the command. Returns its exit status: 1 if a run has failed."""
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
+    experiment = EXPERIMENTS[config.name]
     if not 0 <= config.threads <= MOST_THREADS:
         raise InputError(f"--threads: is {config.threads}, must be 0 to {MOST_THREADS}")
     if not config.seeds or len({*config.seeds}) < len(config.seeds):
         raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
+    if experiment.one_seed and len(config.seeds) > 1:
+        raise InputError(f"--seeds: are several; {config.name} takes one; give one")
     if missing := next((path for path in config.data if not path.exists()), None):
-        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
+        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {experiment.data}")
     if config.quick and config.preset not in (None, "fast"):
         raise InputError(f"--preset: is {config.preset}, but --quick is by fast; leave one of the two out")
     if not all(material.strip() for material in config.materials):
         raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
     preset = config.preset or ("fast" if config.quick else "default")
-    variant = set_variant(config.variant)
-    asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
+    options = ExperimentOptions(config.data, config.materials, preset, config.seeds, config.quick, config.threads,
+                                set_variant(config.variant), config.out)  # fmt: skip
     kind = "quick" if config.quick else preset
     out = config.out / (config.name if kind == "default" else f"{config.name}-{kind}")
-    settings = "--quick" if config.quick else f"--preset {preset}"
-    settings += f" --variant {variant}" * (variant != PaperConfig.variant)
-    what = [path.name or str(path.resolve().name) for path in config.data]
+    words = ["mi-ring paper", config.name, *(path.name or str(path.resolve().name) for path in config.data)]
     if config.materials:
-        what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
-    seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
-    with command.going_on(), locked(out):
-        said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
-        failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
+        words += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
+    words.append("--quick" if config.quick else f"--preset {preset}")
+    if options.variant != PaperConfig.variant:
+        words.append(f"--variant {options.variant}")
+    if config.seeds != (0,):
+        words.append(f"--seeds {as_typed(config.seeds)}")
+    with command.resumable(), locked(out):
+        failed = run_experiment(experiment, options, out, config.only, " ".join(words))
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
     print(f"{out}/table.md{' and figure.png' * (out / 'figure.png').is_file()}{runs}")
     return int(failed > 0)

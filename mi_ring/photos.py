@@ -18,7 +18,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
-from mi_ring.photogrammetry.capture_files import windows, write_shot, write_table
+from mi_ring.photogrammetry.capture_files import windows, write_posed_picture, write_table
 from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, models, unlit, ups, without_exposure
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
@@ -29,19 +29,20 @@ from mi_ring.photogrammetry.workflow import (
     find_cameras,
     find_sheet,
     flash_of,
+    posed_pictures,
     require_same_photographs,
     require_sides,
-    shots,
     upright,
 )
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
-from mi_ring.system.files import locked, write_file
+from mi_ring.system.files import locked, read_json, write_file
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
-METRES = 1e-3  #: of a unit of the scene, if there is a sheet
+OPTIONS = "work/options.json"  #: the options of the command that made the capture
+METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
 
 
 @dataclass(frozen=True)
@@ -87,42 +88,36 @@ class PhotosConfig:
             need("rembg", "--masks rembg")
 
     def words(self) -> list[str]:
-        """What tells it from others."""
+        """The options as strings, by which the same command is recognised."""
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
 def cameras_report(motion: Motion) -> str:
-    """What structure from motion has found."""
-    count, failed = len(motion.cameras), motion.failed
+    """A line about the cameras that were found, and one for each photograph without a camera."""
+    count = len(motion.cameras)
     how = f"as given by {motion.source}" if motion.source else f"by {len(motion.points)} points"
     how += f", reprojection error {motion.error:.2f} px" if motion.error else ""
-    return "\n".join([
-        f"Cameras: {count} of {count + len(failed)} photographs, {how}",
-        *(f"  without: {name}: {why}" for name, why in failed.items()),
-    ])  # fmt: skip
+    lines = [f"Cameras: {count} of {count + len(motion.failed)} photographs, {how}"]
+    return "\n".join(lines + [f"  without: {name}: {why}" for name, why in motion.failed.items()])
 
 
 def masks_report(found: Object, motion: Motion, source: str | Path) -> str:
-    """Which photographs have a mask; `source`: as `PhotosConfig.masks`."""
-    without = [name for name in motion.cameras if name not in found.masks]
+    """A line about the masks, and one for each photograph without a mask; `source`: `PhotosConfig.masks`."""
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
-    return "\n".join([
-        f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs",
-        *(f"  without: {name}: {why}" for name in without),
-    ])  # fmt: skip
+    lines = [f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs"]
+    return "\n".join(lines + [f"  without: {name}: {why}" for name in motion.cameras if name not in found.masks])
 
 
 def flash_report(flash: Flash, motion: Motion, found: Object) -> str:
-    """What the sheet tells of the flash and of the room."""
+    """A line about the flash and the room's light, as measured on the sheet."""
     x, y, z = flash.offset
-    away = np.median([np.linalg.norm(pose[:3, 3] - found.center) for _, pose in motion.cameras.values()])
+    distance = np.median([np.linalg.norm(pose[:3, 3] - found.center) for _, pose in motion.cameras.values()])
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
-    share = (flash.room * away**2).mean()
     where += f", shines like the cosine to the power of {flash.falloff:.1f}"
     curve = f"; the camera's curve has the exponent {flash.gamma:.2f}" if flash.gamma != 1 else ""
     return (f"Flash, by the sheet in {len(flash.intensities)} photographs: {where}; the room's light on the sheet is "
-            f"{share:.1%} of its light at the object{curve}")  # fmt: skip
+            f"{(flash.room * distance**2).mean():.1%} of its light at the object{curve}")  # fmt: skip
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -130,23 +125,23 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
-    if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
+    if scene.exists() and (sheet.exists() or read_json(config.out / OPTIONS) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
     try:
-        with command.going_on(), locked(config.out, "DIR"):
+        with command.resumable(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt as stop:
-        # Native threads do not let themselves be ended; what they write is whole or not at all.
-        os._exit(command.status_of(stop))
+        # At once: native threads cannot be stopped. The files that they write are complete or absent.
+        os._exit(command.exit_status(stop))
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
 
 
 def require_apart(config: PhotosConfig) -> None:
-    """Raise InputError if what is written would come among the photographs or masks that are given."""
+    """Raise InputError if output files would be written among the given photographs or masks."""
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
     written = [out / name for name in ("images", "masks", "valid", "work")]
@@ -156,14 +151,8 @@ def require_apart(config: PhotosConfig) -> None:
             raise InputError(f"{folder}: {field}: is where the capture is written; give another DIR than {config.out}")
 
 
-def made_by(out: Path) -> list[str] | None:
-    """The `words` that a capture was made with; None if that is not known."""
-    file = out / "work/options.json"
-    return json.loads(file.read_text("utf-8")) if file.exists() else None
-
-
 def make(config: PhotosConfig, scene: Path) -> None:
-    """The capture, from what has been found so far."""
+    """Make the capture; steps that are complete in work/ are not repeated."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := unlit(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
@@ -172,11 +161,11 @@ def make(config: PhotosConfig, scene: Path) -> None:
         kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
         print(f"Cameras: of several models, by EXIF data ({kinds}), but all of one size are taken to share a lens, and "
               "all to have their flash in one place beside it; better give photographs of one")  # fmt: skip
-    if isinstance(config.masks, Path):  # before all the work
+    if isinstance(config.masks, Path):  # before the long work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
-    for left in config.out.glob(".scene.*/"):  # by a process that was killed
+    for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
     require_same_photographs(pictures, work)
@@ -199,7 +188,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
     print(masks_report(found, motion, config.masks))
     if not plane:
         print("Table: none found; if the object stands on one, see in the contact sheet that it is not in the masks")
-    if config.masks == "auto":  # what shows a table and no mask would be taken for the object
+    if config.masks == "auto":  # without a mask, the table would be taken for the object
         motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
     has_up = True
     if not sheet:
@@ -212,23 +201,24 @@ def make(config: PhotosConfig, scene: Path) -> None:
     if not flash and not offset.any() and len({picture.held for picture in pictures}) > 1:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
-    taken = shots(pictures, motion, found, offset, flash)
+    taken = posed_pictures(pictures, motion, found, offset, flash)
     if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
-    # Only where the flash's power is known is the reflectance, too, of which Fresnel's depends.
-    root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
+    # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
+    root = scene_element(ground=ground, up=up, metres=METRES if sheet else None, fresnel=flash is not None)
+    writer = Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
         harmonics = np.zeros((PER_FRAME, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
         cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
-        written = in_threads(partial(write_shot, writer), taken, cuts)
+        written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
             root.extend(write_table(writer, taken, plane, found.center, flash))
-        write_file(work / "options.json", json.dumps(config.words()))
+        write_file(config.out / OPTIONS, json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:
         writer.close()

@@ -13,6 +13,7 @@ from mi_ring.metrics.path_tracing import BATCHES, open_lit_scene, render_both
 from mi_ring.metrics.renderer_agreement import all_as_one, compare_renderers, comparison_table, verdict
 from mi_ring.output.validation_sheet import strip, validation_sheet
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.scene.shot import Shot
 from mi_ring.system import command
 from mi_ring.system.files import write_file, writing
 from mi_ring.system.progress import progress
@@ -62,12 +63,12 @@ class ValidateConfig:
             raise InputError(f"--seed: is {self.seed}, must be 0 to {(1 << 31) - 1}")
 
 
-def chosen_photographs(sensors: list, names: Sequence[str]) -> list[int]:
+def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:
     """Indices of the photographs with these ids or image names, all if there are none. Raises InputError."""
     for name in names:
-        if not any(name in (s.id(), s.filename.name) for s in sensors):
-            raise InputError(f"--photographs: there is no {name}; the first is called {sensors[0].id()}")
-    return [k for k, s in enumerate(sensors) if not names or {s.id(), s.filename.name} & set(names)]
+        if not any(name in (shot.name, shot.file_name) for shot in shots):
+            raise InputError(f"--photographs: there is no {name}; the first is called {shots[0].name}")
+    return [k for k, shot in enumerate(shots) if not names or {shot.name, shot.file_name} & set(names)]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -80,19 +81,20 @@ def main(arguments: Sequence[str]) -> int:
             raise InputError(f"{config.scene}: has no scene.xml; give the folder of a finished fit or a scene file")
     out = config.out or out
     scene, sensors = open_lit_scene(path)
-    chosen = chosen_photographs(sensors, config.photographs)
+    shots = [sensor.shot for sensor in sensors]
+    chosen = chosen_photographs(shots, config.photographs)
     with writing(f"{out}: --out"):
         out.mkdir(parents=True, exist_ok=True)
 
-    photographs, spp = Photographs.of(sensors), -(-config.spp // BATCHES)
-    names = [sensor.filename.name for sensor in sensors]
+    photographs, spp = Photographs.of(shots), -(-config.spp // BATCHES)
+    names = [shot.file_name for shot in shots]
     rows, strips = [], []
     for k in progress(chosen, "comparing", unit="photograph", leave=True):
-        size = sensors[k].size
+        size = shots[k].size
         scale = -(-max(size) // config.width)
         if min(size) < scale:
             raise InputError(f"--width: is {config.width}, too small for {names[k]} of {size[0]} x {size[1]} pixels")
-        seed = 2 * BATCHES * (config.seed * len(sensors) + k) % 2**32
+        seed = 2 * BATCHES * (config.seed * len(shots) + k) % 2**32
         pictures = render_both(scene, photographs, k, sensors[k], scale, spp, config.depth, seed)
         rows.append(compare_renderers(names[k], pictures))
         strips.append(strip(rows[-1], pictures))

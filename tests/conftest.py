@@ -91,8 +91,8 @@ def small_capture(tmp_path_factory):
     from mi_ring.images import linear_to_srgb, to_bytes
     from mi_ring.scene.lights import Light
     from mi_ring.scene.plain_mesh import mesh_of
-    from mi_ring.synthesis.stage import Stage
-    from mi_ring.synthesis.tracing import Shot
+    from mi_ring.synthesis.object_on_table import ObjectOnTable
+    from mi_ring.synthesis.tracing import LensCamera
     from mi_ring.synthesis.viewpoints import look_at
 
     folder = tmp_path_factory.mktemp("small")
@@ -106,7 +106,7 @@ def small_capture(tmp_path_factory):
     colour = bands * [0.6, 0.2, 0.1] + (1 - bands) * [0.3, 0.4, 0.2]
     mesh.add_attribute("vertex_color", 3, colour.astype(np.float32).ravel())
     mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}))
-    stage = Stage(mesh, vertices)
+    scene = ObjectOnTable(mesh, vertices)
     width, height, fx, fy, cx, cy = 56, 40, 60.0, 66.0, 30.5, 18.0
     random, sensors = np.random.default_rng(5), []
     for k in range(12):
@@ -117,9 +117,9 @@ def small_capture(tmp_path_factory):
         matrix = look_at(origin, target, random.normal(size=3))
         light = origin + matrix[:3, :3] @ [15, 10, 0]
         intensity = 2.2 * np.linalg.norm(light - CENTER) ** 2
-        shot = Shot(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
-        radiance = stage.radiance(shot, Light("point", light, np.full(3, intensity)), 16, k, 2)
-        coverage = stage.coverage(shot, 16)
+        view = LensCamera(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
+        radiance = scene.radiance(view, Light("point", light, np.full(3, intensity)), 16, k, 2)
+        coverage = scene.coverage(view, 16)
         mi.Bitmap(to_bytes(linear_to_srgb(radiance))).write(str(folder / f"images/{k:03}.png"))
         mi.Bitmap((coverage[..., None] > 0.5).astype(np.uint8) * 255).write(str(folder / f"masks/{k:03}.png"))
         sensors.append(SENSOR.format(

@@ -48,7 +48,7 @@ class Setting:
         shape = next(s for s in self.scene.shapes() if s.id() == "ball")
         self.surface = Surface(self.scene, shape)
         harmonics = np.random.default_rng(9).normal(0, 0.4, (BASIS, 3)) if room else None
-        self.photographs = Photographs.of(self.scene.sensors(), harmonics)
+        self.photographs = Photographs.of([sensor.shot for sensor in self.scene.sensors()], harmonics)
         ico = trimesh.creation.icosphere(subdivisions=3)
         self.s, self.faces = ico.vertices, ico.faces
         self.surface.set_faces(self.faces)

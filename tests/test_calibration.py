@@ -164,16 +164,16 @@ def test_lens_gain_and_curve_are_undone_in_a_file_that_they_made(small_capture):
         calibration.vignetting.fill_(2.0)
         calibration.gain[:, 1] = torch.linspace(-2, 3, len(capture))
     gain = np.exp([0, 0.1 * (calibration.gain[4, 1].item() - 0.5), 0])
-    sensor = calibration.applied(capture).sensors[4]
-    gamma, n, (width, height) = np.exp(0.8 * 0.2), 2.0, sensor.size
-    assert (sensor.gamma, sensor.vignetting) == (pytest.approx(gamma), pytest.approx(n))
+    shot = calibration.applied(capture).shots[4]
+    gamma, n, (width, height) = np.exp(0.8 * 0.2), 2.0, shot.size
+    assert (shot.response.gamma, shot.response.vignetting) == (pytest.approx(gamma), pytest.approx(n))
     radiance = np.random.default_rng(3).uniform(0.05, 0.9, (height, width, 3)).astype(np.float32)
-    (fx, fy), (cx, cy) = sensor.camera.focal, sensor.camera.centre
+    (fx, fy), (cx, cy) = shot.camera.focal, shot.camera.centre
     cosine = np.array([[1 / np.sqrt(1 + ((u + 0.5 - cx) / fx) ** 2 + ((v + 0.5 - cy) / fy) ** 2)
                         for u in range(width)] for v in range(height)])[..., None]  # fmt: skip
     file = (radiance * gain * cosine**n) ** gamma
-    np.testing.assert_allclose(recorded(radiance, sensor), file, rtol=1e-4)
-    changed = replace(capture, sensors=[sensor], images=one(file), masks=one(None), valid=one(None))
+    np.testing.assert_allclose(recorded(radiance, shot), file, rtol=1e-4)
+    changed = replace(capture, shots=(shot,), images=one(file), masks=one(None), valid=one(None))
     np.testing.assert_allclose(changed.observe([0]).rgb[0], radiance, rtol=1e-4)
     relative = 0.3 * (radiance * gain * cosine**n / 0.3) ** gamma
     mean = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
@@ -276,11 +276,11 @@ def test_what_is_known_of_lens_and_gain_dims_what_the_curve_records(small_captur
     calibration = Calibration(capture, ("curve",), CENTER, 0.3)
     with torch.no_grad():
         calibration.curve.fill_(1)
-    gamma, sensor = np.exp(0.2), calibration.applied(capture).sensors[4]
-    width, height = sensor.size
+    gamma, shot = np.exp(0.2), calibration.applied(capture).shots[4]
+    width, height = shot.size
     radiance = np.random.default_rng(6).uniform(0.1, 0.6, size=(height, width, 3)).astype(np.float32)
-    file = recorded(radiance * 0.3 ** ((1 - gamma) / gamma), sensor)  # under the lights of that scene
-    before = replace(capture, sensors=[capture.sensors[4]], images=one(file), masks=one(None), valid=one(None))
+    file = recorded(radiance * 0.3 ** ((1 - gamma) / gamma), shot)  # under the lights of that scene
+    before = replace(capture, shots=(capture.shots[4],), images=one(file), masks=one(None), valid=one(None))
     predicted = calibration.recorded(torch.from_numpy(radiance)[None], [4], 1)
     np.testing.assert_allclose(predicted[0].detach(), before.observe([0]).rgb[0], rtol=1e-4)
 
@@ -295,12 +295,12 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
     calibration = Calibration(capture, tuple(UNKNOWNS), CENTER, 0.3)
     np.testing.assert_allclose(calibration.flash.mean(0).numpy(), FLASH, atol=1e-3)
     same = calibration()
-    for got, sensor, light in zip(zip(*same), capture.sensors, capture.photographs.lights):
-        camera = sensor.camera
+    for got, shot, light in zip(zip(*same), capture.shots, capture.photographs.lights):
+        camera = shot.camera
         np.testing.assert_allclose(got[0].detach().numpy(), camera.to_world[:3], rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(got[2].detach().numpy(), light.vector, rtol=1e-5)
         np.testing.assert_allclose(got[3].detach().numpy(), light.rgb, rtol=1e-5)
-    distance = np.median([np.linalg.norm(s.camera.position - CENTER) for s in capture.sensors])
+    distance = np.median([np.linalg.norm(s.camera.position - CENTER) for s in capture.shots])
     assert calibration.distance == pytest.approx(distance, rel=1e-5)
     widths = {name: width for group in UNKNOWNS.values() for name, width in group.items()}
     with torch.no_grad():
@@ -312,7 +312,7 @@ def test_unknowns_are_in_the_cameras_axes_and_the_flash_moves_with_its_camera(sm
         calibration.falloff.fill_(2)
         calibration.distortion.fill_(-1.5)
     cameras, intrinsics, places, strengths, falloff, distortion = (t.detach().numpy() for t in calibration())
-    old = capture.sensors[3].camera.to_world[:3]
+    old = capture.shots[3].camera.to_world[:3]
     x, y, z, position = old.T
     moved = position + 2 * widths["move"] * distance * z
     np.testing.assert_allclose(cameras[3].T, [y, -x, z, moved], atol=1e-4)
@@ -393,7 +393,7 @@ def test_a_light_that_is_referred_to_is_replaced(small_capture):
     sensor.remove(sensor.find("emitter"))
     ElementTree.SubElement(root, "emitter", type="flash", id="lamp")
     ElementTree.SubElement(sensor, "ref", id="lamp")
-    written = ElementTree.fromstring(recalibrated_xml(ElementTree.tostring(root), capture.sensors)).find("sensor")
+    written = ElementTree.fromstring(recalibrated_xml(ElementTree.tostring(root), capture.shots)).find("sensor")
     assert len(written.findall("emitter")) == 1 and written.find("ref") is None
 
 
@@ -456,12 +456,11 @@ def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(
     np.testing.assert_allclose(recorded[0, 2:].detach(), expected, rtol=1e-5)
     recorded.sum().backward()
     assert radiance.grad.isfinite().all()
-    sensor = calibration.applied(capture).sensors[4]
-    assert sensor.gamma == pytest.approx(gamma, rel=1e-5)
+    shot = calibration.applied(capture).shots[4]
+    assert shot.response.gamma == pytest.approx(gamma, rel=1e-5)
     # What the photograph then says of a lit surface, by the strength of its light then.
-    factor = sensor.light and float(np.ravel(mi.traverse(sensor.light)["intensity.value"])[0])
-    factor /= float(np.ravel(mi.traverse(capture.sensors[4].light)["intensity.value"])[0])
-    decoded, _ = decode(expected.astype(np.float32), True, 2.0, sensor.gamma)
+    factor = shot.light.rgb[0] / capture.shots[4].light.rgb[0]
+    decoded, _ = decode(expected.astype(np.float32), True, 2.0, shot.response.gamma)
     np.testing.assert_allclose(decoded, factor * np.array([0.01, 0.3, 0.7]), rtol=1e-4)
 
 
@@ -476,12 +475,12 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
     with torch.no_grad():
         calibration.curve.fill_(0.8)
         calibration.contrast.fill_(-1.5)
-    sensor, radiance = calibration.applied(capture).sensors[4], np.array([0.02, 0.11, 0.3, 0.71])
+    shot, radiance = calibration.applied(capture).shots[4], np.array([0.02, 0.11, 0.3, 0.71])
     gamma, contrast = np.exp(0.8 * 0.2), np.exp(-1.5 * 0.2)
-    assert sensor.gamma == pytest.approx(1.3 * gamma, rel=1e-6)
-    assert sensor.contrast == pytest.approx(1.2 * contrast, rel=1e-6)
+    assert shot.response.gamma == pytest.approx(1.3 * gamma, rel=1e-6)
+    assert shot.response.contrast == pytest.approx(1.2 * contrast, rel=1e-6)
     stronger = exposure ** ((1 - gamma) / gamma)  # the lights of that scene
-    file = recorded(stronger * radiance, sensor)
+    file = recorded(stronger * radiance, shot)
     v = linear_to_srgb((stronger * radiance) ** (1.3 * gamma))
     odds = (v / (1 - v)) ** (1.2 * contrast)
     np.testing.assert_allclose(linear_to_srgb(file), odds / (1 + odds), rtol=1e-4)
@@ -522,8 +521,8 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     applied = calibration.applied(capture)
     assert capture.photographs.room is None and np.abs(applied.photographs.room).min() > 0
     path = small_capture.parent / "recalibrated.xml"
-    scene = recalibrated_xml(small_capture.read_bytes(), applied.sensors, applied.photographs.room / 2)
-    path.write_bytes(recalibrated_xml(scene, applied.sensors, applied.photographs.room))  # in the place of the former
+    scene = recalibrated_xml(small_capture.read_bytes(), applied.shots, applied.photographs.room / 2)
+    path.write_bytes(recalibrated_xml(scene, applied.shots, applied.photographs.room))  # in the place of the former
     read = mi_ring.load_capture(path)
     path.unlink()
     np.testing.assert_allclose(read.photographs.room, applied.photographs.room, rtol=1e-5)
@@ -532,10 +531,10 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
         for name in ("cameras", "intrinsics", "distortion", "places", "strengths"):
             if hasattr(a, name):
                 np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
-    for a, b in zip(read.sensors, applied.sensors):
-        np.testing.assert_allclose(a.gain, b.gain, rtol=1e-6)
-    assert [s.gamma for s in read.sensors] == pytest.approx([s.gamma for s in applied.sensors])
-    assert [s.mask for s in read.sensors] == [s.mask for s in capture.sensors]
+    for a, b in zip(read.shots, applied.shots):
+        np.testing.assert_allclose(a.response.gain, b.response.gain, rtol=1e-6)
+    assert [s.response.gamma for s in read.shots] == pytest.approx([s.response.gamma for s in applied.shots])
+    assert [s.files for s in read.shots] == [s.files for s in capture.shots]
 
 
 def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, tmp_path):
@@ -555,7 +554,7 @@ def test_distortion_goes_where_the_lens_has_it(small_capture):
         fit.calibration.distortion.fill_(1)  # 0.05: a tenth of a pixel where the object ends
     for _ in range(60):
         fit.step()
-    found = [sensor.camera.distortion for sensor in fit.calibrated().sensors]
+    found = [shot.camera.distortion for shot in fit.calibrated().shots]
     assert np.abs(found).max() < 0.3 * 0.05
     fit.surface.show(fit.ring, *fit.ring.domain.sample(3))
     summary = fit.summary(fit.calibrated())["unknowns"]["distortion"]

@@ -32,7 +32,7 @@ def test_pot_is_a_small_closed_surface_of_genus_one():
 def test_pot_has_its_photographs(file, count):
     scene = loading.load_capture(ROOT / "scenes" / file)
     assert len(scene) == count
-    assert all(sensor.size == (256, 256) for sensor in scene.sensors)
+    assert all(shot.size == (256, 256) for shot in scene.shots)
     assert scene.photographs.colocated  # a flash at the camera
     saturated = np.mean([scene.observe([k])[1].float().mean() for k in range(count)])
     assert 0 < saturated < 0.02
@@ -42,7 +42,7 @@ def test_cameras_of_the_pot_put_the_true_mesh_into_the_masks():
     scene = loading.load_capture(POT)
     mesh = trimesh.load(ROOT / "scenes/pot2/truth/mesh.ply", process=False)
     for k in (0, 5, 17, 31):
-        matrix, focal, centre, *_ = scene.sensors[k].camera
+        matrix, focal, centre, *_ = scene.shots[k].camera
         local = (mesh.vertices - matrix[:3, 3]) @ matrix[:3, :3]
         column, row = (centre - focal * local[:, :2] / local[:, 2:]).T
         rows, columns = np.nonzero(scene.masks[k] > 127)

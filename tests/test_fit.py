@@ -303,9 +303,9 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
 
 def test_each_photograph_comes_before_one_comes_again():
     sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
-    sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
+    shots = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
     rounds, random = (
-        Rounds(SimpleNamespace(sensors=sensors, sizes=sizes), np.arange(12)),
+        Rounds(SimpleNamespace(shots=shots, sizes=sizes), np.arange(12)),
         torch.Generator().manual_seed(5),
     )
     drawn: dict = {size: [] for size in sizes}
@@ -624,7 +624,7 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
     # Nor does what is left depend on the scene, which may have been on the same drive, nor on the report.
     running = Fit(load_capture(small_capture), Config(iterations=2, levels=(1,), widths=(28,), shares=(1,)))
     keeper = session.Keeper(running, folder, lambda: None)
-    scene = results.fitted_scene(running, folder)
+    scene = results.fitted_scene(running.capture, running.ring, folder)
     running.capture = replace(running.capture, path=tmp_path / "gone.xml")
     said = keeper.rescue(scene)
     where = Path(re.fullmatch("the results are in (.*) instead", said)[1])

@@ -79,7 +79,7 @@ def diffuse_cup():
     lights = [{"type": "point", "position": CENTER.tolist(), "intensity": {"type": "rgb", "value": i}}
               for i in INTENSITY.tolist()]  # fmt: skip
     scene = load(lights, cup=cup(material(ALBEDO / np.pi)))
-    return scene, Photographs.of(scene.sensors())
+    return scene, Photographs.of([sensor.shot for sensor in scene.sensors()])
 
 
 def series(bounces):
@@ -128,7 +128,7 @@ def test_it_is_what_path_finds_beyond_direct_light(light):
             "bsdf": material([0.1, 0.2, 0.2], 0.05)}  # fmt: skip
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
     scene = load(lights, cup=cup(material(0.8 * ALBEDO / np.pi, 0.04)), ball=ball, sky=sky)
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
 
     def regions(picture):
         """Means of the left and right halves of each photograph."""
@@ -152,7 +152,11 @@ def test_a_convex_object_has_none():
     lights = [{"type": "point", "position": [1.0, 2.0, 3.0], "intensity": 4.0}] * 2
     ball = {"type": "shapenet", "subdivisions": 3, "center": CENTER.tolist(), "bsdf": material(ALBEDO, 0.1)}
     scene = load(lights, ball=ball)
-    picture = pictures(indirect_light.render_indirect(scene, Photographs.of(scene.sensors()), spp=64, seed=1))
+    picture = pictures(
+        indirect_light.render_indirect(
+            scene, Photographs.of([sensor.shot for sensor in scene.sensors()]), spp=64, seed=1
+        )
+    )
     assert (picture[..., :3] == 0).all() and picture[..., 3].max() == 1
 
 

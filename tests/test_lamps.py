@@ -152,7 +152,7 @@ def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture
     center = capture.sphere()[0]
     own = under.photographs.lights[0]
     away = -own.vector if distant else own.vector - center
-    distances = [np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors]
+    distances = [np.linalg.norm(shot.camera.position - center) for shot in capture.shots]
     assert np.linalg.norm(away) == pytest.approx(1.0 if distant else np.median(distances), rel=1e-4)
     assert np.degrees(np.arccos(away @ toward / np.linalg.norm(away))) < 8
     assert np.pi * under.reflectance(center, capture.exposure()) == pytest.approx(0.5, rel=1e-4)

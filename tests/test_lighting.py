@@ -15,7 +15,7 @@ from conftest import photographed_ellipsoid
 import mi_ring
 from mi_ring import export
 from mi_ring.calibration.calibration import Calibration, refined_of
-from mi_ring.capture.scenefile import photograph_element
+from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
 from mi_ring.fitting import light_selection, priors
 from mi_ring.fitting.lighting import Lighting, lit, moved
@@ -23,10 +23,8 @@ from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import prediction
-from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, room_envmap, world_harmonics
 from mi_ring.scene.lights import is_room, shared_emitters
-from mi_ring.scene.xml_elements import load_element
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
@@ -93,7 +91,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
     for _ in fit:
         pass
-    gains = np.log([sensor.gain for sensor in fit.calibrated().sensors]), np.log(true)
+    gains = np.log([shot.response.gain for shot in fit.calibrated().shots]), np.log(true)
     off = (gains[0] - gains[0].mean(0)) - (gains[1] - gains[1].mean(0))
     assert np.abs(off).mean() < 0.5 * np.abs(gains[1] - gains[1].mean(0)).mean()
 
@@ -101,7 +99,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     said = re.sub(r'(name="intensity" value=)"0 0 0"', lambda _: '{}"{} {} {}"'.format(_[1], *next(values)), text)
     (exposed / "said.xml").write_text(said)
     told = lit(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
-    np.testing.assert_allclose([sensor.gain for sensor in told.sensors], true / true.mean(0), rtol=1e-5)
+    np.testing.assert_allclose([shot.response.gain for shot in told.shots], true / true.mean(0), rtol=1e-5)
     with pytest.raises(InputError, match="--refine: is power gain, must be without power or without gain"):
         mi_ring.Config(refine=("power", "gain"))
 
@@ -179,7 +177,7 @@ def test_a_known_environment_lights_photographs_that_have_no_light(in_an_environ
     assert again.photographs.room is None and not (tmp_path / "environment.exr").exists()
 
     # Without masks it may be what is seen beside the object.
-    bare = replace(capture, masks=[None] * len(capture))
+    bare = replace(capture, masks=Pixels([None] * len(capture)))
     fit = mi_ring.Fit(bare, mi_ring.Config.preset("fast", **TINY))
     assert fit.environment is None and np.isfinite(fit.step().loss)
     with pytest.raises(InputError, match="--refine power: is of the photographs' own lights, of which there are none"):
@@ -214,16 +212,9 @@ def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_en
         "light", "power", "ambient",
     )  # fmt: skip
     assert refined_of(dark, mi_ring.Config(), 0.5) == ("gain", "ambient")
-    exact = [load_element(element) for element in calibrated_elements(dark)]
-    said = lit(replace(dark, sensors=exact), Lighting("environment"))
+    exact = tuple(replace(shot, calibrated=True) for shot in dark.shots)
+    said = lit(replace(dark, shots=exact), Lighting("environment"))
     assert said.known and refined_of(said, mi_ring.Config(light="environment"), 0.5) == ("ambient",)
-
-
-def calibrated_elements(capture):
-    """The photographs of a capture, which say that they are calibrated."""
-    lights = Lights.of(capture.sensors)
-    return [photograph_element(sensor.id(), str(sensor.filename), sensor.camera, lights[k], calibrated=True)
-            for k, sensor in enumerate(capture.sensors)]  # fmt: skip
 
 
 def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path):

@@ -72,7 +72,7 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
 
     fit.save(tmp_path / "run")
     written = mi_ring.load_capture(tmp_path / "run" / "scene.xml")
-    assert [sensor.mask.name for sensor in written.sensors] == [f"{k:03}.png.png" for k in range(12)]
+    assert [shot.files.mask.name for shot in written.shots] == [f"{k:03}.png.png" for k in range(12)]
     for one, another in zip(fit.capture.masks, written.masks):
         np.testing.assert_array_equal(one, another)
 
@@ -90,11 +90,11 @@ def test_what_the_second_search_is_not_sure_of_stays(without_some_masks):
 
 def test_outlines_of_reduced_pictures_stay_where_they_are(small_capture):
     capture = mi_ring.load_capture(small_capture)
-    sensor = capture.sensors[0]
+    shot = capture.shots[0]
     outline = torch.zeros(40 // 3, 56 // 3, dtype=torch.uint8)
     outline[4:, 10:] = 1  # from row 12 and column 30 on
     mask = mask_refinement.with_outlines(capture, {0: outline}).masks[0]
-    assert mask.shape == sensor.size[::-1]
+    assert mask.shape == shot.size[::-1]
     expected = np.zeros((40, 56), bool)
     expected[12:, 30:] = True
     expected[12, 30] = False  # corners are rounded

@@ -16,7 +16,15 @@ from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import automatic_masks, bundle_adjustment, shading_trial, structure_from_motion, table_plane
-from mi_ring.photogrammetry.capture_files import OBJECT, UNSURE, Shot, cut_mask, extent_of, windows, write_shot
+from mi_ring.photogrammetry.capture_files import (
+    OBJECT,
+    UNSURE,
+    PosedPicture,
+    cut_mask,
+    extent_of,
+    windows,
+    write_posed_picture,
+)
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.marker_sheet import Sighting
 from mi_ring.photogrammetry.matching import pairs_to_match
@@ -449,7 +457,7 @@ def shot(tmp_path, name, lens, pose, mask):
     pixels = np.random.default_rng(0).integers(60, 200, (lens.size[1], lens.size[0], 3), np.uint8)
     pixels = cv2.GaussianBlur(pixels, (0, 0), 3)
     light = Light("point", pose[:3, 3], np.full(3, 2.0))
-    return Shot(picture(tmp_path / f"{name}.png", pixels), lens, pose, mask, light)
+    return PosedPicture(picture(tmp_path / f"{name}.png", pixels), lens, pose, mask, light)
 
 
 def test_crops_are_of_one_size_hold_the_object_and_see_the_same(tmp_path):
@@ -468,7 +476,7 @@ def test_crops_are_of_one_size_hold_the_object_and_see_the_same(tmp_path):
     writer = Writer(tmp_path / "capture/scene.xml")
     try:
         for one, window in zip(shots, cut):
-            element = write_shot(writer, one, window)
+            element = write_posed_picture(writer, one, window)
             sensor = load_element(element)
             np.testing.assert_allclose(sensor.camera.position, one.pose[:3, 3], rtol=1e-5)
             rows, columns = np.nonzero(one.mask == OBJECT)

@@ -39,7 +39,7 @@ def arguments(path, out):
 
 def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
     loaded = load_capture(scene[0])
-    (colour, rough), xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
+    (colour, rough), xml = reflectance.predicted_parameters(loaded, PREDICT)
     assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
     assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
     assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
@@ -82,7 +82,7 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
 @pytest.mark.parametrize("which", PREDICT)
 def test_gradients_of_attributes_equal_finite_differences(scene, which):
     loaded = load_capture(scene[0])
-    parameters, xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
+    parameters, xml = reflectance.predicted_parameters(loaded, PREDICT)
     ring = FittedObject(*loaded.sphere(), 1.0, None, parameters, xml)
     surface = Surface(loaded.scene, loaded.shape, ring)
     s, faces = ring.domain.sample(3)
@@ -120,14 +120,14 @@ def test_part_of_cooktorrance(broken_capture):
     """What the XML leaves to mesh attributes needs no starting value."""
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="specular" value="0.05"/></bsdf>')
-    shape = load_capture(path).shape
-    parameters, xml = reflectance.predicted_parameters(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
+    loaded = load_capture(path)
+    parameters, xml = reflectance.predicted_parameters(loaded, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
     assert "vertex_specular" not in str(xml_elements.load_bsdf(xml))
     # Without ranges: all but the constant.
-    assert [p.name for p in reflectance.predicted_parameters(path, shape, {})[0]] == ["diffuse", "roughness"]
+    assert [p.name for p in reflectance.predicted_parameters(loaded, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
-        reflectance.predicted_parameters(path, shape, {"diffuse": (0, 1)})
+        reflectance.predicted_parameters(loaded, {"diffuse": (0, 1)})
 
 
 WRONG = {
@@ -144,7 +144,7 @@ WRONG = {
 def test_wrong_parameters_are_refused_in_one_line(scene, ranges, message):
     loaded = load_capture(scene[0])
     with pytest.raises(InputError, match=message) as caught:
-        reflectance.predicted_parameters(scene[0], loaded.shape, ranges)
+        reflectance.predicted_parameters(loaded, ranges)
     assert "\n" not in str(caught.value)
 
 
@@ -166,9 +166,9 @@ def test_unfit_bsdfs_are_refused_in_one_line(broken_capture, xml):
     path, edit = broken_capture
     (path.parent / "other.xml").write_text('<scene version="3.0.0"/>')
     edit('<bsdf type="cooktorrance"/>', xml)
-    shape = load_capture(path).shape
+    loaded = load_capture(path)
     with pytest.raises(InputError, match=REFUSED[xml]) as caught:
-        reflectance.predicted_parameters(path, shape, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
+        reflectance.predicted_parameters(loaded, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
     assert "\n" not in str(caught.value)
 
 

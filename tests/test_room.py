@@ -75,7 +75,7 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
     """Ramamoorthi and Hanrahan 2001: irradiance is the harmonics times π, 2π/3 and π/4 for l = 0, 1 and 2."""
     ball = {"type": "sphere", "center": CENTER.tolist(), "radius": 0.5, "bsdf": material(ALBEDO / np.pi)}
     scene = load(LIGHTS, ball=ball)
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, harmonics=ALL)
     images, free = (np.moveaxis(part, 0, 3) for part in shown(channels))
     inside = pictures(channels[:4])[..., 3] == 1
@@ -106,7 +106,7 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
     lit, dark = load(LIGHTS, **parts, **emitters(room)), load(LIGHTS, **parts)
     np.testing.assert_allclose(room_of(lit), room, atol=1e-6)
     assert room_of(dark) is None
-    photographs = Photographs.of(dark.sensors(), room)
+    photographs = Photographs.of([sensor.shot for sensor in dark.sensors()], room)
 
     def path(scene, seed):
         integrator = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 100})
@@ -139,7 +139,9 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=256, seed=2))
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
-    channels = indirect_light.render_indirect(dark, Photographs.of(dark.sensors()), 64, 5, harmonics=ALL)
+    channels = indirect_light.render_indirect(
+        dark, Photographs.of([sensor.shot for sensor in dark.sensors()]), 64, 5, harmonics=ALL
+    )
     ours = np.einsum("jnhwc,jc->nhwc", shown(channels)[0], room[ALL])[1]
     np.testing.assert_allclose(added.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
 
@@ -176,7 +178,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     truth, free = some_room(), sorted({k for frame in frames for k in FRAMES[frame]})
     truth[np.setdiff1d(np.arange(BASIS), free)] = 0
     lit, dark = load(LIGHTS, **parts, **emitters(truth)), load(LIGHTS, **parts)
-    photographs = Photographs.of(dark.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in dark.sensors()])
     path = mi.load_dict({"type": "path", "max_depth": 5, "rr_depth": 100})
     observed = np.stack([np.array(mi.render(lit, sensor=k, integrator=path, spp=256, seed=k))[..., :3] for k in (0, 1)])
     observed[:, ::9, ::7] *= 30
@@ -252,7 +254,7 @@ def test_a_scene_says_in_which_axes_its_room_is(frames):
 @pytest.mark.parametrize("light", [0.0, 0.3])
 def test_a_turntable_stays_one_though_its_room_is_dark_or_alike_from_all_sides(small_capture, light):
     """It is told by a room in the camera's axes."""
-    sensors = load_capture(small_capture, images=False).sensors
+    sensors = load_capture(small_capture, images=False).shots
     root = ElementTree.fromstring(small_capture.read_bytes())
     root.append(room_element("camera", np.zeros((PER_FRAME, 3))))
     room = np.zeros((BASIS, 3))

@@ -10,7 +10,7 @@ from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
-from mi_ring.photogrammetry.capture_files import OBJECT, Shot, write_table
+from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, write_table
 from mi_ring.photogrammetry.flash_light import Flash
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.reduced_photographs import camera_of
@@ -78,8 +78,8 @@ def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
                               indirect=True)  # fmt: skip
     np.testing.assert_array_equal(coverage, same)  # no camera sees it
 
-    scene, sensor = mi.load_file(str(write(tmp_path, more=more)), optimize=False, parallel=False), capture.sensors[0]
-    batch = capture.photographs.select([0], sensor.size)
+    scene = mi.load_file(str(write(tmp_path, more=more)), optimize=False, parallel=False)
+    sensor, batch = scene.sensors()[0], capture.photograph(0)
     channels = [np.array(c) for c in render_path(scene, batch, sensor, 1024, 3, 5)]
     traced = np.stack(channels, -1).reshape(rgb[0].shape)
     inside = coverage[0].numpy() == 1
@@ -181,7 +181,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
     for k, (pose, flash, srgb, mask) in enumerate(photographs_of_a_table()):
         write_image(srgb, tmp_path / f"{k}.png")
         light = flash._replace(rgb=brightness * flash.rgb)
-        shots.append(Shot(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
+        shots.append(PosedPicture(kind(tmp_path / f"{k}.png"), LENS, pose, OBJECT * mask, light))
     writer = Writer(tmp_path / "capture/scene.xml")
     root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))

@@ -8,7 +8,6 @@ another reflectance. It is refined only if the scene has some.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,14 +18,14 @@ from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.calibration.rig import Estimate, Rig, Views
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera, straightening
+from mi_ring.geometry.camera import Camera, undistortion_factor
 from mi_ring.rendering import bridge, prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.rendering.surface import Surface
+from mi_ring.scene.assembly import with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
 
@@ -56,7 +55,7 @@ class Calibration(nn.Module):
         self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
         for name, unknown in self.unknowns.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
-        given = capture.photographs.room
+        given = capture.room
         room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
         alone = capture.photographs.dark and not shared_emitters(capture.scene)
         self.room = RoomLight(room, rig.exposure, frames, alone)
@@ -125,7 +124,7 @@ class Calibration(nn.Module):
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
         if self.bent:
-            distance2 = distance2 * straightening(views.distortion[index].detach()[:, None, None], distance2) ** 2
+            distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
     def response(self) -> CameraResponse:
@@ -189,21 +188,23 @@ class Calibration(nn.Module):
         """The capture with the current cameras, lights and response."""
         estimate = self.estimate()
         views, lamps = self.rig.views_of(estimate, self.bent), self.rig.lamps_of(estimate)
-        matrices, intrinsics, places, strengths, falloff, distortion = (part.double().numpy() for part in views)
-        gamma, vignetting = float(self.value("curve").exp()), float(self.value("vignetting"))
-        contrast = float(self.value("contrast").exp())
+        gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
+        gains = np.ones((len(self.rig), 3))
+        if "gain" in self.refined:
+            gains = centred(self.value("gain"), self.rig).double().exp().numpy()
         # The curve keeps the exposure here, and full scale in a scene file.
         level = self.rig.exposure ** ((1 - gamma) / gamma)
-        cameras = []
-        for k, sensor in enumerate(capture.sensors):
-            to_world = np.vstack([matrices[k], [0, 0, 0, 1]])
-            cameras.append(Camera(to_world, intrinsics[k, :2], intrinsics[k, 2:], sensor.size, distortion[k]))
-        lights = LightTensors(torch.from_numpy(places), self.rig.finite, torch.from_numpy(level * strengths)).lights()
-        refined = lamps._replace(strengths=level * lamps.strengths).lights() if "lamps" in self.refined else None
-        room: Any = None
-        if "ambient" in self.refined or capture.photographs.room is not None:
+        lights = LightTensors(views.places, self.rig.finite, level * views.strengths.double()).lights()
+        poses, intrinsics, _, _, falloff, distortion = (part.double().numpy() for part in views)
+        shots = []
+        for k, shot in enumerate(capture.shots):
+            pose, lens = np.vstack([poses[k], [0, 0, 0, 1]]), intrinsics[k]
+            camera = Camera(pose, lens[:2], lens[2:], shot.size, float(distortion[k]))
+            response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
+            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]), response=response))
+        scene, room = capture.scene, None
+        if "lamps" in self.refined:
+            scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())
+        if "ambient" in self.refined or capture.room is not None:
             room = self.room_harmonics().double().numpy(force=True) * level
-        gains = centred(self.value("gain"), self.rig).double().exp().numpy() if "gain" in self.refined else 1.0
-        return with_calibration(
-            capture, cameras, lights, gamma, room, falloff.tolist(), vignetting, contrast, gains, refined
-        )
+        return replace(capture, scene=scene, shots=tuple(shots), room=room)

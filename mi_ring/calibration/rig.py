@@ -62,14 +62,14 @@ class Rig:
         the scene's own lamps are unknown.
         """
         self.path, self.exposure, self.power, self.guessed = capture.path, exposure, power, guessed
-        cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
+        cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
         to_world = np.stack([camera.to_world[:3] for camera in cameras])
         intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
-        cones = np.array([sensor.cone for sensor in capture.sensors])
+        cones = np.array([shot.falloff for shot in capture.shots])
         distortion = np.array([camera.distortion for camera in cameras])
         arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, distortion
         self.views = Views(*(torch.from_numpy(array).float() for array in arrays))
-        self.sizes = [sensor.size for sensor in capture.sensors]
+        self.sizes = [shot.size for shot in capture.shots]
         self.dark = capture.photographs.dark  #: Have photographs no lights of their own?
         self.fitted = torch.arange(len(cameras)) if fitted is None else torch.from_numpy(fitted)
         self.lamps = LightTensors.of(lamp_lights(capture.scene) if lamps else [])  #: that are unknown
@@ -97,9 +97,9 @@ class Rig:
         self.lens = torch.from_numpy(lens)  #: (P,) number of each photograph's lens
         self.place = torch.from_numpy(place if self.flash is None else np.zeros_like(place))  #: (P,) of its light
         self.response = CameraResponse(
-            None, None, None, torch.tensor([sensor.gamma for sensor in capture.sensors]),
-            torch.tensor([sensor.vignetting for sensor in capture.sensors]), exposure,
-            torch.from_numpy(np.stack([sensor.gain for sensor in capture.sensors])).float(),
+            None, None, None, torch.tensor([shot.response.gamma for shot in capture.shots]),
+            torch.tensor([shot.response.vignetting for shot in capture.shots]), exposure,
+            torch.from_numpy(np.stack([shot.response.gain for shot in capture.shots])).float(),
         )  # fmt: skip
 
     def __len__(self) -> int:

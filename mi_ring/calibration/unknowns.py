@@ -189,8 +189,8 @@ class Falloff(Unknown):
         return replace(now, falloff=now.falloff + value)
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        means = (np.mean([sensor.cone for sensor in side.sensors]) for side in (found.before, found.after))
-        return "exponent of the flash's cone", *means, std
+        before, after = (np.mean([shot.falloff for shot in side.shots]) for side in (found.before, found.after))
+        return "exponent of the flash's cone", before, after, std
 
 
 class Vignetting(Unknown):
@@ -202,8 +202,10 @@ class Vignetting(Unknown):
         return replace(now, response=now.response._replace(vignetting=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        means = (np.mean([sensor.vignetting for sensor in side.sensors]) for side in (found.before, found.after))
-        return "exponent of the lens' vignetting", *means, std
+        before, after = (
+            np.mean([shot.response.vignetting for shot in side.shots]) for side in (found.before, found.after)
+        )
+        return "exponent of the lens' vignetting", before, after, std
 
 
 class CurveExponent(Unknown):
@@ -215,7 +217,7 @@ class CurveExponent(Unknown):
         return replace(now, response=now.response._replace(exponent=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (np.mean([sensor.gamma for sensor in side.sensors]) for side in (found.before, found.after))
+        before, after = (np.mean([shot.response.gamma for shot in side.shots]) for side in (found.before, found.after))
         return "exponent of the camera's curve", before, after, after * std
 
 
@@ -228,7 +230,9 @@ class Contrast(Unknown):
         return replace(now, response=now.response._replace(contrast=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (np.mean([sensor.contrast for sensor in side.sensors]) for side in (found.before, found.after))
+        before, after = (
+            np.mean([shot.response.contrast for shot in side.shots]) for side in (found.before, found.after)
+        )
         return "contrast of the camera's curve", before, after, after * std
 
 
@@ -315,4 +319,4 @@ def centred(value: Tensor, rig: Rig) -> Tensor:
 def lens_cameras(found: Found) -> Iterable[list]:
     """Before and after the fit: of each lens the camera of its first photograph."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
-    return ([side.sensors[k].camera for k in first] for side in (found.before, found.after))
+    return ([side.shots[k].camera for k in first] for side in (found.before, found.after))

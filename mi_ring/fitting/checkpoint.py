@@ -104,7 +104,7 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
 def digests(capture: Capture, config: Config) -> dict[str, str]:
     """Hashes of all files that a fit reads, except textures, by their name relative to the scene."""
     files = {capture.path, capture.shape.domain_file}
-    files |= {file for s in capture.sensors for file in (s.filename, s.mask, s.valid, s.ambient)}
+    files |= {file for shot in capture.shots for file in shot.files}
     if isinstance(config.domain, tuple):
         files.add(Path(config.domain[1]))
     return {relative_to(capture.path.parent, file): digest(file) for file in files if file}

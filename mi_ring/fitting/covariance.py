@@ -59,7 +59,7 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
     surface = renderer.showing(model, level)
     colours, silhouettes = Equations(layout.count), Equations(layout.count)
     for index in problem.capture.together(problem.fitted):
-        scale = -(-problem.capture.sensors[index[0]].size[0] // COMPARED_WIDTH)
+        scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
         compare(Comparison(problem, model, surface, index, scale), layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
     precision = np.eye(layout.count) + colours.information() + silhouettes.information()

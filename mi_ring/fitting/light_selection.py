@@ -144,7 +144,7 @@ class Trials:
         self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
-        away = np.median([np.linalg.norm(sensor.camera.position - self.center) for sensor in self.capture.sensors])
+        away = np.median([np.linalg.norm(shot.camera.position - self.center) for shot in self.capture.shots])
         directions, colours = brightest(*self.environment, count)
         vectors = -directions if distant else self.center + away * directions
         rgb = math.pi * self.capture.exposure() / ALBEDO * colours * (1.0 if distant else away**2)

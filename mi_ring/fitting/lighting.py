@@ -13,12 +13,11 @@ import numpy as np
 from torch import Tensor
 
 from mi_ring.calibration.unknowns import OWN_LIGHTS
-from mi_ring.capture.calibrated import with_calibration
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, without_environment
-from mi_ring.scene.assembly import lamp_lights
+from mi_ring.scene.assembly import lamp_lights, with_lamps
 from mi_ring.scene.lights import Light, shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
@@ -78,7 +77,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
         names = ", ".join(f'"{emitter.id()}"' for emitter in others)
         raise InputError(f"{capture.path}: emitter {names}: --light {config.light} finds all the light there is; take "
                          "the lamps of the scene out, or leave --light out")  # fmt: skip
-    if any(sensor.ambient for sensor in capture.sensors):
+    if any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
     if not any(capture.masks.given):
@@ -93,7 +92,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
 
 def unlit(capture: Capture) -> bool:
     """Have the photographs neither lights of their own nor room light?"""
-    return capture.photographs.dark and capture.photographs.room is None
+    return capture.photographs.dark and capture.room is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
@@ -131,20 +130,20 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
     """
     if lighting.kind == "capture":
         return capture
-    cameras, exposure = [sensor.camera for sensor in capture.sensors], capture.exposure()
-    room, lamps = None, None
+    scene, room, gains = capture.scene, None, exposures(capture)
     if lighting.lamps:
         kind: Literal["point", "directional"] = "directional" if lighting.distant else "point"
         first, *others = [Light(kind, np.array(vector), np.array(rgb)) for vector, rgb in lighting.lamps]
-        lights, lamps = [first] * len(cameras), others or None
+        lights = [first] * len(capture)
+        scene = with_lamps(scene, others) if others else scene
     else:
         room = np.zeros((BASIS, 3))
-        room[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
-        lights = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
-    result = with_calibration(capture, cameras, lights, room=room, falloff=[0.0] * len(cameras),
-                              gains=exposures(capture), lamps=lamps)  # fmt: skip
-    result.hull = capture.hull  # of the same masks and cameras; it takes a while
-    return result
+        room[0] = math.sqrt(4 * math.pi) * capture.exposure() / ALBEDO
+        lights = [Light("point", shot.camera.position, np.zeros(3)) for shot in capture.shots]
+    shots = []
+    for shot, light, gain in zip(capture.shots, lights, gains):
+        shots.append(replace(shot, light=light, falloff=0.0, response=shot.response.changed(gain=gain)))
+    return replace(capture, scene=scene, shots=tuple(shots), room=room)
 
 
 def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
@@ -159,8 +158,8 @@ def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
     scene, known = without_environment(capture.scene)
     if known is None:
         return capture, scene, None
-    room = known if capture.photographs.room is None else capture.photographs.room + known
-    return replace(capture, photographs=replace(capture.photographs, room=room)), scene, known
+    room = known if capture.room is None else capture.room + known
+    return replace(capture, room=room), scene, known
 
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:

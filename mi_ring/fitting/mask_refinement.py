@@ -36,12 +36,12 @@ def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Rende
     capture = model.calibrated(capture)
     surface = renderer.showing(model, level)
     places: dict[tuple, list[int]] = {}
-    for k, sensor in enumerate(capture.sensors):
-        places.setdefault((sensor.size, sensor.camera.to_world.tobytes()), []).append(k)
+    for k, shot in enumerate(capture.shots):
+        places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Picture, coverage of the surface, and pixels that are certainly background."""
-        scale = -(-max(capture.sensors[index[0]].size) // LARGEST)
+        scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
         picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / problem.exposure)))
@@ -75,5 +75,5 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
 
     if not masks:
         return capture
-    readers = {k: partial(enlarged, mask, capture.sensors[k].size) for k, mask in masks.items()}
+    readers = {k: partial(enlarged, mask, capture.shots[k].size) for k, mask in masks.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

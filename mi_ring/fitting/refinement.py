@@ -29,7 +29,7 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> t
         names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
-        subtracted = {"ambient"} if all(sensor.ambient for sensor in capture.sensors) else set()
+        subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")

@@ -58,7 +58,7 @@ class Renderer:
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
         """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
-        photograph = capture.photograph(k, -(-capture.sensors[k].size[0] // width))
+        photograph = capture.photograph(k, -(-capture.shots[k].size[0] // width))
         rgb, _ = prediction.draw(self.showing(model, level), photograph, spp, shadows=capture.shadows,
                                  indirect=model.ring.indirect)  # fmt: skip
         return rgb[0].numpy()

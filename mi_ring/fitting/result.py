@@ -40,7 +40,7 @@ def result_of(
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
     """(BASIS, 3) room light without the environment that the scene file has."""
-    room = refined.photographs.room
+    room = refined.room
     if room is None or problem.environment is None:
         return room
     own = room - problem.environment

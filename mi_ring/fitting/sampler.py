@@ -61,7 +61,7 @@ class Sampler:
         seeds = torch.randint(2**62, (len(PURPOSES),), generator=first).tolist()
         self.random = {name: torch.Generator().manual_seed(seed) for name, seed in zip(PURPOSES, seeds)}
         capture = problem.capture
-        self.sizes = [capture.sensors[k].size for k in problem.fitted]
+        self.sizes = [capture.shots[k].size for k in problem.fitted]
         self.alike = {size: np.intersect1d(index, problem.fitted) for size, index in capture.sizes.items()}
         #: by size (width, height): photographs that have not come yet in this round
         self.waiting: dict[tuple[int, int], list[int]] = {}

@@ -24,7 +24,7 @@ from mi_ring.output import results
 from mi_ring.output.fit_result import FitResult
 from mi_ring.system.command import SIGNALS
 from mi_ring.system.optional import installed
-from mi_ring.system.progress import outliving_readers, progress
+from mi_ring.system.progress import progress, tolerating_closed_output
 
 CHECKPOINT_SECONDS = 30.0
 INPUTS_LEVEL = 4  #: of the surface in inputs.png
@@ -192,7 +192,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     """
     processes, model, config = fit.problem.processes, fit.model, fit.problem.config
     fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))
-    with heeding_signals() as heard, outliving_readers():
+    with heeding_signals() as heard, tolerating_closed_output():
 
         def interrupted() -> int:
             return processes.maximum(heard())

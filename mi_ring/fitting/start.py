@@ -27,7 +27,7 @@ def require_settings(capture: Capture, config: Config) -> None:
     """Raise InputError for settings that do not go with a capture."""
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
-    if {"curve", "contrast"} & set(config.refine) and any(sensor.ambient for sensor in capture.sensors):
+    if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted by the curve that the scene says; leave out "
                          "--refine curve and contrast")  # fmt: skip
     if "masks" in config.refine and capture.threshold is not None:
@@ -46,7 +46,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     capture, config, light = problem.seen, problem.config, problem.lighting.kind
     domain, center, radius = starting_surface(capture, config.domain)
     require_view_from_outside(capture, domain, center, radius)
-    parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
+    parameters, bsdf = predicted_parameters(capture, config.parameters)
     if light != "capture":
         bsdf = with_fresnel(bsdf)
     scale = capture.reflectance(center, problem.exposure)
@@ -114,20 +114,20 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
     """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
-    cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
+    cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
     surface = center + radius * domain.points
     ahead = [((surface - camera.position) @ camera.forward).max() for camera in cameras]
     if min(ahead) < 0:
-        sensor = capture.sensors[int(np.argmin(ahead))]
-        raise InputError(f'{capture.path}: photograph "{sensor.id()}", to_world: its camera looks away from the '
+        shot = capture.shots[int(np.argmin(ahead))]
+        raise InputError(f'{capture.path}: photograph "{shot.name}", to_world: its camera looks away from the '
                          "surface that the fit starts from; see python -m mi_ring.check")  # fmt: skip
     places = {"to_world: its camera": np.stack([camera.position for camera in cameras]),
               "emitter: its light": np.where(lights.is_finite()[:, None], lights.positions(), np.inf)}  # fmt: skip
     for what, points in places.items():
         if (inside := domain.contains((points - center) / radius)).any():
-            sensor = capture.sensors[int(inside.argmax())]
+            shot = capture.shots[int(inside.argmax())]
             raise InputError(
-                f'{capture.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, '
+                f'{capture.path}: photograph "{shot.name}", {what} is inside the surface that the fit starts from, '
                 f"of radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
             )
 

@@ -31,13 +31,13 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
     capture, shares = model.calibrated(problem.capture), []
     surface = renderer.showing(model, level)
     for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
-        sensor = capture.sensors[k]
-        scale = -(-sensor.size[0] // COMPARED_WIDTH)
+        shot = capture.shots[k]
+        scale = -(-shot.size[0] // COMPARED_WIDTH)
         rgb, coverage = prediction.draw(surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
                                     indirect=model.ring.indirect)  # fmt: skip
         seen = capture.observe([k], scale)
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)
-        observed, predicted = (recorded(linear[0].numpy(), sensor, scale)[inside[0]] for linear in (seen.rgb, rgb))
+        observed, predicted = (recorded(linear[0].numpy(), shot, scale)[inside[0]] for linear in (seen.rgb, rgb))
         if len(observed):
             factor = (observed * predicted).sum() / max((predicted**2).sum(), 1e-12)
             shares.append(float(np.abs(factor * predicted - observed).sum() / observed.sum()))

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import require_survival
+from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import existing
 from mi_ring.system.optional import need
 
-#: Reads a model, for `require_survival`.
+#: Reads a model, for `require_readable`.
 TRIAL = """
 import pycolmap
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL
@@ -42,7 +42,7 @@ class Colmap(Photogrammetry):
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
         pycolmap = need("pycolmap", f"{model}")
         if size := sum(file.stat().st_size for file in model.glob("*.bin")):
-            require_survival(TRIAL, model, size, "a COLMAP model")
+            require_readable(TRIAL, model, size, "a COLMAP model")
         try:
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what it has to say is in the exception
             reconstruction = pycolmap.Reconstruction(str(model))

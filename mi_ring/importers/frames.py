@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.reading import image_size
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
@@ -30,8 +31,8 @@ class Frame:
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
     mask: Path | None = None  #: of the same size; `image` itself if its alpha channel is meant
     light: Light | None = None  #: None: a point light of intensity 1 at the camera
-    saturation: float | None = None  #: encoded value at which pixels are clipped, if not full scale
-    encoding: str | None = None  #: "srgb" or "linear", if it is not what the type of file implies
+    saturation: float = 1.0  #: encoded value from which pixels are clipped (1 = full scale)
+    encoding: Encoding = "auto"
     name: str = ""  #: in the scene; that of the file, without suffix, if empty
     pixels: np.ndarray | None = None  #: of an image that is no file yet, (H, W, 3) float32
     fill_mask: bool = False  #: fill the holes in the mask
@@ -71,7 +72,7 @@ class Source:
     """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
     """Copy the photographs beside the scene file. Without it the scene refers to them where they are."""
-    encoding: Literal["auto", "srgb", "linear"] = "auto"
+    encoding: Encoding = "auto"
     """How the photographs are encoded.
     auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
     Linear 8-bit files are written again with 16 bits."""

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import ExifTags
 
 from mi_ring.errors import InputError
-from mi_ring.images import opened
+from mi_ring.images import open_image
 from mi_ring.importers.frames import Frame, Source, called
 from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
 
@@ -109,5 +109,5 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
 
 def read_exif(path: Path) -> dict[int, Any]:
     """The part of the EXIF data that is about the exposure."""
-    with opened(path) as image:
+    with open_image(path) as image:
         return image.getexif().get_ifd(ExifTags.IFD.Exif)

@@ -11,7 +11,7 @@ import scipy.io
 
 from mi_ring import images
 from mi_ring.errors import InputError, is_file
-from mi_ring.foreign import reading, require_survival
+from mi_ring.foreign import reading, require_readable
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 Content = TypeVar("Content")
@@ -33,7 +33,7 @@ def has_alpha(path: Path) -> bool:
         return pixels_of(path).shape[2] in (2, 4)
 
     def alpha(file: Path) -> bool:
-        with images.opened(file) as image:
+        with images.open_image(file) as image:
             return image.mode in ("LA", "RGBA")
 
     return read_as(path, "image", alpha)
@@ -115,7 +115,7 @@ def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
 def load_mat(path: Path) -> dict:
     """The variables of a MATLAB file, of some of which its reader crashes."""
     size = existing(path, "MATLAB file").stat().st_size
-    require_survival("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
+    require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
     return read_as(path, "MATLAB file", scipy.io.loadmat)
 
 

@@ -7,16 +7,17 @@ import shutil
 import tempfile
 from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
 
+from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.reading import pixels_of
 from mi_ring.importers.undistortion import undistort
+from mi_ring.scene.shot import Encoding, Files
 from mi_ring.system.files import relative_to, write_file
 
 
@@ -46,9 +47,9 @@ class Writer:
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
-    def relative(self, path: Path) -> str:
+    def relative(self, path: Path) -> Path:
         """As the scene names it."""
-        return relative_to(self.scene.parent, path)
+        return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
         """Move everything to its place. Raises InputError if there are other files, which may be the sources.
@@ -72,16 +73,8 @@ class Writer:
                 folder.rmdir()
 
 
-class Files(NamedTuple):
-    """Where a photograph and what belongs to it are, as the scene names them."""
-
-    filename: str
-    mask: str | None = None
-    valid: str | None = None
-
-
-def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: str | None) -> Files:
-    """The files of a frame; written anew where they must be."""
+def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
+    """The files of a frame, relative to the scene file; written anew where they must be."""
     straight = frame.lens.is_pinhole
 
     def placed(folder: str, path: Path, pixels: np.ndarray | None) -> Path:
@@ -91,7 +84,7 @@ def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
             return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
         return path
 
-    def shared(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> str:
+    def shared(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
         """Of several photographs: written once."""
         if (folder, key) not in writer.shared:
             writer.shared[folder, key] = placed(folder, path, pixels())
@@ -107,8 +100,8 @@ def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
     valid = None
     if not straight:
         assert pixels is not None  # they were read above
-        srgb = encoding == "srgb" or (encoding is None and pixels.dtype == np.uint8)
-        pixels, shown = undistort(pixels, frame.lens, srgb, 1.0 if frame.saturation is None else frame.saturation)
+        srgb = not is_linear(encoding, pixels)
+        pixels, shown = undistort(pixels, frame.lens, srgb, frame.saturation)
         if not shown.all():
             white = np.where(shown, 255, 0).astype(np.uint8)[..., None]
             valid = shared("valid", frame.lens, Path(), lambda: white)

@@ -1,7 +1,7 @@
 """What there is to say of each photograph of a capture, and what is to be mended."""
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from scipy import ndimage, stats
 
 from mi_ring.capture.brightness_masks import dark_threshold
 from mi_ring.capture.capture import Capture
-from mi_ring.geometry.hull import WIDTH, shrink_mask
+from mi_ring.geometry.hull import MAX_WIDTH, shrink_mask
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
@@ -82,12 +82,12 @@ def measure(
     """The rows of all photographs."""
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
-    of_each = zip(capture.sensors, capture.names, lights.toward(center), lights.distances(center),
+    of_each = zip(capture.shots, capture.names, lights.toward(center), lights.distances(center),
                   received_by(capture, center))  # fmt: skip
-    for k, (sensor, name, to_light, away, received) in enumerate(of_each):
-        to_camera = sensor.camera.position - center
+    for k, (shot, name, to_light, away, received) in enumerate(of_each):
+        to_camera = shot.camera.position - center
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
-        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(sensor.size) // WIDTH))[:4])
+        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(shot.size) // MAX_WIDTH))[:4])
         image = rgb.max(-1)
         inside = mask > 0.5 if masked else image > 0.02 * image.max()
         outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
@@ -115,7 +115,7 @@ def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
 def units(capture: Capture, center: np.ndarray) -> str | None:
     """Are the lights in other units than the cameras?"""
     lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
-    cameras = np.stack([sensor.camera.position for sensor in capture.sensors])
+    cameras = np.stack([shot.camera.position for shot in capture.shots])
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
         return None
     away = np.linalg.norm(cameras[point] - center, axis=1)
@@ -132,7 +132,7 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
 
 def facing(capture: Capture, center: np.ndarray) -> str | None:
     """Do the cameras look at the object?"""
-    cameras = [sensor.camera for sensor in capture.sensors]
+    cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
         return (f"{away.sum()} of {len(away)} cameras look away from the object: z of to_world is forward, here; "
@@ -160,7 +160,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # those of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
-        if not strays and capture.hull and max(sensor.size[0] for sensor in capture.sensors) <= WIDTH:
+        if not strays and capture.hull and max(shot.size[0] for shot in capture.shots) <= MAX_WIDTH:
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
@@ -194,7 +194,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if share > AMBIENT:
         found.append(f"{share:.0%} of the light on the object is the room's, by how little darker the object gets "
                      "where the flash is farther: darken the room, or go nearer")  # fmt: skip
-    views = len({sensor.camera.to_world.tobytes() for sensor in capture.sensors})
+    views = len({shot.camera.to_world.tobytes() for shot in capture.shots})
     if views < 8:
         found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")
     return found
@@ -220,9 +220,9 @@ def quality_table(rows: list[PhotographQuality]) -> str:
     return "\n".join([*table, LEGEND])
 
 
-def drop_empty(capture: Capture) -> list[str]:
-    """Forget masks with nothing in them and return the names of their photographs."""
+def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
+    """The capture without masks that have nothing in them, and the names of the photographs with these masks."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
-    empty = [k for k in given if not (shrink_mask(capture.masks[k], WIDTH)[0] > 127).any()]
-    capture.masks = capture.masks.replaced(dict.fromkeys(empty))
-    return [capture.names[k] for k in empty]
+    empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
+    masks = capture.masks.replaced(dict.fromkeys(empty))
+    return replace(capture, masks=masks), [capture.names[k] for k in empty]

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.calibrated import moved
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
@@ -55,7 +54,7 @@ def evaluate_fit(
         motion = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
                  "aligned_scale": scale}  # fmt: skip
         truth, diagonal = scene_of(truth_mesh.vertices, truth_mesh.faces), diagonal * scale
-        unseen = unseen and moved(unseen, scale, rotation, matrix[:3, 3])
+        unseen = unseen and unseen.moved(scale, rotation, matrix[:3, 3])
     numbers, views = compare_surfaces(capture, guess, truth, diagonal)
     numbers |= motion
     numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None, diagonal)

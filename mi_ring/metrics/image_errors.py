@@ -34,9 +34,9 @@ def compare_photographs(
         rgb, _ = prediction.draw(
             surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect
         )
-        predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
+        predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.shots[k]))) / 255
         seen = capture.observe([k])
-        observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))
+        observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.shots[k]))
         telling = comparable(capture, seen)
         if not telling.any():
             views.append({"name": name})

@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.hull import Hull, Silhouette, evenly, thinned
+from mi_ring.geometry.hull import Hull, Silhouette, evenly_spaced, subsample
 
 CONFORMS = 0.9  #: share of a mask that the others agree to, at least
 
@@ -31,7 +31,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
         why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
         if not why:
             tolerant = copy.copy(capture.hull)
-            tolerant.wrong = max(0.1, 1.01 / len(tolerant.silhouettes))
+            tolerant.outliers = max(0.1, 1.01 / len(tolerant.silhouettes))
             robust = shares(tolerant)
             if np.median(robust) >= CONFORMS:
                 agree = robust
@@ -84,7 +84,7 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
     """The mistake with the cameras that explains why the masks do not agree, and its mend; None if none does."""
-    some = thinned(silhouettes, 32, 96)
+    some = subsample(silhouettes, 32, 96)
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
         for second, axes in AXES.items():
@@ -103,7 +103,7 @@ def half_pixel(hull: Hull) -> str | None:
 
     Of photographs that are shrunk for the hull it cannot be told, and matters little.
     """
-    gaps, hull, some = {}, copy.copy(hull), evenly(len(hull.silhouettes), 32)
+    gaps, hull, some = {}, copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):
         hull.silhouettes = [with_camera(s, centre=s.camera.centre + shift) for s in silhouettes]

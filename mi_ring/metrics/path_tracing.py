@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.capture.loading import open_scene
+from mi_ring.capture.loading import open_scene, photographs_in
 from mi_ring.errors import InputError, SceneError
 from mi_ring.plugins import flash, photograph, shapenet
 from mi_ring.rendering.image_formation import render_photographs
@@ -32,15 +32,15 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """The scene without tables and its photographs, lit for stock integrators too. Raises InputError, one line."""
-    scene, sensors = open_scene(path)
+    """The scene without tables and its sensors, lit for stock integrators too. Raises InputError, one line."""
+    scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
             require_attributes(shape)
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
-        Photographs.of(sensors)
-        return with_flash(without_rooms(split_tables(scene)[0])), sensors
+        Photographs.of(shots)
+        return with_flash(without_rooms(split_tables(scene)[0])), photographs_in(scene)
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -76,12 +76,13 @@ def render_both(
     `photometric` and `path` have different samples, but both along rays of ours: the film's filter has no part in it.
     Seeds up to `seed` + 31 are used.
     """
-    width, height = (s // scale for s in sensor.size)
+    size = sensor.camera.size
+    width, height = (s // scale for s in size)
     pixels = width * height
     group = max(1, min(BATCHES, LANES // (pixels * spp)))
     parts = []
     for first in range(0, BATCHES, group):
-        batch = photographs.select([k] * min(group, BATCHES - first), sensor.size, scale)
+        batch = photographs.select([k] * min(group, BATCHES - first), size, scale)
         own, other = seed + 2 * first, seed + 2 * first + 1
         parts.append([
             render_photographs(scene, batch, spp, own),

@@ -1,4 +1,4 @@
-"""The ring: both networks, the domain and the normalisation, which together are a reconstructed object."""
+"""A reconstructed object: both networks, the domain and the normalisation."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,15 @@ from mi_ring.nets.shape_net import Flow, ShapeNet
 
 
 class FittedObject(nn.Module):
-    """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
+    """A surface x(s) = center + radius · Φ(s) with a material Ψ(s) at every point s of the domain.
 
-    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
-    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `subdivisions`: the level to
-    sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
-    paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shape_net.Flow` and
-    `mi_ring.nets.brdf_net.MaterialNet` say. `ground` (2, 3): a point on the table that the object stands on, and the
-    table's unit normal; below it nothing is seen, and what the flow has there lies flat on it. `up` (3,) and `metres`,
-    the length of a scene unit, are for exports; None where they are not known.
+    `center` (3,) and `radius` are in scene units. `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
+    `indirect`: the fit included interreflection, so pictures do, too. `subdivisions`: the level at which to sample the
+    surface; the networks are less certain between the vertices of the fit. `networks` replace the paper's networks,
+    which are made by `steps`, `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and
+    `mi_ring.nets.brdf_net.MaterialNet`. `ground` (2, 3) is a point of the table below the object and the table's unit
+    normal; points below the table are moved up to it. `up` (3,), and `metres`, the length of a scene unit, are for
+    exports; None if they are unknown.
     """
 
     shape_net: Flow
@@ -47,19 +47,19 @@ class FittedObject(nn.Module):
         self.metres = None if metres is None else float(metres)
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
-        """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""
-        return self.placed(self.shape_net(s, time))
+        """Surface points (V, 3) [scene units] of domain points (V, 3), at a `time` of the flow."""
+        return self.to_scene(self.shape_net(s, time))
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
-        """Parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
+        """The parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
         return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
         """`surface` and `material`."""
         return self.surface(s, time), self.material(s)
 
-    def placed(self, points: Tensor) -> Tensor:
-        """Points (V, 3) of the normalised frame in scene units, those below the ground on it."""
+    def to_scene(self, points: Tensor) -> Tensor:
+        """Points (V, 3) of the normalised frame in scene units, none of them below the ground."""
         points = self.center + self.radius * points
         if self.ground is None:
             return points

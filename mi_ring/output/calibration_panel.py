@@ -126,7 +126,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
     """Cameras, their directions and their lights, projected to a plane of two directions (2, 3)."""
-    poses = np.stack([sensor.camera.to_world for sensor in capture.sensors])
+    poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
     axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)
     lights = capture.photographs.lights

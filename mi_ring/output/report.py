@@ -30,7 +30,7 @@ from mi_ring.output.svg import svg_uri
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
-from mi_ring.system.machine import in_turn
+from mi_ring.system.machine import pipelined
 from mi_ring.version import __version__
 
 REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
@@ -63,7 +63,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = in_turn(partial(predicted, result, surface), partial(panels_of, result), some)
+    parts = pipelined(partial(predicted, result, surface), partial(panels_of, result), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # All photographs on the page may be held-out ones.
@@ -105,7 +105,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
     """The viewer's first view, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
-    eye = capture.sensors[0].camera.position
+    eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
         irradiance = np.ones(3)
@@ -194,7 +194,7 @@ def scale_of(result: FitResult, size: tuple[int, int]) -> int:
 def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Prediction]:
     """Predictions of photographs `index`, all of one size."""
     capture, ring = result.capture, result.ring
-    size = capture.sensors[index[0]].size
+    size = capture.shots[index[0]].size
     scale = scale_of(result, size)
     rgb, coverage = prediction.draw(
         surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=ring.indirect, paths=4
@@ -217,13 +217,13 @@ def panels_of(
 def panel_of(result: FitResult, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
     """The row of photograph `k`, and its mean squared error in sRGB over the pixels that are `comparable`."""
     capture, brdf_net = result.capture, result.ring.brdf_net
-    scale = scale_of(result, capture.sensors[k].size)
+    scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
-    sensor = capture.sensors[k]
+    shot = capture.shots[k]
     shown = prediction.rgb * valid[..., None]
-    photo, guess = (linear_to_srgb(recorded(linear, sensor, scale)) for linear in (observed, shown))
+    photo, guess = (linear_to_srgb(recorded(linear, shot, scale)) for linear in (observed, shown))
     found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)

@@ -27,6 +27,7 @@ from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
 PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is moved aside
+OWN_SCENE = Path("capture", "scene.xml")  #: in the folder of a fit: the scene file of a capture from arrays
 VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, and width of its textures [px]
 
 
@@ -47,9 +48,13 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
     A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
     written or holds the scene.
     """
-    folder = folder.resolve()
-    if folder in scene.resolve().parents:
-        raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
+    if folder.resolve() in scene.resolve().parents:
+        raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
+    make_folder(folder.resolve(), scene, options, resume)
+
+
+def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
+    """As `prepare_folder`, for a scene file that may be in the folder."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -68,13 +73,22 @@ def move_aside(folder: Path) -> None:
 
 
 def save(folder: Path, result: FitResult) -> None:
-    """All results of a fit into a folder of their own. Earlier results there are moved aside."""
-    scene = fitted_scene(result.given, result.ring, folder)
+    """Write all results of a fit into a folder of its own. Earlier results there are moved aside.
+
+    A capture from arrays is written as well: as the scene file capture/scene.xml in the folder.
+    """
+    capture = result.given
     ring_state(result.ring)  # raises for networks without a name before anything is moved
+    if not capture.in_memory:
+        fitted_scene(capture, result.ring, folder)  # raises for a scene that cannot be rewritten
     with locked(folder):
-        prepare_folder(folder, result.given.path, result.settings)
+        if capture.in_memory:
+            make_folder(folder.resolve(), folder / OWN_SCENE, result.settings)
+            capture = capture.save(folder / OWN_SCENE)
+        else:
+            prepare_folder(folder, capture.path, result.settings)
         write_log(folder, result.log)
-        write(folder, result, scene)
+        write(folder, result, fitted_scene(capture, result.ring, folder))
 
 
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
@@ -111,7 +125,7 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
     sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
     for index in capture.together(some):
-        scale = max(1, max(capture.sensors[index[0]].size) // cell)
+        scale = max(1, max(capture.shots[index[0]].size) // cell)
         _, covered = prediction.draw(start, capture.selected(index, scale), spp=4, shadows=False)
         for k, observed, coverage in zip(index, capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
@@ -135,13 +149,13 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     views = capture.views
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
     if result.calibration:
-        scene = recalibrated_xml(scene, capture.sensors, result.room, result.room_frames, result.lamps)
+        scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps)
     if result.masks:
-        scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, result.masks))
+        scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))
     write_file(folder / "scene.xml", scene)
-    if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
+    if capture.photographs.dark and capture.room is not None and not shared_emitters(capture.scene):
         # The room is the only light.
-        radiance = room_envmap(capture.photographs.room, np.eye(4)).clip(min=0)
+        radiance = room_envmap(capture.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)
     names = [capture.names[k] for k in result.held_out]

@@ -17,6 +17,7 @@ from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.reduced_photographs import View, camera_of, reduced, whole_of
 from mi_ring.photogrammetry.table_plane import Ground, Plane, reflectance
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: of the object's size, left free around it
@@ -27,8 +28,8 @@ OBJECT, UNSURE = 255, 128  #: in masks; 0 is the background
 
 
 @dataclass(frozen=True)
-class Shot:
-    """A photograph as the scene has it."""
+class PosedPicture:
+    """A photograph with what was found of it: what a `mi_ring.scene.shot.Shot` is written from."""
 
     picture: Picture
     lens: Lens
@@ -60,60 +61,60 @@ def windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]
     return result
 
 
-def write_shot(writer: Writer, shot: Shot, window: Window) -> Element:
+def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> Element:
     """The files of a photograph and its element."""
-    picture = shot.picture
+    picture = posed.picture
     pixels = picture.pixels[..., :3]
     left, top, width, height = window[:4]
-    if shot.lens.is_pinhole:
+    if posed.lens.is_pinhole:
         cut, shown = pixels[top : top + height, left : left + width], np.ones((height, width), bool)
     else:
-        cut, shown = undistort(pixels, shot.lens, picture.encoding == "srgb", window=window)
+        cut, shown = undistort(pixels, posed.lens, picture.encoding == "srgb", window=window)
     picture.close()
     filename = writer.relative(writer.image(f"images/{picture.name}", cut))
-    encoding = picture.encoding if cut.dtype == np.uint16 else None
+    encoding = picture.encoding if cut.dtype == np.uint16 else "auto"
     mask = valid = None
-    if shot.mask is not None:
-        full = cut_mask(shot.mask, shot.lens.size, window)
+    if posed.mask is not None:
+        full = cut_mask(posed.mask, posed.lens.size, window)
         shown = shown & (full != UNSURE)
         white = np.where(full == OBJECT, 255, 0).astype(np.uint8)
         mask = writer.relative(writer.image(f"masks/{picture.name}", white[..., None]))
     if not shown.all():
         white = np.where(shown, 255, 0).astype(np.uint8)
         valid = writer.relative(writer.image(f"valid/{picture.name}", white[..., None]))
-    camera = camera_of(shot.lens, shot.pose)
+    camera = camera_of(posed.lens, posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
-    return photograph_element(picture.name, filename, camera, shot.light, mask, encoding, valid=valid,
-                              gamma=shot.gamma, falloff=shot.falloff)  # fmt: skip
+    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, Response(posed.gamma),
+                                   Files(filename, mask, valid), encoding))  # fmt: skip
 
 
 def write_table(
-    writer: Writer, shots: Sequence[Shot], plane: Plane, center: np.ndarray, flash: Flash
+    writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: Flash
 ) -> list[Element]:  # fmt: skip
     """A `table`, for the light that it reflects onto the object at `center` (3,), and its picture.
 
-    `flash`: what the lights of the shots have in common. None of it if no photograph shows the table.
+    `flash`: what the lights of the photographs have in common. None of it if no photograph shows the table.
     """
 
-    def seen(shot: Shot) -> tuple[View, np.ndarray, Light]:
-        view = reduced(shot.picture, shot.lens, shot.pose, whole_of(shot.lens, TABLE_SEEN))
+    def seen(posed: PosedPicture) -> tuple[View, np.ndarray, Light]:
+        view = reduced(posed.picture, posed.lens, posed.pose, whole_of(posed.lens, TABLE_SEEN))
         # What is white to a view is less in a raw photograph, whose light is as strong as that says.
-        white = shot.picture.white if shot.picture.encoding == "linear" else 1.0
-        light = shot.light._replace(rgb=shot.light.rgb / white)
-        shot.picture.close()
-        if shot.mask is None:  # it may be anywhere
+        white = posed.picture.white if posed.picture.encoding == "linear" else 1.0
+        light = posed.light._replace(rgb=posed.light.rgb / white)
+        posed.picture.close()
+        if posed.mask is None:  # it may be anywhere
             return view, np.ones(view.shown.shape, np.uint8), light
-        mask = cv2.resize((shot.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
+        mask = cv2.resize((posed.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
         return view, grown(mask, MARGIN), light
 
-    views, hidden, lights = zip(*in_threads(seen, shots))
+    views, hidden, lights = zip(*in_threads(seen, pictures))
     away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     ground = Ground(plane, center, TABLE_REACH * away, TABLE_TEXELS)
     albedo = reflectance(views, lights, hidden, ground, flash)
     if albedo is None:
         return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))
-    return [table_element(writer.relative(picture), ground.square)]
+    return [table_element(writer.relative(picture).as_posix(), ground.square)]
 
 
 def extent_of(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:

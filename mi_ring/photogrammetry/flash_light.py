@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from mi_ring.geometry.hull import evenly
+from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.photogrammetry.marker_sheet import White
 from mi_ring.rendering.photograph_lights import MIN_FLASH_COSINE
 
@@ -176,7 +176,7 @@ def shared_light(
     papers: Sequence[Paper], told: Exposures, offset: np.ndarray, ball: Ball | None, curved: bool
 ) -> Shared:  # fmt: skip
     """What is alike in all photographs; the arguments are as `find_flash` has them."""
-    some = evenly(len(papers), MOST)
+    some = evenly_spaced(len(papers), MOST)
     papers, told = [papers[k] for k in some], told.part(some)
     paper = Paper(*(np.concatenate(parts) for parts in zip(*papers)))
     of = np.repeat(np.arange(len(some)), [len(own.places) for own in papers])

@@ -11,10 +11,11 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import require_room
-from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, opened, read_image, srgb_to_linear
+from mi_ring.foreign import require_plausible_size
+from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
+from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
@@ -83,7 +84,7 @@ class Picture:
         """EXIF data, empty where there are none."""
         try:
             let_open(self.path)
-            with opened(self.path) as image:
+            with open_image(self.path) as image:
                 exif = image.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
                 return exif
@@ -97,7 +98,7 @@ class Picture:
         return found if found > 0 else np.nan
 
     @property
-    def encoding(self) -> str:
+    def encoding(self) -> Encoding:
         """`linear` or `srgb`: what the numbers mean."""
         return "linear" if self.path.suffix.lower() in RAW else "srgb"
 
@@ -174,13 +175,13 @@ def let_open(path: Path) -> None:
 
 def decode_heif(path: Path) -> np.ndarray:
     """A HEIF photograph (H, W, 3) uint8, upright."""
-    with opened(path) as image:
+    with open_image(path) as image:
         return np.array(image.convert("RGB"))
 
 
 def turned_before(path: Path) -> int:
     """By EXIF's numbers, how a HEIF photograph would have to be turned, had its reader not done so."""
-    with opened(path) as image:
+    with open_image(path) as image:
         return image.info.get("original_orientation") or 1
 
 
@@ -195,7 +196,7 @@ def develop(path: Path) -> np.ndarray:
     """A raw photograph (H, W, 3) uint16, linear radiance in sRGB's primaries, white balance as the camera chose it."""
     rawpy = need("rawpy", f"{path}")
     with rawpy.imread(str(path)) as raw:
-        require_room(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
+        require_plausible_size(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 

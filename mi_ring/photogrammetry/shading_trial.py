@@ -1,14 +1,10 @@
 """What the object might be by its shading alone: a short fit without masks, from the sphere of the sparse points."""
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
+from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.photogrammetry.reduced_photographs import View
@@ -45,25 +41,14 @@ def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress
     away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.shown].mean() for view in views]))
     intensity = np.full(3, np.pi * level / DIM * away**2)
-    with tempfile.TemporaryDirectory() as name:
-        folder, elements = Path(name), []
-        for k, view in enumerate(views):
-            Image.fromarray(view.rgb).save(folder / f"{k}.png")
-            Image.fromarray(view.shown.astype(np.uint8) * 255).save(folder / f"{k}.valid.png")
-            light = Light("point", view.camera.position, intensity)
-            elements.append(photograph_element(f"{k}", f"{k}.png", view.camera, light, valid=f"{k}.valid.png"))
-        scene = scene_element(elements)
-        shape = next(scene.iter("shape"))
-        for tag, name, value in (("point", "center", center), ("float", "radius", radius)):
-            element = shape.makeelement(tag, {"name": name})
-            numbers = np.ravel(value)
-            element.attrib.update(zip("xyz", map(str, numbers)) if tag == "point" else {"value": str(numbers[0])})
-            shape.append(element)
-        (folder / "scene.xml").write_bytes(scene_bytes(scene))
-        capture = load_capture(folder / "scene.xml")
-        fit = Fit(capture, SETTINGS)
-        for _ in progress(fit, "a trial fit", fit.iterations):
-            pass
+    lights = [Light("point", view.camera.position, intensity) for view in views]
+    capture = Capture.from_arrays(
+        [view.rgb for view in views], valid=[view.shown for view in views], cameras=[view.camera for view in views],
+        lights=lights, center=center, radius=radius, name="a trial fit",
+    )  # fmt: skip
+    fit = Fit(capture, SETTINGS)
+    for _ in progress(fit, "a trial fit", fit.iterations):
+        pass
     surface = fit.renderer.showing(fit.model, SETTINGS.subdivisions)
     drawn = (prediction.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]

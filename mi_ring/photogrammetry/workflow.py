@@ -16,7 +16,7 @@ from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.photogrammetry.capture_files import OBJECT, Shot, reduction
+from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import Ball, Flash, find_flash
 from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
 from mi_ring.photogrammetry.marker_sheet import Board, Sighting, White, calibrate, white
@@ -230,9 +230,9 @@ def ball_of(motion: Motion, object_: Object) -> Ball | None:
     return Ball(object_.center, float(np.median(radii))) if radii else None
 
 
-def shots(
+def posed_pictures(
     pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, flash: Flash | None
-) -> list[Shot]:
+) -> list[PosedPicture]:
     """The photographs of the scene, in its frame; the `offset` (3,) of a flash is in the camera's axes [scene units].
 
     The sheet tells where it is and how strong. Without one it is where the offset says, and how strong is not known: it
@@ -247,8 +247,8 @@ def shots(
         lens, pose = motion.cameras[picture.name]
         name = picture.name
         light = Light("point", pose[:3, :3] @ places[name] + pose[:3, 3], known.get(name, exposure * usual))
-        shot = Shot(picture, lens, pose, object_.masks.get(name), light)
+        posed = PosedPicture(picture, lens, pose, object_.masks.get(name), light)
         if flash:
-            shot = replace(shot, measured=name in known, falloff=flash.falloff, gamma=flash.gamma)
-        result.append(shot)
+            posed = replace(posed, measured=name in known, falloff=flash.falloff, gamma=flash.gamma)
+        result.append(posed)
     return result

@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.errors import SceneError
-from mi_ring.scene.lights import LAMP_CLASSES, Light, position_of, strength_of
+from mi_ring.scene.lights import Light, position_of, strength_of
+from mi_ring.scene.shot import Shot
 
 MIN_FLASH_COSINE = 1e-3  #: the least cosine between the axis of a flash and a direction; smaller ones are clamped
 DISTANT = 1e9  #: distance of a directional light [scene units]
@@ -23,22 +24,30 @@ class Lights:
     strengths: object  #: Float, 3 per light: intensity [W/sr], or irradiance [W/m²]
 
     @classmethod
-    def of(cls, sensors: Sequence) -> "Lights":
-        """The nested lights of `photograph` sensors, all positive, or all 0. Raises SceneError for one that is not."""
-        # By way of numpy: Dr.Jit would compile a kernel for each number of photographs.
-        columns = [[np.ravel(part) for part in parts_of(sensor)] for sensor in sensors]
-        places, finite, strengths = (np.concatenate(column) for column in zip(*columns))
-        lit = strengths.reshape(-1, 3).any(1)
+    def of(cls, shots: Sequence[Shot]) -> "Lights":
+        """The photographs' own lights. Raises SceneError if one is not finite, or if some are black but not all."""
+        lights = [shot.own_light for shot in shots]
+        finite = np.array([light.kind == "point" for light in lights])
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
+            places = np.stack([light.vector if light.kind == "point" else toward(light) for light in lights])
+            places, strengths = places.astype(np.float32), np.stack([light.rgb for light in lights]).astype(np.float32)
+        for shot, place, rgb in zip(shots, places, strengths):
+            what = f'photograph "{shot.name}": its light is'
+            if not (np.isfinite(rgb) & (rgb >= 0)).all():
+                raise SceneError(f"{what} {rgb} strong, must be positive, or 0 in all")
+            if not np.isfinite(place).all():
+                raise SceneError(f"{what} at {place}, must be finite")
+        lit = strengths.any(1)
         if lit.any() and not lit.all():
-            name = sensors[int(lit.argmin())].id()
+            name = shots[int(lit.argmin())].name
             raise SceneError(f'photograph "{name}": its light is 0 strong, must be positive, or 0 in all photographs')
-        return cls(mi.Float(places), mi.Bool(finite), mi.Float(strengths))
+        return cls(mi.Float(places.ravel()), mi.Bool(finite), mi.Float(strengths.ravel()))
 
     @classmethod
-    def attached(cls, sensor) -> "Lights":
-        """The light of one photograph, attached to the sensor's parameters."""
-        place, finite, strength = parts_of(sensor)
-        return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength)))
+    def attached(cls, emitter) -> "Lights":
+        """One point light or distant light, attached to the parameters of its emitter."""
+        place, finite = position_of(emitter)
+        return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
         """Light `k`, one per lane, as an eye of `Edges`."""
@@ -99,19 +108,8 @@ def flash_falloff(direction, to_world, falloff):
     return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)
 
 
-def parts_of(sensor):
-    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength).
-
-    Of one that has none the strength is 0.
-    """
-    light = sensor.light
-    kind = light.class_name()
-    if kind not in LAMP_CLASSES:
-        raise SceneError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
-    where, finite = position_of(light)
-    strength = strength_of(light)
-    if not dr.all(dr.isfinite(strength) & (strength >= 0)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive, or 0 in all')
-    if not dr.all(dr.isfinite(where)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
-    return where, finite, strength
+def toward(light: Light) -> np.ndarray:
+    """The unit direction (3,) toward a distant light."""
+    length = np.linalg.norm(light.vector)
+    # What Mitsuba has read is of unit length, but for the rounding of float32.
+    return -light.vector if abs(length - 1) < 1e-6 else -light.vector / length

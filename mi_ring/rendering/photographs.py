@@ -11,6 +11,7 @@ import numpy as np
 from mi_ring.rendering.photograph_lights import Lights, flash_falloff
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, reflected_harmonics
+from mi_ring.scene.shot import Shot
 
 LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
 
@@ -36,32 +37,34 @@ class Photographs:
     before: int = 0  #: number of photographs before these that are rendered elsewhere: random numbers depend on it
 
     @classmethod
-    def of(cls, sensors: Sequence, room: np.ndarray | None = None) -> "Photographs":
-        """All `photograph` sensors of a scene; `size` is the first one's, `select` those of equal size."""
-        cameras = [sensor.camera for sensor in sensors]
-        matrices = np.stack([camera.to_world[:3] for camera in cameras])
-        intrinsics = np.stack([np.concatenate([camera.focal, camera.centre]) for camera in cameras])
-        lights = Lights.of(sensors)
-        falloff = np.array([sensor.cone for sensor in sensors], np.float32)
-        bent = np.array([camera.distortion for camera in cameras], np.float32)
+    def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
+        """All these photographs; `size` is the first one's, `select` chooses those of equal size.
+
+        Raises SceneError for lights that cannot be rendered.
+        """
+        matrices = np.stack([shot.camera.to_world[:3] for shot in shots])
+        intrinsics = np.stack([np.concatenate([shot.camera.focal, shot.camera.centre]) for shot in shots])
+        lights = Lights.of(shots)
+        falloff = np.array([shot.falloff for shot in shots], np.float32)
+        bent = np.array([shot.camera.distortion for shot in shots], np.float32)
         # Equal but for the rounding of float32.
         off = np.abs(lights.positions() - matrices[:, :, 3]).max(1) > 1e-6 * np.abs(matrices[:, :, 3]).max()
         return cls(
             mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
-            dr.arange(mi.UInt32, len(sensors)), sensors[0].size, not (off | ~lights.is_finite()).any(),
+            dr.arange(mi.UInt32, len(shots)), shots[0].size, not (off | ~lights.is_finite()).any(),
             mi.Float(falloff) if falloff.any() else None, mi.Float(bent) if bent.any() else None, room,
             dark=not lights.rgb().any(),
         )  # fmt: skip
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """One photograph, its camera and its light attached to the parameters of the sensor."""
+        """One photograph, its camera and its light attached to the parameters of its sensor."""
         m = sensor.to_world.matrix
         return replace(
-            cls.of([sensor]),
+            cls.of([sensor.shot]),
             cameras=dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
             intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
-            lights=Lights.attached(sensor),
+            lights=Lights.attached(sensor.light),
             falloff=mi.Float(sensor.falloff),
             distortion=mi.Float(sensor.distortion),
         )

@@ -3,7 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.geometry.camera import bending, straightening
+from mi_ring.geometry.camera import distortion_factor, undistortion_factor
 
 OUTSIDE = 1e6  #: factor of picture coordinates that puts a point outside of every picture
 
@@ -17,7 +17,7 @@ def camera_ray(to_world, focal, centre, distortion, pixel):
     """
     x, y = (pixel.x - centre.x) / focal.x, (pixel.y - centre.y) / focal.y
     if distortion is not None:
-        factor = straightening(distortion, x * x + y * y)
+        factor = undistortion_factor(distortion, x * x + y * y)
         x, y = x * factor, y * factor
     m = to_world
     direction = mi.Vector3f(
@@ -39,7 +39,7 @@ def project(to_world, focal, centre, distortion, point):
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     x, y = x / z, y / z
     if distortion is not None:
-        factor, shown = bending(distortion, x * x + y * y)
+        factor, shown = distortion_factor(distortion, x * x + y * y)
         # Points that the lens does not show are outside of the picture. They are finite, so that gradients are, too.
         factor = dr.select(shown, factor, OUTSIDE)
         x, y = x * factor, y * factor

@@ -34,7 +34,7 @@ class Visibility:
         self.mesh = mesh_of((self.vertices - self.center) / self.size, faces)  # for float32
         self.scene = mi.load_dict({"type": "scene", "mesh": self.mesh})
         # Photographs that differ in their light alone show the same.
-        keys = [(*(np.asarray(part).tobytes() for part in v.camera), id(v.valid)) for v in views]
+        keys = [(v.camera.key, id(v.valid)) for v in views]
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:

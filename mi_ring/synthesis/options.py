@@ -1,4 +1,4 @@
-"""What a synthetic capture is to be: the options of `mi-ring synthesize`."""
+"""The options of `mi-ring synthesize`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,23 +130,23 @@ class SynthesizeConfig:
 
     @property
     def exact(self) -> bool:
-        """Does the scene file say nothing wrong?"""
+        """Is all calibration in the scene file exact?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
-    def axis(self) -> np.ndarray:
-        """(3,) what is up."""
+    def up_axis(self) -> np.ndarray:
+        """(3,) unit vector that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property
-    def away(self) -> float:
+    def camera_distance(self) -> float:
         """From the cameras to the middle of the object [scene units]."""
         half = np.arctan(min(self.size) / self.size[0] * np.tan(np.radians(self.fov / 2)))
         return float(self.radius * (1.04 / np.sin(half) if self.distance is None else self.distance))
 
 
-#: Least and most of each option that is a number.
+#: Least and greatest value of numeric options.
 RANGES = {
     "views": (1, 10_000), "novel": (0, 10_000), "fov": (1, 150), "bands": (1, 1000), "radius": (1e-6, 1e6),
     "lamps": (1, 8), "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5),
@@ -156,7 +156,7 @@ RANGES = {
 
 
 def require_options(config: SynthesizeConfig) -> None:
-    """Raise InputError for options out of range or that contradict each other."""
+    """Raise InputError for options that are out of range or contradict each other."""
     for name, (least, most) in RANGES.items():
         if not least <= getattr(config, name) <= most:
             raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be {least} to {most}")

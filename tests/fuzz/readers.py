@@ -47,7 +47,7 @@ from mi_ring.output.results import read_log
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.rendering.measured_brdf import CELLS, MerlNetwork, MerlTable
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.path_traced_capture import Production
+from mi_ring.synthesis.path_traced_capture import Studio
 from mi_ring.system.files import write_state
 
 SIZE = W, H = 7, 5  #: of pictures [px]
@@ -359,7 +359,7 @@ def synthesized(folder: Path) -> Reader:
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
     config = SynthesizeConfig(mesh_file, folder / "out", material=str(material), second=f"{measured}:one",
                               pattern=str(pattern), environment=sky)  # fmt: skip
-    return Reader(files, lambda: Production(config))
+    return Reader(files, lambda: Studio(config))
 
 
 def plugin_error(call: Callable[[], object]) -> None:
