@@ -5,6 +5,7 @@ And what shows the difference: triangles turned inside out or crossing others.
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -150,16 +151,15 @@ def test_a_wide_resnet_of_equal_blocks_is_the_ring():
 
 
 def test_the_regulariser_of_a_plain_resnet_sees_all_blocks():
-    class Iteration:
-        s, stage = torch.randn(20, 3), Stage(3, 32, 0, 1)
-        fit = type("Fit", (), {"config": Config(laplacian_scale=0.0), "autocast": torch.no_grad})()
-
-    fit = Iteration.fit
-    fit.ring, fit.random = type("FittedObject", (), {"shape_net": ResNet(3)})(), torch.Generator().manual_seed(0)
-    for k, block in enumerate(fit.ring.shape_net.blocks):
+    net = ResNet(3)
+    model = SimpleNamespace(ring=SimpleNamespace(shape_net=net))
+    context = SimpleNamespace(config=Config(laplacian_scale=0.0), autocast=torch.no_grad, model=model)
+    batches = [SimpleNamespace(points=torch.randn(20, 3), seeds={"regulariser": seed}) for seed in range(40)]
+    its = [SimpleNamespace(batch=batch, stage=Stage(3, 32, 0, 1), context=context) for batch in batches]
+    for k, block in enumerate(net.blocks):
         torch.nn.init.zeros_(block.output.weight)
         block.output.bias.data[:] = torch.tensor([0.1 * (k + 1), 0, 0])
-    found = {round(terms.velocity(Iteration).item(), 6) for _ in range(40)}
+    found = {round(terms.velocity(it).item(), 6) for it in its}
     assert found == {round((SPEED * math.tanh(0.1 * (k + 1))) ** 2, 6) for k in range(3)}
 
 
@@ -261,7 +261,7 @@ def test_without_resampling_the_vertices_stay_at_the_same_points(capture):
     points = {}
     for resample in (True, False):
         fit = Fit(capture, Config(**SMALL, resample=resample))
-        points[resample] = [it.s for it in fit]
+        points[resample] = [it.batch.points for it in fit]
     assert torch.equal(*points[False]) and torch.equal(points[False][0], Sphere().sample(2)[0])
     assert not torch.equal(*points[True])
 
@@ -273,11 +273,12 @@ def test_the_command_takes_the_choices_and_others_those_of_the_file(small_captur
     ])  # fmt: skip
     choice = {f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | SMALL
     fit = Fit(capture, Config(**choice))
-    entry = [it.entry() for it in fit][-1]
+    list(fit)
+    entry = fit.course.log[-1]
     assert 1 <= entry["material_rank"] <= math.sqrt(5) and entry["weights"]["material_rank"] == 0.1
     run = tmp_path / "run"
     run.mkdir()
-    torch.save(ring_state(fit.ring, fit.config.settings()), run / "ring.pt")
+    torch.save(ring_state(fit.ring, fit.problem.config.settings()), run / "ring.pt")
     ring = load_fit(run)
     assert type(ring.shape_net) is ResNet
     assert ring.brdf_net.encoding.spacing == "octaves" and ring.shape_net.encoding.frequencies == 4

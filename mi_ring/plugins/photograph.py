@@ -8,7 +8,7 @@ from mi_ring.errors import SceneError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
 from mi_ring.rendering.pinhole import camera_ray
-from mi_ring.scene.lights import LAMPS, light_of
+from mi_ring.scene.lights import LAMP_CLASSES, light_of
 from mi_ring.scene.shot import Files, Response, Shot
 
 #: Time of a photograph's rays. Other sensors have times of 0 and later: by the time the flash tells them apart.
@@ -151,7 +151,7 @@ class Photograph(mi.Sensor):
 
         Raises SceneError if its light is neither a point light nor a distant one.
         """
-        if (kind := self.light.class_name()) not in LAMPS:
+        if (kind := self.light.class_name()) not in LAMP_CLASSES:
             raise SceneError(f'photograph "{self.id()}": nested emitter is a {kind}, must be "point" or "directional"')
         falloff = float(np.ravel(self.falloff)[0])
         return Shot(self.id(), self.camera, light_of(self.light), falloff, self.response, self.files, self.encoding,

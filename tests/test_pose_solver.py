@@ -8,8 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import mi_ring
-from mi_ring.fitting.poses import curvature, motion, slopes
-from mi_ring.fitting.powers import Powers
+from mi_ring.capture.capture import Observation
+from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.pose_solver import curvature, motion, slopes
 from mi_ring.geometry.camera import Camera
 
 SIZE = (7, 5)
@@ -59,26 +61,29 @@ def posed(capture, **changes):
                 "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
     config = mi_ring.Config(**settings | changes)
     fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
-    fit.iteration, chosen = fit.iterations // 2, fit.rounds.draw(fit.config.batch, fit.random)
-    fit.rounds.draw = lambda *_: chosen
+    fit.course.iteration, chosen = fit.iterations // 2, fit.sampler.draw_photographs(config.batch)
+    fit.sampler.draw_photographs = lambda count: chosen
     with torch.no_grad():
-        seen = fit.predict()
-    index = seen.index
+        it = iteration_of(fit)
+    seen = it.observation._replace(rgb=it.prediction.rgb, mask=it.prediction.coverage)
+    fit.sampler.observe = lambda *_: seen
+    own = set(fit.model.calibration.parameters())
+    steppers = fit.optimisation.steppers  # without those of the networks, so that the surface stays as it is
+    fit.optimisation.steppers = [s for s in steppers if own & {*s.optimizer.param_groups[0]["params"]}]
+    return fit, it.batch.photographs
 
-    def predict():
-        it = predicted()
-        it.observed, it.mask = seen.predicted, seen.coverage
-        return it
 
-    predicted, fit.predict = fit.predict, predict
-    fit.optimizers = fit.lookers or fit.calibration.optimizers()  # the surface stays as it is
-    return fit, index
+def iteration_of(fit):
+    """What a step of a fit would draw, see and predict."""
+    batch = fit.sampler.draw(fit.problem, fit.schedule, fit.ring.domain, fit.iteration)
+    seen = fit.sampler.observe(fit.problem, fit.capture, batch)
+    return Iteration(batch, seen, fit.renderer.predict(fit.problem, fit.model, batch), fit.context())
 
 
 @pytest.mark.parametrize("loss", ["l1+log", "l2"])
 def test_cameras_go_where_photographs_were_taken(small_capture, loss):
     fit, index = posed(small_capture, loss=loss)
-    calibration, center = fit.calibration, fit.calibration.center
+    calibration, center = fit.model.calibration, fit.model.calibration.rig.center
     random = torch.Generator().manual_seed(1)
     with torch.no_grad():
         calibration.turn += 2 * torch.randn(calibration.turn.shape, generator=random)
@@ -90,7 +95,7 @@ def test_cameras_go_where_photographs_were_taken(small_capture, loss):
         """How far the object's centre is from where it was, in photographs of 56 × 40 [px]: (4,)."""
         cameras = calibration()[0].detach()[index]
         found = torch.einsum("nji,nj->ni", cameras[:, :, :3], center - cameras[:, :, 3])
-        base = calibration.base.cameras[index]
+        base = calibration.rig.views.cameras[index]
         true = torch.einsum("nji,nj->ni", base[:, :, :3], center - base[:, :, 3])
         return 60 * (found[:, :2] / found[:, 2:] - true[:, :2] / true[:, 2:]).norm(dim=1)
 
@@ -107,24 +112,25 @@ def test_right_cameras_stay(small_capture):
     for _ in range(8):
         fit.step()
     # About and along the optical axis pictures tell the least: a quarter moves the rim by a twentieth of a pixel.
-    assert fit.calibration.turn.abs().max() < 0.25 and fit.calibration.move.abs().max() < 0.25
+    calibration = fit.model.calibration
+    assert calibration.turn.abs().max() < 0.25 and calibration.move.abs().max() < 0.25
 
 
 def test_curvature_is_that_of_the_loss(small_capture):
     """Second differences of the loss where predictions are what is seen: of squares there Gauss-Newton is exact."""
     fit, index = posed(small_capture, loss="l2")
-    before = fit.random.get_state()
+    before = fit.sampler.state()
 
     def loss():
-        fit.random.set_state(before)
+        fit.sampler.restore(before)
         with torch.no_grad():
-            it = fit.predict()
-            return it, float(fit.weigh(it))
+            it = iteration_of(fit)
+            return it, float(fit.loss(it))
 
     it, least = loss()
     found = curvature(it)
     for name, axis, component in (("turn", 1, 1), ("turn", 2, 2), ("move", 0, 3), ("move", 2, 5)):
-        unknown = getattr(fit.calibration, name)
+        unknown = getattr(fit.model.calibration, name)
         for i, k in enumerate(index):
             sides = []
             for step in 3.0, -3.0:
@@ -140,25 +146,26 @@ def test_curvature_is_that_of_the_loss(small_capture):
 def test_terms_whose_curvature_is_not_known_are_refused(small_capture):
     config = mi_ring.Config(refine=("cameras",))
     with pytest.raises(mi_ring.InputError, match="terms: rgb: must be the default one for --refine cameras"):
-        mi_ring.Fit(mi_ring.load_capture(small_capture), config, terms={"rgb": lambda it: it.predicted.mean()})
+        mi_ring.Fit(mi_ring.load_capture(small_capture), config, terms={"rgb": lambda it: it.prediction.rgb.mean()})
 
 
 @pytest.mark.parametrize(("domain", "start"), [("hull", 0.2), ("sphere", 0.4)])
 def test_cameras_begin_when_there_is_a_shape(small_capture, domain, start):
     fit, _ = posed(small_capture, domain=domain)
+    move = fit.model.calibration.move
     for progress, moved in (start - 0.01, False), (start + 0.05, True):
         with torch.no_grad():
-            fit.calibration.move += 1
-        before = fit.calibration.move.detach().clone()
-        fit.iteration = round(progress * fit.iterations)
+            move += 1
+        before = move.detach().clone()
+        fit.course.iteration = round(progress * fit.iterations)
         fit.step()
-        assert (not torch.equal(fit.calibration.move, before)) == moved
+        assert (not torch.equal(move, before)) == moved
 
 
 def test_powers_go_where_photographs_were_lit(small_capture):
     """Of those that were seen, by one another, and of no others."""
     fit, index = posed(small_capture, refine=("power",))
-    calibration, random = fit.calibration, torch.Generator().manual_seed(3)
+    calibration, random = fit.model.calibration, torch.Generator().manual_seed(3)
     with torch.no_grad():
         calibration.power += 1.5 * torch.randn(calibration.power.shape, generator=random)
     others = np.setdiff1d(np.arange(len(fit.capture)), index)
@@ -176,27 +183,26 @@ def test_powers_go_where_photographs_were_lit(small_capture):
 def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
     """Blue is a tenth as bright as red; highlights, where the prediction is wrong, are bright in it alone."""
     fit, _ = posed(small_capture, refine=("power",))
-    powers = Powers(fit.calibration, "power")
+    powers = ExposureSolver(fit.model.calibration, "power")
     predicted = torch.tensor([0.4, 0.2, 0.03]).expand(3, 8, 10, 3).clone()
     factors = torch.tensor([[1.2, 1.0, 0.9], [0.8, 1.1, 1.0], [1.0, 1.0, 1.3]])
     observed = predicted * factors[:, None, None]
     predicted[:, :2, :5] += 0.5
     observed[:, :2, :5] += torch.tensor([0.9, 0.2, 0.5])[:, None, None, None]
     observed[2, :, :, 1] = 1e-4  # nothing to be told of
-    inside = torch.ones(3, 8, 10, dtype=torch.bool)
-    it = SimpleNamespace(
-        progress=0.5, fit=fit, surely=lambda: inside, clipped=torch.zeros(3, 8, 10, 3, dtype=torch.bool),
-        observed=observed, predicted=predicted, index=[4, 7, 2], everything=np.array([4, 7, 2]),
-        share=SimpleNamespace(gathered=lambda t: t),
-    )  # fmt: skip
+    inside = torch.ones(3, 8, 10)
+    batch = SimpleNamespace(progress=0.5, photographs=np.array([4, 7, 2]), all_photographs=np.array([4, 7, 2]),
+                            gathered=lambda tensor: tensor)  # fmt: skip
+    seen = Observation(observed, torch.zeros(3, 8, 10, 3, dtype=torch.bool), inside, torch.ones(3).bool(), None)
+    it = Iteration(batch, seen, SimpleNamespace(rgb=predicted, coverage=inside), fit.context())
     powers.look(it)
     found = torch.stack([brighter for _, brighter in powers.seen])
     expected = factors.log() - factors.log().mean(0)
     expected[:, 1] = torch.tensor([-0.5, 0.5, torch.nan]) * np.log(1.1)
     assert [k for k, _ in powers.seen] == [4, 7, 2]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5, equal_nan=True)
-    before = fit.calibration.power.detach().clone()
+    before = fit.model.calibration.power.detach().clone()
     powers.step()
-    after = fit.calibration.power.detach()
+    after = fit.model.calibration.power.detach()
     changed = (after != before).nonzero().tolist()
     assert after.isfinite().all() and [2, 1] not in changed and {k for k, _ in changed} <= {4, 7, 2}

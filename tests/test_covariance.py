@@ -8,7 +8,7 @@ import torch
 
 import mi_ring
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.covariance import BLOCK, Entries, Equations, deviations
+from mi_ring.fitting.covariance import BLOCK, Equations, Layout, covariance
 from mi_ring.fitting.fit import Fit
 from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.output.calibration_panel import panel
@@ -33,47 +33,47 @@ def test_deviation_of_a_slope_is_that_of_linear_regression(block):
 
 def test_photographs_share_the_unknowns_of_their_lens_and_flash(small_capture):
     config = Config(refine=("cameras", "focal", "light", "power", "curve"))
-    entries = Entries(Fit(mi_ring.load_capture(small_capture), config).calibration)
-    first, other = (entries.of(np.array([k])) for k in (2, 7))
+    layout = Layout(Fit(mi_ring.load_capture(small_capture), config).model.calibration)
+    first, other = (layout.of(np.array([k])) for k in (2, 7))
     shared = {name for (name, _, a), (_, _, b) in zip(first, other) if a == b}
     assert shared == {"focal", "light", "curve"}
     own = [int(place[0]) for entry in (first, other) for name, _, place in entry if name not in shared]
     assert len(own) == len(set(own)) == 2 * 9
-    assert entries.count == 12 * 9 + 1 + 3 + 1
+    assert layout.count == 12 * 9 + 1 + 3 + 1
 
 
 def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
     refined = "cameras", "light", "power", "curve"
-    config = Config(iterations=30, levels=(3,), widths=(56,), shares=(1,), refine=refined)
+    config = Config(iterations=30, levels=(3,), widths=(56,), shares=(1,), subdivisions=3, refine=refined)
     running = Fit(mi_ring.load_capture(small_capture), config)
     for _ in running:
         pass
-    before = {name: value.clone() for name, value in running.calibration.state_dict().items()}
-    running.surface.show(running.ring, *running.ring.domain.sample(3))
-    found = deviations(running)
-    for name, value in running.calibration.state_dict().items():
+    calibration = running.model.calibration
+    before = {name: value.clone() for name, value in calibration.state_dict().items()}
+    found = covariance(running.problem, running.model, running.renderer, 3)
+    for name, value in calibration.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
-    for name, width in running.calibration.widths.items():
-        assert found[name].shape == getattr(running.calibration, name).shape
+    for name, width in calibration.widths.items():
+        assert found[name].shape == getattr(calibration, name).shape
         assert (found[name] > 0).all() and (found[name] <= width * (1 + 1e-6)).all()  # a photograph cannot know less
 
-    summary = running.summary(running.calibrated())
+    summary = running.result().calibration
     assert json.loads(json.dumps(summary)) == summary
-    light, unit = summary["unknowns"]["light"], running.calibration.distance
+    light, unit = summary["unknowns"]["light"], calibration.rig.distance
     np.testing.assert_allclose(light["before"], [15, 10, 0], atol=1e-3)
     moved = np.subtract(light["after"], light["before"])
-    np.testing.assert_allclose(moved, unit * running.calibration.value("light")[0].detach(), atol=1e-4)
+    np.testing.assert_allclose(moved, unit * calibration.value("light")[0].detach(), atol=1e-4)
     np.testing.assert_allclose(light["std"], unit * found["light"][0], rtol=1e-6)
     photograph = summary["photographs"]["003.png"]
-    turn = running.calibration.value("turn")[3].detach().norm()
+    turn = calibration.value("turn")[3].detach().norm()
     assert photograph["turned_degrees"] == pytest.approx(np.degrees(float(turn)), rel=1e-5)
     np.testing.assert_allclose(photograph["std"]["power"], found["power"][3] * photograph["power"], rtol=1e-5)
     page = panel(running.capture, running.calibrated(), summary)
     assert [row[0].split()[0] for row in page.rows] == ["place", "exponent", "cameras", "and", "power"]
     assert page.chart.startswith("data:image/svg")
 
-    assert found["light"].max() < 0.3 * running.calibration.widths["light"]
-    assert found["power"].max() < 0.7 * running.calibration.widths["power"]
+    assert found["light"].max() < 0.3 * calibration.widths["light"]
+    assert found["power"].max() < 0.7 * calibration.widths["power"]
 
 
 def test_pixels_beside_the_blocks_count_as_well():
@@ -86,7 +86,7 @@ def test_pixels_beside_the_blocks_count_as_well():
 
 def test_the_room_alone_has_no_deviation(small_capture):
     running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",)))
-    assert deviations(running) == {}
+    assert covariance(running.problem, running.model, running.renderer, 3) == {}
 
 
 def test_photographs_that_moved_far_are_told_from_those_that_all_moved():

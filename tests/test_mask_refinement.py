@@ -10,6 +10,7 @@ import torch
 import mi_ring
 from mi_ring import Config, Fit, InputError
 from mi_ring.capture.grabcut import grabcut, overlap
+from mi_ring.fitting import fit as fitting
 from mi_ring.fitting import mask_refinement
 
 WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
@@ -66,7 +67,7 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
     for k in range(12):
         assert overlap(fit.capture.masks[k] > 127, true[k]) > 0.93, k
 
-    other = Fit(capture, fit.config, state=fit.state())
+    other = Fit(capture, fit.problem.config, state=fit.state())
     for one, another in zip(fit.capture.masks, other.capture.masks):
         np.testing.assert_array_equal(one, another)
 
@@ -77,14 +78,17 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
         np.testing.assert_array_equal(one, another)
 
 
-def test_what_the_second_search_is_not_sure_of_stays(without_some_masks):
+def test_what_the_second_search_is_not_sure_of_stays(without_some_masks, monkeypatch):
     scene, _ = without_some_masks
     fit = Fit(mi_ring.load_capture(scene), Config(**BRIEF, refine=("masks",)))
     half = {k: torch.ones(40, 56, dtype=torch.uint8) for k in range(12)}
-    fit.take_outlines(half)
-    fit.take_outlines({k: 0 * outline for k, outline in half.items() if k != 4})
-    assert sorted(fit.outlines) == list(range(12))
-    assert fit.outlines[4].all() and not fit.outlines[5].any()
+    searches = iter([half, {k: 0 * mask for k, mask in half.items() if k != 4}])
+    monkeypatch.setattr(fitting, "find_masks", lambda *parts: next(searches))
+    fit.refine_masks()
+    fit.refine_masks()
+    masks = fit.course.masks
+    assert sorted(masks) == list(range(12))
+    assert masks[4].all() and not masks[5].any()
     assert (fit.capture.masks[4] == 255).all()
 
 
@@ -93,7 +97,7 @@ def test_outlines_of_reduced_pictures_stay_where_they_are(small_capture):
     shot = capture.shots[0]
     outline = torch.zeros(40 // 3, 56 // 3, dtype=torch.uint8)
     outline[4:, 10:] = 1  # from row 12 and column 30 on
-    mask = mask_refinement.with_outlines(capture, {0: outline}).masks[0]
+    mask = mask_refinement.with_masks(capture, {0: outline}).masks[0]
     assert mask.shape == shot.size[::-1]
     expected = np.zeros((40, 56), bool)
     expected[12:, 30:] = True
@@ -108,9 +112,9 @@ def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks,
     monkeypatch.setattr(
         mask_refinement, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
     )
-    fit.iteration = 30
+    fit.course.iteration = 30
     fit.step()
-    assert not fit.outlines
+    assert not fit.course.masks
     for before, after in zip(capture.masks, fit.capture.masks):
         assert before is after
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from test_indirect import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
+from test_indirect_light import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.capture.loading import load_capture
@@ -191,7 +191,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
         free = torch.from_numpy(pictures(render_photographs(dark, lit_so_far, 64, 0))).to(direct) - direct
-        room.see(around, predicted + free[..., :3], observed, direct[..., 3] > 0.99)
+        room.solve(around, predicted + free[..., :3], observed, direct[..., 3] > 0.99)
     good = (direct[..., 3] == 1) & ((observed - predicted).abs() < 1).all(-1)
     missing, added = (  # in blocks of 7 × 10 pixels: single ones are noisy
         torch.nn.functional.avg_pool2d((picture * good[..., None]).movedim(-1, 1), (7, 10))
@@ -207,7 +207,7 @@ def test_without_anything_seen_the_room_is_as_given():
     dark = torch.zeros(len(ALL), 1, 5, 7, 3)
     around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, dark, dark, torch.ones(1, 5, 7), torch.ones(1, 10, 14),
                                  2)  # fmt: skip
-    room.see(around, torch.zeros(1, 10, 14, 3), torch.ones(1, 10, 14, 3), torch.ones(1, 10, 14) > 0)
+    room.solve(around, torch.zeros(1, 10, 14, 3), torch.ones(1, 10, 14, 3), torch.ones(1, 10, 14) > 0)
     torch.testing.assert_close(room.harmonics, given)
 
 
@@ -223,13 +223,13 @@ def test_a_room_takes_no_light_away():
     truth[PER_FRAME:] = 0
     missing = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL]).repeat_interleave(2, 1).repeat_interleave(2, 2)
     room = RoomLight(torch.zeros(BASIS, 3), 0.3)
-    room.see(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
+    room.solve(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
     assert not room.harmonics[:, 0].any()
     found, missing = (torch.einsum("jnhw,j->nhw", harmonics[..., 1], part[ALL, 1]) for part in (room.harmonics, truth))
     assert float((found - missing).abs().mean()) < 0.2 * float(missing.abs().mean())
     before = {name: value.clone() for name, value in room.state_dict().items()}
     broken = torch.full((1, 10, 14, 3), torch.nan)
-    room.see(around, broken, broken + 1, torch.ones(1, 10, 14) > 0)  # a photograph that is no number tells nothing
+    room.solve(around, broken, broken + 1, torch.ones(1, 10, 14) > 0)  # a photograph that is no number tells nothing
     assert all(torch.equal(value, before[name]) for name, value in room.state_dict().items())
 
 
