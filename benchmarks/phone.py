@@ -44,7 +44,7 @@ from tqdm import tqdm
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.photogrammetry.capture_files import windows
+from mi_ring.photogrammetry.capture_files import crop_windows
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Shot
 
@@ -201,7 +201,7 @@ def crop(scene: Path) -> None:
         return {e.get("name"): e for e in sensor.findall("string") if e.get("name") in ("filename", "mask", "valid")}
 
     masks = [np.array(Image.open(scene.parent / files(sensor)["mask"].get("value"))) for sensor in sensors]
-    for sensor, window in zip(sensors, windows(masks, [mask.shape[::-1] for mask in masks])):
+    for sensor, window in zip(sensors, crop_windows(masks, [mask.shape[::-1] for mask in masks])):
         left, top, width, height = window[:4]
         for kind, file in files(sensor).items():
             path = Path(f"cropped/{kind}/{sensor.get('id')}.png")

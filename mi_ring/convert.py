@@ -24,8 +24,8 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
     frames = write_scene(source)
-    if source.left_out:
-        some = sorted(source.left_out)
+    if source.without_pose:
+        some = sorted(source.without_pose)
         print(f"{len(some)} of {len(some) + len(frames)} photographs left out, without a pose: {', '.join(some[:3])}"
               f"{', …' if len(some) > 3 else ''}")  # fmt: skip
     masked = sum(frame.mask is not None for frame in frames)

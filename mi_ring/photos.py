@@ -18,21 +18,28 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
-from mi_ring.photogrammetry.capture_files import windows, write_posed_picture, write_table
-from mi_ring.photogrammetry.flash_light import Flash
-from mi_ring.photogrammetry.folder import TRANSPARENT, find_pictures, models, unlit, ups, without_exposure
+from mi_ring.photogrammetry.capture_files import crop_windows, write_posed_picture, write_table
+from mi_ring.photogrammetry.flash_light import FlashCalibration
+from mi_ring.photogrammetry.folder import (
+    TRANSPARENT,
+    camera_names,
+    find_pictures,
+    up_directions,
+    without_exposure,
+    without_flash,
+)
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
-from mi_ring.photogrammetry.object_masks import Hints, Object, find_object, require_half
-from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.photogrammetry.object_masks import SegmentationInput, SegmentedObject, find_object, require_half
+from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.photogrammetry.workflow import (
     find_cameras,
     find_sheet,
-    flash_of,
+    flash_from_sheet,
+    make_upright,
     posed_pictures,
+    require_parallax,
     require_same_photographs,
-    require_sides,
-    upright,
 )
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
@@ -92,32 +99,37 @@ class PhotosConfig:
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
-def cameras_report(motion: Motion) -> str:
-    """A line about the cameras that were found, and one for each photograph without a camera."""
-    count = len(motion.cameras)
-    how = f"as given by {motion.source}" if motion.source else f"by {len(motion.points)} points"
-    how += f", reprojection error {motion.error:.2f} px" if motion.error else ""
-    lines = [f"Cameras: {count} of {count + len(motion.failed)} photographs, {how}"]
-    return "\n".join(lines + [f"  without: {name}: {why}" for name, why in motion.failed.items()])
+def cameras_report(sparse: SparseModel) -> str:
+    """The line about cameras, and one for each photograph without."""
+    count, failed = len(sparse.cameras), sparse.failed
+    how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
+    how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
+    return "\n".join([
+        f"Cameras: {count} of {count + len(failed)} photographs, {how}",
+        *(f"  without: {name}: {why}" for name, why in failed.items()),
+    ])  # fmt: skip
 
 
-def masks_report(found: Object, motion: Motion, source: str | Path) -> str:
-    """A line about the masks, and one for each photograph without a mask; `source`: `PhotosConfig.masks`."""
+def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
+    """The line about masks, and one for each photograph without; `source`: as `PhotosConfig.masks`."""
+    without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
-    lines = [f"Masks: of {len(found.masks)} of {len(motion.cameras)} photographs"]
-    return "\n".join(lines + [f"  without: {name}: {why}" for name in motion.cameras if name not in found.masks])
+    return "\n".join([
+        f"Masks: of {len(found.masks)} of {len(sparse.cameras)} photographs",
+        *(f"  without: {name}: {why}" for name in without),
+    ])  # fmt: skip
 
 
-def flash_report(flash: Flash, motion: Motion, found: Object) -> str:
-    """A line about the flash and the room's light, as measured on the sheet."""
+def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
+    """The line about the flash and the light of the room."""
     x, y, z = flash.offset
-    distance = np.median([np.linalg.norm(pose[:3, 3] - found.center) for _, pose in motion.cameras.values()])
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
+    share = (flash.room * sparse.distance(found.center) ** 2).mean()
     where += f", shines like the cosine to the power of {flash.falloff:.1f}"
     curve = f"; the camera's curve has the exponent {flash.gamma:.2f}" if flash.gamma != 1 else ""
     return (f"Flash, by the sheet in {len(flash.intensities)} photographs: {where}; the room's light on the sheet is "
-            f"{(flash.room * distance**2).mean():.1%} of its light at the object{curve}")  # fmt: skip
+            f"{share:.1%} of its light at the object{curve}")  # fmt: skip
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -154,10 +166,10 @@ def require_apart(config: PhotosConfig) -> None:
 def make(config: PhotosConfig, scene: Path) -> None:
     """Make the capture; steps that are complete in work/ are not repeated."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
-    if dark := unlit(pictures):
+    if dark := without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
         pictures = [picture for picture in pictures if picture.path.name not in dark]
-    if len(cameras := models(pictures)) > 1:
+    if len(cameras := camera_names(pictures)) > 1:
         kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
         print(f"Cameras: of several models, by EXIF data ({kinds}), but all of one size are taken to share a lens, and "
               "all to have their flash in one place beside it; better give photographs of one")  # fmt: skip
@@ -172,37 +184,37 @@ def make(config: PhotosConfig, scene: Path) -> None:
     sheet = find_sheet(pictures, config.square_mm, work, progress)
     if config.box and not sheet:
         raise InputError(f"--box: is in the frame of the sheet of `mi-ring board`, which {config.folder} does not show")
-    motion, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
-    print(cameras_report(motion))
-    require_sides(motion, config.folder)
+    sparse, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
+    print(cameras_report(sparse))
+    require_parallax(sparse, config.folder)
     if sheet:
-        moved = align(sheet.sightings, motion.cameras)
-        motion = motion.moved(moved.scale, moved.rotation, moved.shift)
+        moved = align(sheet.detections, sparse.cameras)
+        sparse = sparse.moved(moved.scale, moved.rotation, moved.shift)
         plane = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-        print(f"Sheet: in {len(sheet.sightings)} photographs, {moved.corners} corners, {moved.rms:.2g} mm off")
+        print(f"Sheet: in {len(sheet.detections)} photographs, {moved.corners} corners, {moved.rms:.2g} mm off")
     else:
         print("Sheet: none seen, so that the scale is unknown")
-    hints = Hints(plane, config.box, config.masks)
-    found = find_object(pictures, motion, hints, work / "masks", progress)
+    known = SegmentationInput(plane, config.box, config.masks)
+    found = find_object(pictures, sparse, known, work / "masks", progress)
     plane = found.plane
-    print(masks_report(found, motion, config.masks))
+    print(masks_report(found, sparse, config.masks))
     if not plane:
         print("Table: none found; if the object stands on one, see in the contact sheet that it is not in the masks")
-    if config.masks == "auto":  # without a mask, the table would be taken for the object
-        motion = replace(motion, cameras={n: camera for n, camera in motion.cameras.items() if n in found.masks})
+    if config.masks == "auto":  # what shows a table and no mask would be taken for the object
+        sparse = replace(sparse, cameras={n: camera for n, camera in sparse.cameras.items() if n in found.masks})
     has_up = True
     if not sheet:
-        motion, plane, has_up = upright(motion, found.center, plane, ups(pictures))
+        sparse, plane, has_up = make_upright(sparse, found.center, plane, up_directions(pictures))
         found = found._replace(center=np.zeros(3))
     offset = np.array(config.flash_offset)
-    flash = flash_of(pictures, motion, found, offset, sheet) if sheet else None
+    flash = flash_from_sheet(pictures, sparse, found, offset, sheet) if sheet else None
     if flash:
-        print(flash_report(flash, motion, found))
-    if not flash and not offset.any() and len({picture.held for picture in pictures}) > 1:
+        print(flash_report(flash, sparse, found))
+    if not flash and not offset.any() and len({picture.camera_orientation for picture in pictures}) > 1:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
-    taken = posed_pictures(pictures, motion, found, offset, flash)
-    if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
+    taken = posed_pictures(pictures, sparse, found, offset, flash)
+    if silent := without_exposure([posed.picture for posed in taken if not posed.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
@@ -213,7 +225,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
-        cuts = windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
+        cuts = crop_windows([posed.mask for posed in taken], [posed.lens.size for posed in taken])
         written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:

@@ -15,6 +15,7 @@ import pytest
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 from mi_ring.doctor import OPTIONAL
+from mi_ring.system.optional import installed
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -43,14 +44,21 @@ def no_scenes_of_other_tests():
     gc.collect()
 
 
+def missing_package(error: BaseException | None) -> str | None:
+    """The package of `OPTIONAL` that an error, or what it came from, could not import for it is not installed."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL and not installed(error.name):
+            return error.name
+        error = error.__cause__ or error.__context__
+    return None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(call):
     """A test that needs a package which is not ready-made for every machine is skipped where it is missing."""
-    text = str(call.excinfo.value) if call.excinfo else ""
-    for name in OPTIONAL:
-        if f"needs the package {name}, which is not installed" in text or f"No module named '{name}'" in text:
-            skipped = pytest.skip.Exception(f"needs {name}")
-            call.excinfo = pytest.ExceptionInfo.from_exc_info((type(skipped), skipped, call.excinfo.tb))
+    if call.excinfo and (name := missing_package(call.excinfo.value)):
+        skipped = pytest.skip.Exception(f"needs {name}")
+        call.excinfo = pytest.ExceptionInfo.from_exc_info((type(skipped), skipped, call.excinfo.tb))
 
 
 @pytest.fixture

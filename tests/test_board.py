@@ -12,7 +12,15 @@ from scipy.spatial.transform import Rotation
 from mi_ring import board as command
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
-from mi_ring.photogrammetry.marker_sheet import DOTS, Board, Sighting, align, calibrate, page, white
+from mi_ring.photogrammetry.marker_sheet import (
+    DOTS,
+    MarkerSheet,
+    SheetDetection,
+    align,
+    calibrate,
+    page,
+    sample_paper,
+)
 
 MIDDLE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 300.0, 210.0, -0.06))
 ASIDE = Lens("SIMPLE_RADIAL", (600, 420), (640.0, 313.0, 201.0, -0.06))
@@ -80,7 +88,7 @@ def truth(lens, pose, points):
 def aside():
     """Cameras and what is found in their photographs, by name; the lens's principal point is not in the middle."""
     cameras = {f"{k:02}": (ASIDE, pose) for k, pose in enumerate(poses(7))}
-    return cameras, {name: Board().detect(photograph(*camera)) for name, camera in cameras.items()}
+    return cameras, {name: MarkerSheet().detect(photograph(*camera)) for name, camera in cameras.items()}
 
 
 def test_corners_are_found_where_they_are(aside):
@@ -102,7 +110,7 @@ def test_what_stands_on_the_sheet_hides_its_corners(aside):
     cv2.ellipse(hidden, (330, 190), (90, 60), 25, 0, 360, 1, -1)
     speckled = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, picture.shape), (0, 0), 3) * 400 + 110
     picture[hidden > 0] = speckled.clip(0, 255)[hidden > 0]
-    sighting = Board().detect(picture)
+    sighting = MarkerSheet().detect(picture)
     exact = truth(*cameras["01"], sighting.points)
     assert 40 < len(exact) < len(sightings["01"].ids) - 8
     assert not hidden[tuple(exact[:, ::-1].astype(int).T)].any()
@@ -112,7 +120,7 @@ def test_what_stands_on_the_sheet_hides_its_corners(aside):
 def test_the_frame_has_the_printed_side_up():
     """By OpenCV's own way: the first corner is at the top left of the page as it is read."""
     sheet = np.array(page("letter"), np.uint8) * 255
-    sighting = Board(40.0).detect(sheet)
+    sighting = MarkerSheet(40.0).detect(sheet)
     assert sighting.ids.tolist() == list(range(96))
     np.testing.assert_allclose(sighting.points[[0, 7, 88]], [[-140, 220, 0], [140, 220, 0], [-140, -220, 0]])
     middle = np.array(sheet.shape[::-1]) / 2
@@ -132,7 +140,7 @@ def test_large_photographs_are_as_exact_as_small_ones():
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     place = np.array([[7, 0, sheet.shape[1] / 2], [0, -7, sheet.shape[0] / 2], [0, 0, 1]])
     picture = cv2.warpPerspective(sheet, half @ H @ np.linalg.inv(half @ place), lens.size, flags=cv2.INTER_LINEAR)
-    sighting = Board().detect(cv2.GaussianBlur(picture, (0, 0), 1.2))
+    sighting = MarkerSheet().detect(cv2.GaussianBlur(picture, (0, 0), 1.2))
     exact = (np.column_stack([sighting.points[:, :2], np.ones(len(sighting.ids))])) @ H.T
     errors = sighting.pixels - exact[:, :2] / exact[:, 2:]
     assert len(errors) > 80 and np.abs(errors).max() < 0.15 and np.abs(errors.mean(0)).max() < 0.02
@@ -140,22 +148,22 @@ def test_large_photographs_are_as_exact_as_small_ones():
 
 def test_nothing_and_a_strip_are_no_sighting():
     random = np.random.default_rng(0)
-    assert Board().detect(random.integers(0, 255, (200, 300, 3)).astype(np.uint8)) is None
+    assert MarkerSheet().detect(random.integers(0, 255, (200, 300, 3)).astype(np.uint8)) is None
     sheet = np.array(page("a4"), np.uint8) * 255
     top = (sheet.shape[0] - 13 * 20 * DOTS) // 2
     strip = np.full_like(sheet, 255)
     strip[top : top + 2 * 20 * DOTS] = sheet[top : top + 2 * 20 * DOTS]  # two rows of squares: one of corners
-    assert Board().detect(strip) is None
+    assert MarkerSheet().detect(strip) is None
     strip[: top + 3 * 20 * DOTS] = sheet[: top + 3 * 20 * DOTS]
-    assert len(Board().detect(strip).ids) == 16
+    assert len(MarkerSheet().detect(strip).ids) == 16
 
 
 def test_the_sheet_alone_gives_the_cameras():
     cameras = {f"{k:02}": (MIDDLE, pose) for k, pose in enumerate(poses(7))}
-    sightings = {name: Board().detect(photograph(*camera)) for name, camera in cameras.items()}
+    sightings = {name: MarkerSheet().detect(photograph(*camera)) for name, camera in cameras.items()}
     ids, points, pixels = sightings["03"]
     bent = pixels + 30 * np.sin(pixels[:, ::-1] / 40)  # of a sheet that is not flat
-    sightings["03"] = Sighting(ids, points, bent)
+    sightings["03"] = SheetDetection(ids, points, bent)
     lens, found, errors = calibrate(sightings, MIDDLE.size)
     assert found.keys() == errors.keys() == sightings.keys() - {"03"} and max(errors.values()) < 0.2
     assert lens.model == "SIMPLE_RADIAL" and lens.centre == (300, 210)
@@ -197,7 +205,8 @@ def test_the_sheet_gives_cameras_their_scale_and_frame(aside):
     assert found.scale == pytest.approx(1 / 0.013, rel=1e-3)
     np.testing.assert_allclose(found.rotation, turn.T, atol=1e-3)
     centres = np.array([elsewhere[name][1][:3, 3] for name in cameras])
-    np.testing.assert_allclose(found(centres), [pose[:3, 3] for _, pose in cameras.values()], atol=0.4)
+    there = found.scale * centres @ found.rotation.T + found.shift
+    np.testing.assert_allclose(there, [pose[:3, 3] for _, pose in cameras.values()], atol=0.4)
     assert found.corners > 85 and 0 < found.rms < 0.1
 
 
@@ -208,7 +217,7 @@ def test_a_sheet_that_was_moved_is_refused(aside):
     mixed = {}
     for name, (ids, _, pixels) in sightings.items():
         order = np.random.default_rng(2).permutation(96)  # the same in all: corners are in space, but elsewhere
-        mixed[name] = Sighting(order[ids], Board().points[order[ids]], pixels)
+        mixed[name] = SheetDetection(order[ids], MarkerSheet().points[order[ids]], pixels)
     with pytest.raises(InputError, match="mm off"):
         align(mixed, cameras)
 
@@ -217,25 +226,25 @@ def test_white_is_the_papers_colour(aside):
     cameras, sightings = aside
     picture = photograph(*cameras["00"])
     linear = ((picture / 255.0) ** 2.2).astype(np.float32)
-    places, colours, beside = white(linear, sightings["00"])
+    places, colours, beside = sample_paper(linear, sightings["00"])
     np.testing.assert_allclose(colours, np.broadcast_to(0.06 + 0.94 * PAPER, colours.shape), rtol=0.06)
     squares = np.abs(places[:, :2] / 20)  # from the middle of 9 x 13
     assert 0.2 < beside.mean() < 0.8
     np.testing.assert_allclose(squares[~beside], squares[~beside].round(), atol=1e-6)
     np.testing.assert_allclose((squares[beside] - [4.5, 6.5]).max(1), 0.2, atol=1e-6)
-    few = Sighting(*(part[:6] for part in sightings["00"]))
-    assert not len(white(linear, few).places)
+    few = SheetDetection(*(part[:6] for part in sightings["00"]))
+    assert not len(sample_paper(linear, few).points)
 
 
 def test_white_is_asked_of_white_squares_only():
     """Markers in red, black squares in green: none of it must be seen."""
     sheet = np.array(page("a4"))
-    sighting = Board().detect(sheet.astype(np.uint8) * 255)
+    sighting = MarkerSheet().detect(sheet.astype(np.uint8) * 255)
     picture = np.zeros((*sheet.shape, 3), np.float32)
     picture[sheet] = [0.3, 0.6, 0.9]
     for ids in (sighting.ids, sighting.ids[:16], sighting.ids[40:56]):
-        part = Sighting(ids, sighting.points[ids], sighting.pixels[ids])
-        _, colours, _ = white(picture, part)
+        part = SheetDetection(ids, sighting.points[ids], sighting.pixels[ids])
+        _, colours, _ = sample_paper(picture, part)
         assert len(colours)
         np.testing.assert_allclose(colours, np.broadcast_to([0.3, 0.6, 0.9], colours.shape), rtol=1e-6)
 
@@ -243,10 +252,10 @@ def test_white_is_asked_of_white_squares_only():
 def test_white_is_that_of_where_it_is_said_to_be():
     """Paper whose light falls off to one side: what is brighter on one side of a square is darker on the other."""
     sheet = np.array(page("a4"))
-    sighting = Board().detect(sheet.astype(np.uint8) * 255)
+    sighting = MarkerSheet().detect(sheet.astype(np.uint8) * 255)
     row, column = np.mgrid[: sheet.shape[0], : sheet.shape[1]]
     light = 0.3 + 0.4 * column / sheet.shape[1] - 0.2 * row / sheet.shape[0]
-    places, colours, _ = white((sheet * light)[..., None].repeat(3, 2).astype(np.float32), sighting)
+    places, colours, _ = sample_paper((sheet * light)[..., None].repeat(3, 2).astype(np.float32), sighting)
     x, y = DOTS * (places[:, :2].T + np.array([[210], [-297]]) / 2)  # from the left, and downward to the top
     expected = 0.3 + 0.4 * x / sheet.shape[1] + 0.2 * y / sheet.shape[0]
     np.testing.assert_allclose(colours[:, 0], expected, rtol=2e-3)

@@ -37,7 +37,6 @@ from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import NanGuard
 from mi_ring.fitting.optimisation import network_steppers
 from mi_ring.fitting.regulariser_strength import RegulariserStrength
-from mi_ring.fitting.sampler import Sampler
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.fitted_object import FittedObject
@@ -303,23 +302,6 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
     rate = broken.optimisation.learning_rate
     assert rate == pytest.approx(0.09 * config.learning_rate * config.decay ** (39 / 40))
     assert Fit(broken.capture, config, state=broken.state()).optimisation.guard.retreats == 2
-
-
-def test_each_photograph_comes_before_one_comes_again():
-    sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
-    shots = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
-    capture = SimpleNamespace(shots=shots, sizes=sizes)
-    sampler = Sampler(SimpleNamespace(capture=capture, fitted=np.arange(12), config=Config(seed=5)))
-    drawn: dict = {size: [] for size in sizes}
-    for _ in range(60):
-        index, size = sampler.draw_photographs(3)
-        assert len({*index.tolist()}) == 3 and {*index.tolist()} <= {*sizes[size].tolist()}
-        drawn[size] += index.tolist()
-    for size, alike in sizes.items():
-        times = np.bincount(drawn[size])[alike]
-        assert times.sum() > 40 and times.max() - times.min() <= 1
-        orders = [drawn[size][k : k + len(alike)] for k in range(0, len(drawn[size]) - len(alike), len(alike))]
-        assert len({tuple(one) for one in orders}) > len(orders) / 2  # in another order
 
 
 def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mi_ring.photogrammetry.flash_light import PAPER, Ball, find_flash
-from mi_ring.photogrammetry.marker_sheet import White
+from mi_ring.photogrammetry.flash_light import PAPER_ALBEDO, ObjectSphere, calibrate_flash
+from mi_ring.photogrammetry.marker_sheet import PaperSamples
 
 OFFSET, CONE, POWER = np.array([-20.0, -15.0, 1.0]), 2.0, np.array([1.1e5, 1e5, 0.8e5])
 ROOM = np.array([0.03, 0.025, 0.02]) / 350**2
-BALL = Ball(np.array([4.0, -7.0, 40.0]), 40.0)
+BALL = ObjectSphere(np.array([4.0, -7.0, 40.0]), 40.0)
 UP = np.array([0.0, 0, 1])
 
 
@@ -43,11 +43,11 @@ def photographs(count=20, held=(), table=None):
         way = position + upright @ OFFSET - places
         distance = np.linalg.norm(way, axis=1)
         light = (-(way / distance[:, None]) @ forward) ** CONE * way[:, 2] / distance**3
-        colours = PAPER / np.pi * intensities[name] * (light[:, None] + ROOM)
+        colours = PAPER_ALBEDO / np.pi * intensities[name] * (light[:, None] + ROOM)
         beside = np.arange(len(places)) >= len(inner)
         if table:
-            colours[beside] *= table / PAPER
-        papers[name] = White(places, colours, beside)
+            colours[beside] *= table / PAPER_ALBEDO
+        papers[name] = PaperSamples(places, colours, beside)
     return papers, poses, axes, exposures, intensities
 
 
@@ -77,10 +77,10 @@ def test_flash_cone_and_room_are_found(told):
     papers, poses, axes, exposures, intensities = photographs(held=(4, 11))
     papers = rough(papers)
     papers["not placed"] = papers["0"]
-    papers["none"], poses["none"] = White(*(part[:0] for part in papers["0"])), poses["0"]
+    papers["none"], poses["none"] = PaperSamples(*(part[:0] for part in papers["0"])), poses["0"]
     poses["below"] = np.diag([1.0, -1, -1, 1]) @ poses["1"]
     papers["below"], axes["below"] = papers["1"], axes["1"]
-    found = find_flash(papers, poses, axes, exposures if told else dict.fromkeys(exposures, np.nan), np.zeros(3))
+    found = calibrate_flash(papers, poses, axes, exposures if told else dict.fromkeys(exposures, np.nan), np.zeros(3))
     assert found.intensities.keys() == intensities.keys()
     require(found, intensities)
     assert found.gamma == 1
@@ -94,48 +94,48 @@ def test_the_cameras_curve_is_found(gamma):
     papers, poses, axes, exposures, intensities = photographs()
     for name, paper in rough(papers).items():
         papers[name] = paper._replace(colours=paper.colours**gamma)
-    found = find_flash(papers, poses, axes, exposures, np.zeros(3))
+    found = calibrate_flash(papers, poses, axes, exposures, np.zeros(3))
     assert found.gamma == pytest.approx(gamma, rel=0.03)
     require(found, intensities)
-    straight = find_flash(papers, poses, axes, exposures, np.zeros(3), curved=False)
+    straight = calibrate_flash(papers, poses, axes, exposures, np.zeros(3), curved=False)
     assert straight.gamma == 1
 
 
 @pytest.mark.parametrize("albedo", [0.2, 0.5, 0.68])
 def test_a_margin_that_was_cut_off_is_no_paper(albedo):
     papers, poses, axes, exposures, intensities = photographs(table=albedo)
-    require(find_flash(rough(papers), poses, axes, exposures, np.zeros(3)), intensities)
+    require(calibrate_flash(rough(papers), poses, axes, exposures, np.zeros(3)), intensities)
 
 
 def test_a_dark_room_and_a_flash_to_all_sides_are_said_to_be(monkeypatch):
     monkeypatch.setitem(globals(), "ROOM", np.zeros(3))
     monkeypatch.setitem(globals(), "CONE", 0.0)
     papers, poses, axes, exposures, _ = photographs()
-    found = find_flash(papers, poses, axes, exposures, np.zeros(3))
+    found = calibrate_flash(papers, poses, axes, exposures, np.zeros(3))
     assert not found.room.any() and found.falloff == 0
 
 
 def test_light_that_the_object_sends_to_the_paper_and_hides_from_it_is_part_of_it():
     papers, poses, axes, exposures, intensities = photographs()
     for name, paper in papers.items():
-        lights = np.broadcast_to(poses[name][:3, 3] + poses[name][:3, :3] @ OFFSET, paper.places.shape)
-        more = 0.8 * BALL.bounce(paper.places, lights)[:, None] - ROOM * BALL.share(paper.places)[:, None]
-        papers[name] = paper._replace(colours=paper.colours + PAPER / np.pi * intensities[name] * more)
-    found, without = (find_flash(papers, poses, axes, exposures, np.zeros(3), ball) for ball in (BALL, None))
+        lights = np.broadcast_to(poses[name][:3, 3] + poses[name][:3, :3] @ OFFSET, paper.points.shape)
+        more = 0.8 * BALL.reflected(paper.points, lights)[:, None] - ROOM * BALL.form_factor(paper.points)[:, None]
+        papers[name] = paper._replace(colours=paper.colours + PAPER_ALBEDO / np.pi * intensities[name] * more)
+    found, without = (calibrate_flash(papers, poses, axes, exposures, np.zeros(3), ball) for ball in (BALL, None))
     require(found, intensities)
     assert np.abs(found.room - ROOM).max() < 0.5 * np.abs(without.room - ROOM).max()
 
 
 def test_a_ball_sends_back_what_its_surface_does():
     """By an integral over the surface of a small sphere."""
-    ball, light = Ball(np.array([3.0, -5, 60]), 0.5), np.array([150.0, 90, 260])
+    ball, light = ObjectSphere(np.array([3.0, -5, 60]), 0.5), np.array([150.0, 90, 260])
     places = np.array([[70.0, 30, 0], [-60, 20, 0], [10, -90, 0]])
     normals = np.random.default_rng(0).normal(size=(400_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points, area = ball.center + ball.radius * normals, 4 * np.pi * ball.radius**2
     toward = light - points
     lit = np.maximum((toward * normals).sum(1), 0) / np.linalg.norm(toward, axis=1) ** 3
-    for place, found in zip(places, ball.bounce(places, np.broadcast_to(light, places.shape))):
+    for place, found in zip(places, ball.reflected(places, np.broadcast_to(light, places.shape))):
         way = place - points
         away = np.linalg.norm(way, axis=1)
         seen = np.maximum((way * normals).sum(1), 0) / away * -way[:, 2] / away
@@ -147,23 +147,23 @@ def test_little_is_told_by_few_squares():
     papers, poses, axes, exposures, _ = photographs(1)
 
     def first(count):
-        return {"0": White(*(part[:count] for part in papers["0"]))}
+        return {"0": PaperSamples(*(part[:count] for part in papers["0"]))}
 
-    found = find_flash(first(1), poses, axes, exposures, OFFSET)
+    found = calibrate_flash(first(1), poses, axes, exposures, OFFSET)
     np.testing.assert_allclose(found.offset, OFFSET, atol=4)
     assert 0 <= found.falloff < 1
-    assert find_flash(first(0), poses, axes, exposures, OFFSET) is None
-    assert find_flash({"elsewhere": papers["0"]}, poses, axes, exposures, OFFSET) is None
+    assert calibrate_flash(first(0), poses, axes, exposures, OFFSET) is None
+    assert calibrate_flash({"elsewhere": papers["0"]}, poses, axes, exposures, OFFSET) is None
 
 
 def test_a_photograph_that_shows_one_square_in_a_shadow_is_lit_like_the_others():
     papers, poses, axes, exposures, intensities = photographs()
-    papers["7"] = White(*(part[:1] for part in papers["7"]))
+    papers["7"] = PaperSamples(*(part[:1] for part in papers["7"]))
     papers["7"].colours[:] *= 0.1
-    found = find_flash(papers, poses, axes, exposures, np.zeros(3))
+    found = calibrate_flash(papers, poses, axes, exposures, np.zeros(3))
     np.testing.assert_allclose(found.intensities["7"], intensities["7"], rtol=0.25)
 
 
 def test_many_photographs_are_asked_in_part():
     papers, poses, axes, exposures, intensities = photographs(70)
-    require(find_flash(papers, poses, axes, exposures, np.zeros(3)), intensities)
+    require(calibrate_flash(papers, poses, axes, exposures, np.zeros(3)), intensities)

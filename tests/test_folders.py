@@ -22,13 +22,21 @@ from mi_ring import photos
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
-from mi_ring.photogrammetry.flash_light import Flash
-from mi_ring.photogrammetry.folder import FLIPS, Picture, axes_of, find_pictures, models, turned_with, unlit, ups
-from mi_ring.photogrammetry.matching import alike
-from mi_ring.photogrammetry.object_masks import Object
-from mi_ring.photogrammetry.reduced_photographs import camera_of
-from mi_ring.photogrammetry.structure_from_motion import Motion, structure_from_motion
-from mi_ring.photogrammetry.workflow import cameras_beside, require_same_photographs, shots
+from mi_ring.photogrammetry.flash_light import FlashCalibration
+from mi_ring.photogrammetry.folder import (
+    FLIPS,
+    Picture,
+    camera_names,
+    find_pictures,
+    orientation_axes,
+    turn_with_cameras,
+    up_directions,
+    without_flash,
+)
+from mi_ring.photogrammetry.matching import static_share
+from mi_ring.photogrammetry.object_masks import SegmentedObject
+from mi_ring.photogrammetry.structure_from_motion import SparseModel, structure_from_motion
+from mi_ring.photogrammetry.workflow import imported_cameras, posed_pictures, require_same_photographs
 from mi_ring.system.progress import progress
 
 pty = pytest.importorskip("pty")  # not on Windows
@@ -39,7 +47,7 @@ LENS = Lens("PINHOLE", SIZE, (470.0, 470.0, 200.0, 150.0))
 
 def rendered(pose, noise):
     """A speckled ellipsoid on a speckled table, lit by a flash at the camera: (H, W, 3) uint8."""
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     rays, t = rays_of(camera), hit_ellipsoid(camera)[0]
     hit = np.isfinite(t)
     floor = (CENTER[2] - AXES[2] - camera.position[2]) / rays[:, 2]
@@ -74,7 +82,7 @@ def photographs(tmp_path_factory, speckles):
     for k, pose in enumerate(walk(14)):
         name = f"# 2026 IMG ({k:02}).png"  # as messengers and file managers call them
         Image.fromarray(rendered(pose, speckles)).save(folder / name)
-        mask = np.isfinite(hit_ellipsoid(camera_of(LENS, pose))[0]).reshape(SIZE[::-1])
+        mask = np.isfinite(hit_ellipsoid(LENS.camera(pose))[0]).reshape(SIZE[::-1])
         Image.fromarray(mask).convert("L").save(folder / "masks" / name)
     return folder
 
@@ -186,8 +194,8 @@ def test_photographs_from_one_place_are_told_after_the_first_pairs(tmp_path, spe
         structure_from_motion(find_pictures(tmp_path), {}, tmp_path / "work", counting)
     assert batches.count("matching") == 1
     database = tmp_path / "work/database.db"  # where an interrupted one goes on there are more pairs than are asked for
-    assert alike(database, [("01.png", "00.png"), ("02.png", "03.png")]) == 1
-    assert alike(database, [("01.png", "00.png"), ("12.png", "13.png")]) == 0.5
+    assert static_share(database, [("01.png", "00.png"), ("02.png", "03.png")]) == 1
+    assert static_share(database, [("01.png", "00.png"), ("12.png", "13.png")]) == 0.5
 
 
 def test_photographs_that_are_the_same_file_are_named(tmp_path):
@@ -270,7 +278,7 @@ def test_photographs_are_turned_as_pillow_turns_them(orientation, suffix, tmp_pa
     before, after = (
         np.mean(np.nonzero(p[..., 0] > 100), 1)[::-1] + 0.5 - np.array(p.shape[1::-1]) / 2 for p in (pixels, expected)
     )
-    np.testing.assert_allclose(axes_of(orientation) @ [*before, 7], [*after, 7], atol=0.6)
+    np.testing.assert_allclose(orientation_axes(orientation) @ [*before, 7], [*after, 7], atol=0.6)
 
 
 def test_the_flash_turns_with_the_camera(tmp_path):
@@ -278,7 +286,7 @@ def test_the_flash_turns_with_the_camera(tmp_path):
     for k, orientation in enumerate((1, 1, 8)):
         save_turned(np.zeros((4, 6, 3), np.uint8), tmp_path / f"{k}.jpg", orientation)
     pictures = [Picture(tmp_path / f"{k}.jpg") for k in range(3)]
-    found = turned_with(pictures, np.array([10.0, 0, 1]))
+    found = turn_with_cameras(pictures, np.array([10.0, 0, 1]))
     np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
 
 
@@ -296,17 +304,17 @@ def test_lights_are_those_that_the_sheet_tells(tmp_path):
         pose[:3, :3] = Rotation.from_euler("zyx", [20 * k, 7, 150], degrees=True).as_matrix()
         pose[:3, 3] = 10 * k, -5, 300
         poses[picture.name] = (pose, np.array(picture.axes))
-    motion = Motion({name: (LENS, pose) for name, (pose, _) in poses.items()}, np.zeros((0, 3)), None, {})
-    flash = Flash(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), 1.2, np.array([9.0, 8, 7]),
+    motion = SparseModel({name: (LENS, pose) for name, (pose, _) in poses.items()}, np.zeros((0, 3)), None, {})
+    flash = FlashCalibration(np.array([-20.0, -15, 2]), 1.5, np.zeros(3), 1.2, np.array([9.0, 8, 7]),
                   {"0": np.array([4.0, 4, 4]), "1": np.array([9.0, 8, 8]), "2": np.array([9.0, 9, 9])})  # fmt: skip
-    taken = shots(pictures, motion, Object({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
+    taken = posed_pictures(pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.zeros(3), flash)
     for one, (pose, axes) in zip(taken, poses.values()):
         np.testing.assert_allclose(one.light.vector, pose[:3, :3] @ axes @ flash.offset + pose[:3, 3])
         assert (one.falloff, one.gamma) == (1.5, 1.2)
     assert [one.measured for one in taken] == [True, True, True, False]
     np.testing.assert_allclose(taken[2].light.rgb, 9)
     np.testing.assert_allclose(taken[3].light.rgb, 2 * flash.power)  # 0.02 s are usual
-    alone = shots(pictures, motion, Object({}, np.zeros(3), 0.2, None), np.array([3.0, 0, 0]), None)
+    alone = posed_pictures(pictures, motion, SegmentedObject({}, np.zeros(3), 0.2, None), np.array([3.0, 0, 0]), None)
     np.testing.assert_allclose(alone[0].light.vector, poses["0"][0][:3, 0] * 3 + poses["0"][0][:3, 3])
     assert not any(one.measured for one in alone) and alone[0].falloff == 0
 
@@ -320,8 +328,8 @@ def test_photographs_without_flash_are_told_among_those_with(tmp_path):
         return Picture(tmp_path / name)
 
     pictures = [write(f"{k}.jpg", fired) for k, fired in enumerate((9, 16, 25, 9, None, 1))]
-    assert unlit(pictures) == ["1.jpg"]
-    assert unlit([pictures[1]] * 3 + [pictures[0]]) == []  # a torch does not fire
+    assert without_flash(pictures) == ["1.jpg"]
+    assert without_flash([pictures[1]] * 3 + [pictures[0]]) == []  # a torch does not fire
 
 
 def test_models_of_cameras_are_told_apart(tmp_path):
@@ -330,16 +338,16 @@ def test_models_of_cameras_are_told_apart(tmp_path):
         if model:
             exif[ExifTags.Base.Model] = model
         Image.new("RGB", (8, 6)).save(tmp_path / f"{k}.jpg", exif=exif)
-    assert models([Picture(tmp_path / f"{k}.jpg") for k in range(4)]) == {"One": 2, "Other": 1}
+    assert camera_names([Picture(tmp_path / f"{k}.jpg") for k in range(4)]) == {"One": 2, "Other": 1}
 
 
 def test_the_flash_and_up_are_as_photographs_are_shown_though_their_pixels_are_not_turned(tmp_path):
     for k in range(3):
         save_turned(np.zeros((4, 6, 3), np.uint8), tmp_path / f"{k}.jpg", 6)  # turned to the right when it is shown
     pictures = [Picture(tmp_path / f"{k}.jpg", upright=False) for k in range(3)]
-    assert turned_with(pictures, np.array([10.0, 0, 1]))["1"].tolist() == [0, -10, 1]
-    assert ups(pictures)["2"].tolist() == [-1, 0, 0]
-    assert ups([Picture(tmp_path / "0.jpg")])["0"].tolist() == [0, -1, 0]
+    assert turn_with_cameras(pictures, np.array([10.0, 0, 1]))["1"].tolist() == [0, -10, 1]
+    assert up_directions(pictures)["2"].tolist() == [-1, 0, 0]
+    assert up_directions([Picture(tmp_path / "0.jpg")])["0"].tolist() == [0, -1, 0]
 
 
 def test_the_flash_turns_with_heif_whose_reader_turns_the_pixels(tmp_path):
@@ -352,7 +360,7 @@ def test_the_flash_turns_with_heif_whose_reader_turns_the_pixels(tmp_path):
     pictures = [Picture(tmp_path / f"{k}.heic") for k in range(3)]
     assert [picture.size for picture in pictures] == [(64, 40), (64, 40), (40, 64)]
     assert [picture.pixels.shape[:2] for picture in pictures] == [(40, 64), (40, 64), (64, 40)]
-    found = turned_with(pictures, np.array([10.0, 0, 1]))
+    found = turn_with_cameras(pictures, np.array([10.0, 0, 1]))
     np.testing.assert_array_equal([found["0"], found["1"], found["2"]], [[10, 0, 1], [10, 0, 1], [0, -10, 1]])
 
 
@@ -422,7 +430,7 @@ def test_cameras_of_another_tool_are_taken_whatever_photographs_lack_or_are_gone
         if k == 3:
             exif.get_ifd(0x8769).update({33434: 0.01, 33437: 2.0, 34855: 100})
         Image.fromarray(pixels[k]).save(tmp_path / f"images/p{k}.{'heic' if k % 2 else 'jpg'}", exif=exif)
-    motion = cameras_beside(find_pictures(tmp_path / "images", upright=False))
+    motion = imported_cameras(find_pictures(tmp_path / "images", upright=False))
     assert list(motion.cameras) == [f"p{k}" for k in range(10)] and not motion.failed
     np.testing.assert_allclose(np.diff([pose[0, 3] for _, pose in motion.cameras.values()]), 1)
 
@@ -434,7 +442,7 @@ def test_cameras_of_another_tool_are_those_of_the_pixels_as_stored(tmp_path):
     frames = [{"file_path": f"{k}.jpg", "transform_matrix": eye} for k in range(8)]
     top = {"fl_x": 60, "fl_y": 60, "cx": 30, "cy": 20, "w": 60, "h": 40, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(top))
-    motion = cameras_beside(find_pictures(tmp_path, upright=False))
+    motion = imported_cameras(find_pictures(tmp_path, upright=False))
     assert {lens.size for lens, _ in motion.cameras.values()} == {(60, 40)}
     with pytest.raises(InputError, match=r"has a camera of 60 x 40 pixels for 4.jpg, which has 40 x 60"):
-        cameras_beside(find_pictures(tmp_path))
+        imported_cameras(find_pictures(tmp_path))

@@ -27,7 +27,7 @@ from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_exposure, exposure_of
 from mi_ring.importers.reading import has_alpha, image_size, load_mat, pixels_of
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.capture_findings import told_before
+from mi_ring.metrics.capture_findings import findings_of_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import default_folder, read_log
@@ -216,7 +216,7 @@ def test_what_other_runs_have_left_is_damaged(tmp_path, monkeypatch):
         assert default_folder(tmp_path / "pot.xml").resolve() == folder
     for far in ("1" * 400, "[" * 100_000, '"x"'):
         (tmp_path / "calibration.json").write_text(f'{{"photographs": {{"a": {{"moved_px": {far}}}}}}}')
-        assert told_before(tmp_path / "pot.xml", ["a"]) == ("", "")
+        assert findings_of_fit(tmp_path / "pot.xml", ["a"]) == ("", "")
     (folder / "log.jsonl").write_bytes(b'{"iteration": 1}\n\xff\xff\n{"iteration"')
     assert read_log(folder) == [{"iteration": 1}]
 

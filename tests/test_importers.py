@@ -120,7 +120,7 @@ def agisoft(R, t, kind="frame", f=0.0, cx=0.0, cy=0.0, b1=0.0, b2=0.0, k1=0.0, k
 def test_metashape(tmp_path, kind, terms, where):
     source = Metashape(metashape(tmp_path, terms, kind, where), Path())
     frames = taken(source)
-    assert [frame.image.name for frame in frames] == NAMES and source.left_out == {"lost"}
+    assert [frame.image.name for frame in frames] == NAMES and source.without_pose == {"lost"}
     for frame, (R, t) in zip(frames, cameras()):
         np.testing.assert_allclose(landed(frame), agisoft(R, t, kind, **terms), atol=1e-3)
 
@@ -129,7 +129,7 @@ def test_metashape_leaves_out_what_is_disabled(tmp_path):
     path = metashape(tmp_path)
     path.write_text(path.read_text().replace("label='b'", "label='b' enabled='0'"))
     source = Metashape(path, Path())
-    assert [frame.image.name for frame in taken(source)] == ["a.JPG", "c.jpeg"] and source.left_out == {"b", "lost"}
+    assert [frame.image.name for frame in taken(source)] == ["a.JPG", "c.jpeg"] and source.without_pose == {"b", "lost"}
 
 
 # RealityCapture
@@ -175,7 +175,7 @@ def test_realitycapture_sidecars(tmp_path, model, elements, count):
     source = RealityCapture(sidecars(tmp_path, model, elements), Path())
     terms = {name: value * (k < count) for k, (name, value) in enumerate(TERMS.items())}
     frames = taken(source)
-    assert source.left_out == {"lost.png"} and [frame.image.name for frame in frames] == NAMES
+    assert source.without_pose == {"lost.png"} and [frame.image.name for frame in frames] == NAMES
     for frame, (R, t) in zip(frames, cameras()):
         np.testing.assert_allclose(landed(frame), capturing_reality(R, t, terms), atol=1e-3)
 
@@ -215,7 +215,7 @@ def csv_table(folder, drop=(), **cells):
 def test_realitycapture_table(tmp_path):
     source = RealityCapture(csv_table(tmp_path), Path())
     frames = taken(source)
-    assert source.left_out == {"lost.png"}
+    assert source.without_pose == {"lost.png"}
     for frame, (R, t) in zip(frames, rig_of_angles(), strict=True):
         np.testing.assert_allclose(landed(frame), capturing_reality(R, t, TERMS), atol=1e-3)
 
@@ -293,7 +293,7 @@ def test_the_dinosaur_of_middlebury_fills_the_box_of_its_readme(shared):
         bright = ndimage.binary_erosion(ndimage.binary_dilation(bright, iterations=10), iterations=7, border_value=1)
         x = (grid - frame.pose[:3, 3]) @ frame.pose[:3, :3]
         u, v = np.floor(x[:, :2] / x[:, 2:] * frame.lens.focal + frame.lens.centre).astype(int).T
-        seen = (u >= 0) & (u < frame.size[0]) & (v >= 0) & (v < frame.size[1])
+        seen = (u >= 0) & (u < frame.lens.size[0]) & (v >= 0) & (v < frame.lens.size[1])
         inside[seen] &= bright[v[seen], u[seen]]
         views += seen
     parts, _ = ndimage.label((inside & (views >= 12)).reshape(3 * [steps]))  # corners that few cameras see remain
@@ -371,7 +371,7 @@ def strings(value):
 def test_meshroom(tmp_path, version, own, terms):
     source = SfmData(alicevision(tmp_path, version, own), Path())
     frames = taken(source)
-    assert source.left_out == {"lost.png"}
+    assert source.without_pose == {"lost.png"}
     focal = (FX, FX) if version == "1.0.0" else (FX, FY)
     for frame, (R, t) in zip(frames, cameras(), strict=True):
         pixels = by_opencv(R, t, focal, np.array(SIZE) / 2 + OFFSET, terms, own.get("type") == "fisheye4")
@@ -412,7 +412,7 @@ def test_openmvg(tmp_path, kinds, nested):
              "fisheye": [0.1, -0.05, 0.02, 0.01]}  # fmt: skip
     source = SfmData(openmvg(tmp_path, kinds, nested), Path())
     frames = taken(source)
-    assert source.left_out == {"lost.png"}
+    assert source.without_pose == {"lost.png"}
     for frame, kind, (R, t) in zip(frames, kinds, cameras(), strict=True):
         pixels = by_opencv(R, t, (FX, FX), np.array(SIZE) / 2 + OFFSET, terms[kind], kind == "fisheye")
         np.testing.assert_allclose(landed(frame), pixels + 0.5, atol=1e-3)

@@ -73,6 +73,8 @@ def test_settings_of_all_kinds_are_read_as_they_were(tmp_path):
     ('{"solver": "euler"}', "solver: is no setting of mi_ring"),
     ('{"iterations": "many"}', "iterations: is 'many', which this setting cannot be"),
     ('{"iterations": true}', "iterations: is True"),
+    ('{"blur": 0.06}', "blur: is no setting of mi_ring"),
+    ('{"decay": 1%s}' % ("0" * 400), "decay: is 1000"),
     ('{"levels": [4, 5.5, 6]}', "levels: is [4, 5.5, 6]"),
     ('{"parameters": {"haze": [0]}}', "parameters: is {'haze': [0]}"),
     ('{"domain": ["mesh"]}', "domain: is ['mesh']"),

@@ -443,9 +443,9 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
     """Concentric ones: between them it is 1.5 mm, along a ray that passes the middle at a distance b a little more."""
     monkeypatch.setattr(surfaces, "POINTS", 2000)
     monkeypatch.setattr(evaluation, "compare_photographs", lambda *_: ({}, [{}]))  # which are no lengths
-    part = datasets.Subset("part", tmp_path / "part/scene.xml", tmp_path / "truth", datasets.given(known_capture), 3)
+    part = datasets.Subset.of(tmp_path / "part", datasets.given(known_capture), 3)
     part.prepare()
-    scene = part.scene
+    part, scene = dataclasses.replace(part, truth=tmp_path / "truth"), part.scene
     radius, more, ball = 16.0, 1.5, trimesh.creation.icosphere(subdivisions=4)
     ring = FittedObject(CENTER, radius, scale=0.5, subdivisions=2)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
@@ -473,7 +473,7 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
 def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp_path):
     file, middle, radius = photographed_ball
     scene = tmp_path / "captures/ball/scene.xml"
-    dataset = single_view.SingleView("single-ball", scene, tmp_path / "none", file)
+    dataset = single_view.SingleView.of(scene.parent, file)
     dataset.prepare()
     center, size = load_capture(scene).sphere()
     assert np.linalg.norm(center - middle) < 3 and size == pytest.approx(radius, rel=0.05)
@@ -517,16 +517,16 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
         dataset.prepare()
         return dataset.scene
 
-    part = datasets.Subset.of("part", tmp_path, egg, 5)
+    part = datasets.Subset.of(tmp_path / "part", egg, 5)
     some = load_capture(made(part))
     assert [shot.name for shot in some.shots] == ["000", "003", "006", "008", "011"]
     assert part.truth == known_capture / "truth"
     torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
     before = part.scene.stat().st_ino
     assert made(part).stat().st_ino == before  # it is there already
-    more = datasets.Subset.of("part", tmp_path, egg, 6)
+    more = datasets.Subset.of(tmp_path / "part", egg, 6)
     assert len(load_capture(made(more))) == 6  # of the same name
-    wrong = datasets.PerturbedCameras.of("wrong", tmp_path, egg, 0.5, 0)
+    wrong = datasets.PerturbedCameras.of(tmp_path / "wrong", egg, 0.5, 0)
     other = load_capture(made(wrong))
     torch.testing.assert_close(other.observe([3]).rgb, whole.observe([3]).rgb)
     assert 0.4 < measures.rotation_error(egg.scene, other.path) < 1.4  # √3 · 0.5° but for chance
@@ -534,7 +534,7 @@ def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture,
     said = egg.scene.with_name("calibrated.xml")
     said.write_text(re.sub('(<sensor type="photograph"[^>]*>)', r'\1<boolean name="calibrated" value="true"/>',
                            egg.scene.read_text()))  # fmt: skip
-    wrong = datasets.PerturbedCameras.of("said", tmp_path, datasets.given(said), 0.5, 0)
+    wrong = datasets.PerturbedCameras.of(tmp_path / "said", datasets.given(said), 0.5, 0)
     assert load_capture(said).known and not load_capture(made(wrong)).known
     said.unlink()
 
@@ -553,10 +553,6 @@ class Slow(datasets.CachedDataset):
         raise InputError("there is\nnone")
 
 
-def slow(name, folder, *arguments):
-    return Slow(name, folder / name / "scene.xml", folder / name / "truth", *arguments)
-
-
 def both_tried(first, second, out):
     """What has become of two runs that are made at the same time."""
     options = ExperimentOptions(preset="fast", quick=True)
@@ -566,12 +562,12 @@ def both_tried(first, second, out):
 
 def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsys):
     events = []
-    two = [slow("cup", tmp_path, events) for _ in range(2)]
+    two = [Slow.of(tmp_path / "cup", events) for _ in range(2)]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert events == ["begun", "done"] * 2
     assert "cup, which another process makes" in capsys.readouterr().out
     barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
-    two = [slow(name, tmp_path, [], barrier.wait) for name in ("cup", "pot")]
+    two = [Slow.of(tmp_path / name, [], barrier.wait) for name in ("cup", "pot")]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert "waiting" not in capsys.readouterr().out
 
@@ -579,7 +575,7 @@ def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsy
 def test_captures_of_runs_that_are_not_wanted_are_not_made(tmp_path):
     options, events = ExperimentOptions(preset="fast", quick=True), []
     nowhere = datasets.Dataset("cup", tmp_path / "cup.xml", tmp_path / "truth")
-    for dataset in (slow("cup", tmp_path, events), nowhere, datasets.Subset.of("part", tmp_path, nowhere, 3)):
+    for dataset in (Slow.of(tmp_path / "cup", events), nowhere, datasets.Subset.of(tmp_path / "part", nowhere, 3)):
         outcome = engine.try_run(Run("a", dataset, {}), options, tmp_path / "out", wanted=False)
         assert outcome.failed == NOT_RUN and not events
 
@@ -593,7 +589,7 @@ def test_a_converted_capture_is_made_again_when_any_of_its_files_changes(tmp_pat
         (bear / name).touch()
     written = []
     monkeypatch.setattr(datasets, "write_scene", lambda source: written.append(source.scene.write_text("<scene/>")))
-    dataset = datasets.DiligentObject("bear", tmp_path / "captures/bear/scene.xml", tmp_path / "none", bear)
+    dataset = datasets.DiligentObject.of(tmp_path / "captures/bear", bear)
     for count, name in enumerate(names, 1):
         dataset.prepare()
         dataset.prepare()

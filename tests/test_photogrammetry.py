@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.grabcut import grown
+from mi_ring.capture.grabcut import disk, grown, overlap
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window
@@ -18,19 +18,24 @@ from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry import automatic_masks, bundle_adjustment, shading_trial, structure_from_motion, table_plane
 from mi_ring.photogrammetry.capture_files import (
     OBJECT,
-    UNSURE,
+    UNKNOWN,
     PosedPicture,
-    cut_mask,
-    extent_of,
-    windows,
+    crop_mask,
+    crop_windows,
+    mask_bounds,
     write_posed_picture,
 )
 from mi_ring.photogrammetry.folder import Picture, find_pictures
-from mi_ring.photogrammetry.marker_sheet import Sighting
+from mi_ring.photogrammetry.marker_sheet import SheetDetection
 from mi_ring.photogrammetry.matching import pairs_to_match
-from mi_ring.photogrammetry.object_masks import Hints, find_body
-from mi_ring.photogrammetry.reduced_photographs import View, around, camera_of, pasted, reduced, whole_of
-from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.photogrammetry.object_masks import SegmentationInput, locate_object
+from mi_ring.photogrammetry.reduced_photographs import (
+    ReducedView,
+    paste_mask,
+    reduce_photograph,
+    window_around,
+)
+from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.scene.lights import Light
 from mi_ring.scene.xml_elements import load_element
 
@@ -78,14 +83,14 @@ def hit_ellipsoid(camera):
 
 
 def view(name, pose, rgb):
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     height, width = LENS.size[::-1]
-    return View(name, rgb.reshape(height, width, 3).astype(np.uint8), np.ones((height, width), bool), camera)
+    return ReducedView(name, rgb.reshape(height, width, 3).astype(np.uint8), np.ones((height, width), bool), camera)
 
 
 def in_a_dim_room(pose, random):
     """The ellipsoid lit by a flash, a lamp in the background somewhere, noise; and its mask."""
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     t, cosine = hit_ellipsoid(camera)
     object_ = np.isfinite(t)
     shade = np.where(object_, 60 + 150 * np.clip(cosine, 0, 1), 22)[:, None] * np.array([1.0, 0.9, 0.7])
@@ -104,14 +109,14 @@ def test_masks_of_a_dim_room_with_lamps():
         rgb, mask = in_a_dim_room(pose, random)
         views.append(view(str(k), pose, rgb))
         true.append(mask)
-    guesses = [automatic_masks.bright(v) for v in views]
-    assert min(automatic_masks.overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
-    found = automatic_masks.settle(
-        automatic_masks.Space.seen_by(views), guesses, automatic_masks.nothing(views), lambda things, *_: things
+    guesses = [automatic_masks.bright_mask(v) for v in views]
+    assert min(overlap(g, t) for g, t in zip(guesses, true)) < 0.95  # the lamps
+    found = automatic_masks.refine_masks(
+        automatic_masks.VoxelGrid.seen_by(views), guesses, automatic_masks.empty_masks(views), lambda things, *_: things
     )
-    assert min(automatic_masks.overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
-    assert found.quality > 0.9
-    np.testing.assert_allclose(found.body.points.mean(0), CENTER, atol=0.15)
+    assert min(overlap(m, t) for m, t in zip(found.masks, true)) > 0.96
+    assert np.quantile(found.agreement, 0.2) > 0.9
+    np.testing.assert_allclose(found.object.points.mean(0), CENTER, atol=0.15)
 
 
 def test_a_trial_fit_covers_the_object_without_any_mask():
@@ -123,13 +128,13 @@ def test_a_trial_fit_covers_the_object_without_any_mask():
         true.append(mask)
     directions = random.normal(size=(200, 3))
     points = CENTER + AXES * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    space = automatic_masks.Space.seen_by(views)
-    assert shading_trial.sphere_of(points[:20], space.center, space.reach) is None
-    center, radius = shading_trial.sphere_of(points, space.center, space.reach)
+    grid = automatic_masks.VoxelGrid.seen_by(views)
+    assert shading_trial.initial_sphere(points[:20], grid.center, grid.half_size) is None
+    center, radius = shading_trial.initial_sphere(points, grid.center, grid.half_size)
     np.testing.assert_allclose(center, CENTER, atol=0.5)
     assert AXES.min() < radius < AXES.max()
-    covered = shading_trial.coverages(views, center, radius, lambda things, *_: things)
-    assert np.median([automatic_masks.overlap(c, t) for c, t in zip(covered, true)]) > 0.9
+    covered = shading_trial.shading_silhouettes(views, center, radius, lambda things, *_: things)
+    assert np.median([overlap(c, t) for c, t in zip(covered, true)]) > 0.9
 
 
 def test_nothing_in_common_is_no_object():
@@ -140,8 +145,11 @@ def test_nothing_in_common_is_no_object():
         x, y = random.integers(0, 150, 2)
         guess[y : y + 8, x : x + 8] = 1
     assert (
-        automatic_masks.settle(
-            automatic_masks.Space.seen_by(views), guesses, automatic_masks.nothing(views), lambda things, *_: things
+        automatic_masks.refine_masks(
+            automatic_masks.VoxelGrid.seen_by(views),
+            guesses,
+            automatic_masks.empty_masks(views),
+            lambda things, *_: things,
         )
         is None
     )
@@ -153,7 +161,7 @@ def test_a_rod_that_touches_is_unsure_and_a_lamp_apart_is_not():
     guess[20:40, 28:32] = guess[2:6, 2:6] = 1
     expected = np.zeros((40, 60), np.uint8)
     expected[20:40, 28:32] = 1
-    np.testing.assert_array_equal(automatic_masks.unsure(mask, guess), expected)
+    np.testing.assert_array_equal(automatic_masks.touching_pixels(mask, guess), expected)
 
 
 def on_a_table(pose, random, gain, bare=False):
@@ -161,7 +169,7 @@ def on_a_table(pose, random, gain, bare=False):
 
     A bare table is without it.
     """
-    camera = camera_of(LENS, pose)
+    camera = LENS.camera(pose)
     t, cosine = hit_ellipsoid(camera)
     rays = rays_of(camera)
     height = CENTER[2] - AXES[2]
@@ -187,12 +195,14 @@ def test_what_stands_on_a_table_differs_from_it():
         views.append(view(str(k), pose, rgb))
         true.append(mask)
     plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
-    space = automatic_masks.Space.seen_by(views)
-    guesses = table_plane.Table(
-        views, table_plane.Ground(plane, space.center, space.reach), lambda things, *_: things
-    ).others()
-    assert np.median([automatic_masks.overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
-    sure = table_plane.Table(views, table_plane.Ground(plane, CENTER, 5.0), lambda things, *_: things).patterns()
+    grid = automatic_masks.VoxelGrid.seen_by(views)
+    guesses = table_plane.TableAppearance(
+        views, table_plane.TexelGrid(plane, grid.center, grid.half_size), lambda things, *_: things
+    ).foreign_masks()
+    assert np.median([overlap(g, t) for g, t in zip(guesses, true)]) > 0.75
+    sure = table_plane.TableAppearance(
+        views, table_plane.TexelGrid(plane, CENTER, 5.0), lambda things, *_: things
+    ).pattern_masks()
     assert max((s & t).sum() for s, t in zip(sure, true)) < 0.01 * np.mean([t.sum() for t in true])
     assert np.mean([s.sum() for s in sure]) > 0.1 * sure[0].size
 
@@ -209,11 +219,13 @@ def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
     plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     covered = [mask.astype(np.uint8) for mask in true]
     hidden = [grown(mask, 0.1) for mask in covered]
-    grounds = table_plane.Ground(plane, CENTER, 3.0), table_plane.Ground(plane, CENTER, 8.0)
+    grounds = table_plane.TexelGrid(plane, CENTER, 3.0), table_plane.TexelGrid(plane, CENTER, 8.0)
 
     def known(pictures):
-        tables = [table_plane.Table(pictures, ground, lambda things, *_: things, hidden) for ground in grounds]
-        return tables, table_plane.bare(pictures, covered, tables, lambda things, *_: things)
+        tables = [
+            table_plane.TableAppearance(pictures, ground, lambda things, *_: things, hidden) for ground in grounds
+        ]
+        return tables, table_plane.bare_table(pictures, covered, tables, lambda things, *_: things)
 
     tables, found = known(views)
     assert np.mean([f[t].mean() for f, t in zip(found, true)]) < 0.05
@@ -235,8 +247,12 @@ def test_a_table_that_the_flash_lights_is_no_object(bare):
     random = np.random.default_rng(1)
     views = [view(str(k), pose, on_a_table(pose, random, 1.0, bare)[0]) for k, pose in enumerate(poses(20, lowest=30))]
     plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
-    body = find_body(
-        automatic_masks.Space.seen_by(views), np.zeros((0, 3)), Hints(plane), False, lambda things, *_: things
+    body = locate_object(
+        automatic_masks.VoxelGrid.seen_by(views),
+        np.zeros((0, 3)),
+        SegmentationInput(plane),
+        False,
+        lambda things, *_: things,
     )
     if bare:
         assert body is None
@@ -246,31 +262,33 @@ def test_a_table_that_the_flash_lights_is_no_object(bare):
 
 def test_a_few_voxels_are_no_object():
     views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
-    space = automatic_masks.Space.seen_by(views)
+    grid = automatic_masks.VoxelGrid.seen_by(views)
     for radius, enough in ((1.2, False), (3.0, True)):
-        near = np.linalg.norm(space.grid - space.grid[len(space.grid) // 2], axis=1)
-        space.allowed = near < radius * (space.axis[1] - space.axis[0])
-        assert (space.vote([np.ones((120, 160), np.uint8) for _ in views], automatic_masks.AGREE) is not None) == enough
+        near = np.linalg.norm(grid.points - grid.points[len(grid.points) // 2], axis=1)
+        grid.allowed = near < radius * (grid.axis[1] - grid.axis[0])
+        assert (
+            grid.vote([np.ones((120, 160), np.uint8) for _ in views], automatic_masks.MIN_AGREEMENT) is not None
+        ) == enough
 
 
 def test_a_mask_that_misses_far_more_than_others_has_no_vote():
     views = [view(str(k), pose, np.full((120, 160, 3), 20)) for k, pose in enumerate(poses(12))]
     true = [np.isfinite(hit_ellipsoid(v.camera)[0]).reshape(120, 160).astype(np.uint8) for v in views]
-    space = automatic_masks.Space.seen_by(views)
-    body = space.vote(true, 0.96)
+    grid = automatic_masks.VoxelGrid.seen_by(views)
+    body = grid.vote(true, 0.96)
     np.testing.assert_allclose(body.points.mean(0), CENTER, atol=0.1)
     wrong = [
         mask * (np.arange(160) < 80) if k == 5 else mask for k, mask in enumerate(true)
     ]  # a lamp in the other half
-    covered = [body.coverage(v) for v in views]
-    voters = automatic_masks.reliable(views, wrong, covered)
+    covered = [body.silhouette(v) for v in views]
+    voters = automatic_masks.are_complete(views, wrong, covered)
     assert voters == [k != 5 for k in range(12)]
-    assert automatic_masks.reliable(views, true, covered) == [True] * 12
-    assert space.vote(wrong, 0.96).voxels.sum() < 0.8 * body.voxels.sum()
-    assert space.vote(wrong, 0.96, voters).voxels.sum() == pytest.approx(body.voxels.sum(), rel=0.05)
+    assert automatic_masks.are_complete(views, true, covered) == [True] * 12
+    assert grid.vote(wrong, 0.96).voxels.sum() < 0.8 * body.voxels.sum()
+    assert grid.vote(wrong, 0.96, voters).voxels.sum() == pytest.approx(body.voxels.sum(), rel=0.05)
     for v, mask in zip(views, true):
-        reach = body.reach(v, body.coverage(v))
-        assert (reach >= mask)[body.coverage(v) > 0].all() and reach.sum() < 1.5 * mask.sum()
+        reach = cv2.dilate(body.silhouette(v), disk(body.voxel_pixels(v)))
+        assert (reach >= mask)[body.silhouette(v) > 0].all() and reach.sum() < 1.5 * mask.sum()
 
 
 def test_the_pattern_of_the_table_is_known_again_in_a_shadow():
@@ -280,7 +298,7 @@ def test_the_pattern_of_the_table_is_known_again_in_a_shadow():
     seen[:, 40:110] -= 2.5  # shadow
     seen[60:90, 60:100] = np.log(0.3) + random.normal(0, 0.1, (30, 40))  # something of one colour on it
     known[105:] = np.nan
-    sure = table_plane.alike(seen, known)
+    sure = table_plane.match_pattern(seen, known)
     assert sure[10:45, 55:95].mean() > 0.9
     assert sure[60:90, 60:100].mean() < 0.05
     assert not sure[100:].any()
@@ -291,7 +309,7 @@ def test_masks_that_others_contradict_are_left_open():
     coverage[10:30, 20:40] = 1
     mask = coverage.copy()
     mask[15:25, 38:50], mask[18:22, 25:30] = 1, 0  # a shadow, and a hole
-    found = automatic_masks.disputed(mask, coverage, 2.0)
+    found = automatic_masks.disputed_pixels(mask, coverage, 2.0)
     assert found[16:24, 43:50].all() and found[18:22, 25:30].all()
     assert found.sum() < 10 * 12 + 4 * 5 + 10
 
@@ -305,19 +323,19 @@ def test_a_window_about_the_object_and_back(seed):
     center, radius = random.uniform(300, 900, 2), random.uniform(150, 250)
     away = np.linalg.norm(np.stack(np.meshgrid(np.arange(1603) + 0.5, np.arange(1201) + 0.5), -1) - center, axis=-1)
     whole = cv2.resize((away < radius).astype(np.uint8)[:1200, :1600], (160, 120), interpolation=cv2.INTER_NEAREST)
-    window = around(lens, whole, 100)
+    window = window_around(lens, whole, 100)
     scale = window.scale
     assert scale in (3, 4, 5) and window.width * scale < 4 * radius
     row = window.top + scale * (np.arange(window.height) + 0.5)
     column = window.left + scale * (np.arange(window.width) + 0.5)
     inside = np.hypot(column - center[0], row[:, None] - center[1]) < radius
-    back = pasted(inside * np.uint8(OBJECT), lens, window)
+    back = paste_mask(inside * np.uint8(OBJECT), lens, window)
     assert back.shape == (1201 // scale, 1603 // scale)
-    cut = cut_mask(back, size, (100, 40, 1400, 1150)) > 127
+    cut = crop_mask(back, size, (100, 40, 1400, 1150)) > 127
     rows, columns = np.nonzero(cut)
     np.testing.assert_allclose([columns.mean() + 100.5, rows.mean() + 40.5], center, atol=0.4)
     assert cut.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
-    extent = extent_of(back, lens.size)
+    extent = mask_bounds(back, lens.size)
     np.testing.assert_allclose(extent, [center - radius, center + radius], atol=scale)
 
 
@@ -354,12 +372,12 @@ def test_how_far_matches_are_from_what_two_cameras_say():
     for camera, image in ((first, one), (second, two)):
         local = points @ image.cam_from_world().matrix()[:, :3].T + image.cam_from_world().matrix()[:, 3]
         seen.append(camera.img_from_cam(local))
-    np.testing.assert_allclose(structure_from_motion.epipolar(model, one, two, *seen), 0, atol=1e-9)
+    np.testing.assert_allclose(structure_from_motion.sampson_distance(model, one, two, *seen), 0, atol=1e-9)
     centre = one.cam_from_world().inverse().matrix()[:, 3]
     local = two.cam_from_world().matrix()[:, :3] @ centre + two.cam_from_world().matrix()[:, 3]
     toward = seen[1] - (170 * local[:2] / local[2] + [80, 60])  # lines of the second picture meet in the first's camera
     aside = toward[:, ::-1] * [1, -1] / np.linalg.norm(toward, axis=1, keepdims=True)
-    off = structure_from_motion.epipolar(model, one, two, seen[0], seen[1] + 1e-3 * aside)
+    off = structure_from_motion.sampson_distance(model, one, two, seen[0], seen[1] + 1e-3 * aside)
     # Sampson's distance shares the error out among both pictures, whose lines are about equally steep.
     np.testing.assert_allclose(off, 1e-3 / np.sqrt(2), rtol=0.35)
 
@@ -372,32 +390,29 @@ def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_
 
     for counts, best, kept in (((50, 40), "together", [0, 1]), ((40, 50), "after", [0, 1, 2])):
         together, after = model("together", [90, 80, 12]), model("after", [90, 80, 70])
-        monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_, model=together: model)
-        monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_, model=after: model)
-        found = {name: [structure_from_motion.Agreement(0, 1, n, n), structure_from_motion.Agreement(2, 1, 50, 45)]
+        monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_, model=together: {0: model})
+        monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_, model=after: {0: model})
+        found = {name: [structure_from_motion.ImagePair(0, 1, n, n), structure_from_motion.ImagePair(2, 1, 50, 45)]
                  for name, n in zip(("together", "after"), counts)}  # fmt: skip
-        monkeypatch.setattr(structure_from_motion, "agreements", lambda model, _, found=found: found[model.name])
-        taken = structure_from_motion.put_together(tmp_path, 3, None)
+        monkeypatch.setattr(structure_from_motion, "check_pairs", lambda model, _, found=found: found[model.name])
+        taken = structure_from_motion.reconstruct(tmp_path, 3, None)
         assert taken.name == best and taken.reg_image_ids() == kept
     # What hangs on matches that do not fit is left out, and what it explains within itself does not count.
     together, after = model("together", [90] * 7), model("after", [90] * 7)
-    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: together)
-    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: after)
-    whole = [structure_from_motion.Agreement(k, k + 1, 100, 80) for k in range(6)]
-    torn = [*(structure_from_motion.Agreement(k, k + 1, 100, 90) for k in range(3)),
-            structure_from_motion.Agreement(3, 4, 100, 60),
-            *(structure_from_motion.Agreement(k, k + 1, 900, 890) for k in (4, 5)),
-            structure_from_motion.Agreement(0, 6, 14, 14)]  # fmt: skip
-    assert structure_from_motion.loose([9, 8, 0, 1, 2, 3, 4, 5, 6], torn) == [
-        4,
-        5,
-        6,
-    ]  # of single ones nothing can be said
-    monkeypatch.setattr(structure_from_motion, "agreements", lambda model, _: whole if model is together else torn)
-    assert structure_from_motion.put_together(tmp_path, 7, None) is together and after.reg_image_ids() == [0, 1, 2, 3]
-    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: None)
-    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: None)
-    assert structure_from_motion.put_together(tmp_path, 3, None) is None
+    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: {0: together})
+    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: {0: after})
+    whole = [structure_from_motion.ImagePair(k, k + 1, 100, 80) for k in range(6)]
+    torn = [*(structure_from_motion.ImagePair(k, k + 1, 100, 90) for k in range(3)),
+            structure_from_motion.ImagePair(3, 4, 100, 60),
+            *(structure_from_motion.ImagePair(k, k + 1, 900, 890) for k in (4, 5)),
+            structure_from_motion.ImagePair(0, 6, 14, 14)]  # fmt: skip
+    # Of single ones nothing can be said.
+    assert structure_from_motion.disconnected_images([9, 8, 0, 1, 2, 3, 4, 5, 6], torn) == [4, 5, 6]
+    monkeypatch.setattr(structure_from_motion, "check_pairs", lambda model, _: whole if model is together else torn)
+    assert structure_from_motion.reconstruct(tmp_path, 7, None) is together and after.reg_image_ids() == [0, 1, 2, 3]
+    monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: {})
+    monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: {})
+    assert structure_from_motion.reconstruct(tmp_path, 3, None) is None
 
 
 def test_pairs_of_few_photographs_are_all_and_of_many_are_near_ones_and_some():
@@ -411,9 +426,9 @@ def test_a_motion_in_another_frame_shows_points_at_the_same_pixels():
     random = np.random.default_rng(4)
     points = CENTER + random.normal(size=(9, 3))
     cameras = {str(k): (LENS, pose) for k, pose in enumerate(poses(3))}
-    motion = Motion(cameras, points, 0.3, {})
+    motion = SparseModel(cameras, points, 0.3, {})
     turn = Rotation.from_euler("xyz", [10, 80, -40], degrees=True).as_matrix()
-    moved = structure_from_motion.moved(2.5, turn, np.array([1.0, -2, 3]))
+    moved = motion.moved(2.5, turn, np.array([1.0, -2, 3]))
     for name in cameras:
         local = (np.linalg.inv(m.cameras[name][1]) @ np.c_[m.points, np.ones(9)].T for m in (motion, moved))
         before, after = (LENS.colmap.img_from_cam(points[:3].T) for points in local)
@@ -466,11 +481,11 @@ def test_crops_are_of_one_size_hold_the_object_and_see_the_same(tmp_path):
     shots = []
     for k, pose in enumerate(poses(4, away=24.0)):
         mask = np.zeros((60, 80), np.uint8)
-        t, _ = hit_ellipsoid(camera_of(Lens("PINHOLE", (80, 60), (75, 75, 38.5, 32)), pose))
+        t, _ = hit_ellipsoid(Lens("PINHOLE", (80, 60), (75, 75, 38.5, 32)).camera(pose))
         mask.ravel()[np.isfinite(t)] = OBJECT
-        mask[:6, :8] = UNSURE
+        mask[:6, :8] = UNKNOWN
         shots.append(shot(tmp_path, str(k), lens, pose, mask))
-    cut = windows([one.mask for one in shots], [one.lens.size for one in shots])
+    cut = crop_windows([one.mask for one in shots], [one.lens.size for one in shots])
     assert len({(w.width, w.height) for w in cut}) == 1
     assert cut[0].width * cut[0].height < 0.6 * 160 * 120
     writer = Writer(tmp_path / "capture/scene.xml")
@@ -505,8 +520,8 @@ def test_a_reduced_photograph_has_a_camera_that_sees_the_same(tmp_path):
     local = np.array([0.2, -0.15, 1.0])
     column, row = lens.colmap.img_from_cam(local[None])[0]
     cv2.circle(pixels, (round((column - 0.5) * 16), round((row - 0.5) * 16)), 64, (255, 255, 255), -1, cv2.LINE_AA, 4)
-    for window, shape in ((whole_of(lens, 80), (60, 80, 3)), (Window(61, 17, 45, 38, 2), (38, 45, 3))):
-        small = reduced(picture(tmp_path / "a.png", pixels), lens, np.eye(4), window)
+    for window, shape in ((Window.whole(lens, 80), (60, 80, 3)), (Window(61, 17, 45, 38, 2), (38, 45, 3))):
+        small = reduce_photograph(picture(tmp_path / "a.png", pixels), lens, np.eye(4), window)
         assert small.rgb.shape == shape
         weight = small.rgb.sum(-1).astype(float)
         y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
@@ -549,9 +564,9 @@ def seen_by(lens, pose, points):
 @pytest.mark.parametrize(("focal", "told"), [(500.0, True), (8000.0, False)])
 def test_principal_points_are_found_where_the_lens_tells_them(focal, told):
     model, _ = model_of(np.random.default_rng(1).normal(0, 1, (300, 3)), 0.3, focal, (7, -4))
-    structure_from_motion.leave_out(model, [3])
+    structure_from_motion.deregister(model, [3])
     pictures = [SimpleNamespace(name=str(k), path=Path(f"{k}.jpg"), size=(1000, 700)) for k in range(14)]
-    (lens,) = bundle_adjustment.adjusted(model, pictures, {}, quiet).cameras.values()
+    (lens,) = bundle_adjustment.adjust(model, pictures, {}, quiet).cameras.values()
     np.testing.assert_allclose(lens.params[1:3], [507, 346] if told else [500, 350], atol=1.5 if told else 0.0)
 
 
@@ -574,8 +589,8 @@ def adjusted_by_corners(shift):
     sightings = {}
     for k, pose in poses.items():
         seen = seen_by(lens, pose, grid + np.array([k % 2 * (shift or 0), 0, 0])) + random.normal(0, 0.05, (30, 2))
-        sightings[str(k)] = Sighting(np.arange(30), 40 * grid, 2 * seen)
-    model = bundle_adjustment.adjusted(model, pictures, {} if shift is None else sightings, quiet)
+        sightings[str(k)] = SheetDetection(np.arange(30), 40 * grid, 2 * seen)
+    model = bundle_adjustment.adjust(model, pictures, {} if shift is None else sightings, quiet)
     (found,) = model.cameras.values()
     shown = [seen_by(found, model.images[k + 1].cam_from_world().matrix(), points) for k in poses]
     return np.abs(shown - np.array([seen_by(lens, pose, points) for pose in poses.values()])).mean(), model

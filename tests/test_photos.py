@@ -19,11 +19,10 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures, without_exposure
-from mi_ring.photogrammetry.object_masks import box_in, kept_masks
-from mi_ring.photogrammetry.reduced_photographs import camera_of
-from mi_ring.photogrammetry.structure_from_motion import Motion
+from mi_ring.photogrammetry.object_masks import box_mask, kept_masks
+from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
-from mi_ring.photogrammetry.workflow import cameras_beside, find_sheet, require_sides, upright
+from mi_ring.photogrammetry.workflow import find_sheet, imported_cameras, make_upright, require_parallax
 from mi_ring.system import command
 from mi_ring.system.progress import progress
 
@@ -103,9 +102,9 @@ def test_masks_that_were_painted_in(folder, tmp_path):
 
 
 def test_a_box_in_a_photograph_is_where_its_corners_are(folder):
-    camera = camera_of(LENS, next(poses(20)))
+    camera = LENS.camera(next(poses(20)))
     low, high = CENTER + np.array([[-2, -3, -1], [1, 2, 3]])
-    shown = box_in(camera, np.stack([low, high], 1).ravel())
+    shown = box_mask(camera, np.stack([low, high], 1).ravel())
     points = np.random.default_rng(0).uniform(low, high, (20_000, 3))
     pixel, _ = camera.project(points)
     column, row = pixel.astype(int).T
@@ -129,31 +128,31 @@ def test_geocentric_cameras_and_wrong_ones(folder):
     file = folder / "transforms.json"
     top = json.loads(file.read_text())
     pictures = find_pictures(folder, upright=False)
-    near = cameras_beside(pictures)
+    near = imported_cameras(pictures)
     for frame in top["frames"]:
         for row, shift in zip(frame["transform_matrix"], (4.1e6, 6.2e5, -4.8e6)):
             row[3] += shift
     file.write_text(json.dumps(top))
-    far = cameras_beside(pictures)
+    far = imported_cameras(pictures)
     for name, (_, pose) in far.cameras.items():
         np.testing.assert_allclose(pose, near.cameras[name][1], atol=1e-8)
     for frame in top["frames"]:
         frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
     file.write_text(json.dumps(top))
     with pytest.raises(InputError, match=r"00.png: camera: the last row of its pose is .*; is it transposed"):
-        cameras_beside(pictures)
+        imported_cameras(pictures)
 
 
 def test_masks_that_the_user_brings(folder, tmp_path):
     brought = tmp_path / "masks"
     brought.mkdir()
     for k, pose in enumerate(poses(20)):
-        mask = np.isfinite(hit_ellipsoid(camera_of(LENS, pose))[0]).reshape(120, 160)
+        mask = np.isfinite(hit_ellipsoid(LENS.camera(pose))[0]).reshape(120, 160)
         Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(brought / f"{k:02}.png.png")
     photos.main([str(folder), str(tmp_path / "capture"), "--masks", str(brought)])
     capture = load_capture(tmp_path / "capture/scene.xml")
     first = next(poses(20))
-    inside = np.isfinite(hit_ellipsoid(camera_of(LENS, first))[0]).sum()
+    inside = np.isfinite(hit_ellipsoid(LENS.camera(first))[0]).sum()
     assert (capture.masks[0] > 127).sum() == inside
     for file in list(brought.iterdir())[8:]:
         file.unlink()
@@ -187,18 +186,18 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
         turned = np.eye(4)
         turned[:3, :3], turned[:3, 3] = turn @ pose[:3, :3], turn @ pose[:3, 3]
         cameras[str(k)] = LENS, turned
-    motion = Motion(cameras, (turn @ CENTER)[None], None, {})
+    motion = SparseModel(cameras, (turn @ CENTER)[None], None, {})
     ups = dict.fromkeys(cameras, np.array([0.0, -1, 0]))
-    moved, none, known = upright(motion, turn @ CENTER, None, ups)
+    moved, none, known = make_upright(motion, turn @ CENTER, None, ups)
     np.testing.assert_allclose(moved.points, 0, atol=1e-9)
     heights = [pose[2, 3] for _, pose in moved.cameras.values()]
     distances = [np.linalg.norm(pose[:3, 3]) for _, pose in moved.cameras.values()]
     assert min(heights) > 0.1 and np.median(distances) == pytest.approx(1)
     assert none is None and known
     ways = {name: Rotation.from_euler("z", 150 * k, degrees=True).apply([0, -1, 0]) for k, name in enumerate(cameras)}
-    assert not upright(motion, turn @ CENTER, None, ways)[2]  # held in every way
+    assert not make_upright(motion, turn @ CENTER, None, ways)[2]  # held in every way
     low = Plane(turn[:, 2], float(turn[:, 2] @ turn @ (CENTER - [0, 0, 3])))  # 3 below the object's middle
-    exact, plane, _ = upright(motion, turn @ CENTER, low, ups)
+    exact, plane, _ = make_upright(motion, turn @ CENTER, low, ups)
     np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-9)
     assert plane.offset * 18 == pytest.approx(-3, rel=0.1)  # the cameras are 18 away, now 1
     for (_, pose), before in zip(exact.cameras.values(), poses(12)):
@@ -209,9 +208,9 @@ def test_upright_is_where_the_photographs_have_up_and_the_object_is_the_origin()
 def test_photographs_from_one_side_are_refused(degrees, enough):
     turns = Rotation.from_euler("y", np.linspace(-degrees / 2, degrees / 2, 5)[:, None], degrees=True).as_matrix()
     poses_ = [np.block([[turn, np.ones((3, 1))], [np.eye(4)[3:]]]) for turn in turns]
-    motion = Motion({str(k): (LENS, pose) for k, pose in enumerate(poses_)}, np.zeros((0, 3)), None, {})
+    motion = SparseModel({str(k): (LENS, pose) for k, pose in enumerate(poses_)}, np.zeros((0, 3)), None, {})
     with nullcontext() if enough else pytest.raises(InputError, match="folder: .* within 12 degrees; walk around"):
-        require_sides(motion, Path("folder"))
+        require_parallax(motion, Path("folder"))
 
 
 def test_a_process_that_is_ended_says_nothing():

@@ -20,7 +20,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.photogrammetry.marker_sheet import Board
+from mi_ring.photogrammetry.marker_sheet import MarkerSheet
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.scene.lights import Light
@@ -228,7 +228,7 @@ def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     write_scenes(studio, studio.photographs(30), [], exposure=7.0)
     said, true = (mi_ring.load_capture(out / name, images=False) for name in ("scene.xml", "truth/exact.xml"))
     assert said.photographs.room is None and not said.shots[0].calibrated and true.shots[0].calibrated
-    a, b = ([s.camera.to_world for s in c.sensors] for c in (said, true))
+    a, b = ([s.camera.to_world for s in c.shots] for c in (said, true))
     turns = [Rotation.from_matrix(x[:3, :3] @ y[:3, :3].T).as_rotvec(degrees=True) for x, y in zip(a, b)]
     assert 0.4 < np.std(turns) < 0.6
     distance = np.linalg.norm(np.array(b)[:, :3, 3], axis=1)
@@ -291,7 +291,7 @@ def test_the_sheet_is_printed_true_to_scale(lump, tmp_path):
         "--distance", "11", "--fov", "45", "--offset", "0.1", "0.1", "0", "--format", "png8", "--material", "diffuse",
     ])  # fmt: skip
     capture = mi_ring.load_capture(out / "scene.xml")
-    sighting = Board().detect(np.array(capture.images[0]))
+    sighting = MarkerSheet().detect(np.array(capture.images[0]))
     ground = trimesh.load(out / "truth/mesh.ply").bounds[0, 1]
     # Seen from above, y up: x of the page is z of the world, and y is x.
     world = np.stack([sighting.points[:, 1], np.full(len(sighting.points), ground), sighting.points[:, 0]], 1)

@@ -11,10 +11,9 @@ from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, write_table
-from mi_ring.photogrammetry.flash_light import Flash
+from mi_ring.photogrammetry.flash_light import FlashCalibration
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.reduced_photographs import camera_of
-from mi_ring.photogrammetry.table_plane import Ground, Plane, reflectance
+from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.assembly import split_tables
@@ -126,7 +125,7 @@ def albedo(points):
 
 
 def flash_of(falloff=0.0, room=0.0, gamma=1.0):
-    return Flash(np.zeros(3), falloff, np.full(3, room), gamma, np.ones(3), {})
+    return FlashCalibration(np.zeros(3), falloff, np.full(3, room), gamma, np.ones(3), {})
 
 
 def photographs_of_a_table(falloff=0.0, room=0.0, gamma=1.0):
@@ -137,7 +136,7 @@ def photographs_of_a_table(falloff=0.0, room=0.0, gamma=1.0):
     """
     random = np.random.default_rng(4)
     for pose in poses(14):
-        camera = camera_of(LENS, pose)
+        camera = LENS.camera(pose)
         flash = Light("point", camera.position + pose[:3, 0] * 0.8, random.uniform(100, 160, 3))
         rays = rays_of(camera)
         t = (PLANE.offset - camera.position @ UP) / (rays @ UP)
@@ -158,11 +157,11 @@ def photographs_of_a_table(falloff=0.0, room=0.0, gamma=1.0):
 def test_the_reflectance_of_a_table_is_found_under_what_stands_on_it_and_in_shadows(falloff, room, gamma):
     taken, flashes, pictures, hidden = zip(*photographs_of_a_table(falloff, room, gamma))
     views = [view(str(k), pose, srgb) for k, (pose, srgb) in enumerate(zip(taken, pictures))]
-    ground = Ground(PLANE, CENTER, 5.0, 40)
-    found = reflectance(views, flashes, hidden, ground, flash_of(falloff, room, gamma))
+    ground = TexelGrid(PLANE, CENTER, 5.0, 40)
+    found = estimate_albedo(views, flashes, hidden, ground, flash_of(falloff, room, gamma))
     near = np.linalg.norm(ground.points - CENTER, axis=1).reshape(40, 40) < 6
     assert np.median(np.abs(found - albedo(ground.points).reshape(found.shape))[near]) < 0.01
-    assert reflectance(views, flashes, [np.ones_like(mask) for mask in hidden], ground, flash_of()) is None
+    assert estimate_albedo(views, flashes, [np.ones_like(mask) for mask in hidden], ground, flash_of()) is None
 
 
 class Raw(Picture):

@@ -47,7 +47,7 @@ def test_radiance_is_interpolated_not_its_encoding():
     assert between.sum() > 10
     np.testing.assert_allclose(pixels[between, 1], expected[between], atol=0.51)
     linear = np.where(picture == dark, 0.1, 0.7).astype(np.float32)
-    np.testing.assert_allclose(undistort(linear, LENS).pixels[between, 0], (0.1 + 0.6 * share)[between], atol=1e-4)
+    np.testing.assert_allclose(undistort(linear, LENS)[0][between, 0], (0.1 + 0.6 * share)[between], atol=1e-4)
 
 
 @pytest.mark.parametrize(("kind", "saturation", "clipped"), [(np.uint8, 1.0, 255), (np.uint16, 0.9, 59000)])

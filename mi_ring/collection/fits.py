@@ -14,7 +14,6 @@ from typing import Any
 from mi_ring.collection.jobs import Job, Record, modified
 
 USER_ERROR = 2  #: exit status of a fit whose input is wrong; another try would fail, too
-OUTPUT_POLL = 0.5  #: seconds between looks at the printed output
 DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
 
 
@@ -52,39 +51,31 @@ def fit_to_the_end(
 
 
 def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = None) -> tuple[int, str]:
-    """Run a fit; its process ends with this one. Returns its exit status and the last line that it printed."""
-    with job.output.open("ab") as output:
+    """Run a fit and copy its output to `job.output`. Returns its exit status and the last line that it printed.
+
+    Its process ends with this one. `on_line` gets each line.
+    """
+    cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
+    options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    options |= {"encoding": "utf-8", "errors": "replace", **die_with_parent()}
+    last = ""
+    with job.output.open("ab", buffering=0) as output:
         output.write(b"\n$ " + " ".join(command).encode(errors="replace") + b"\n")
-        output.flush()
-        start, reported = output.tell(), 0
-        cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
-        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
-        process = subprocess.Popen(command, cwd=cwd, **streams, **die_with_parent())
-        try:
-            status = None
-            while status is None:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    status = process.wait(OUTPUT_POLL if on_line else None)
-                if on_line:
-                    lines = printed_lines(job, start, complete=status is None)
-                    for line in lines[reported:]:
-                        on_line(line)
-                    reported = len(lines)
-        finally:
-            process.kill()
-            process.wait()
+        with subprocess.Popen(command, cwd=cwd, **options) as process:
+            try:
+                for line in process.stdout or ():  # a carriage return of a progress bar ends a line, too
+                    with contextlib.suppress(OSError):  # a disk that is full for a while ends no fit
+                        output.write(line.encode())
+                    if line.strip():
+                        last = line.strip()
+                        if on_line:
+                            on_line(last)
+                status = process.wait()
+            finally:
+                process.kill()
     if status < 0:
         return status, f"was ended by {signal.Signals(-status).name}"
-    lines = printed_lines(job, start)
-    return status, re.sub(r"^mi_ring\.fit: ", "", lines[-1]) if lines else f"ended with status {status}"
-
-
-def printed_lines(job: Job, start: int, complete: bool = False) -> list[str]:
-    """Lines of a fit's output from byte `start` on. `complete`: without a last line that has no end yet."""
-    with job.output.open("rb") as output:
-        output.seek(start)
-        lines = re.split(r"[\r\n]+", output.read().decode(errors="replace"))
-    return [line.strip() for line in (lines[:-1] if complete else lines) if line.strip()]
+    return status, re.sub(r"^mi_ring\.fit: ", "", last) or f"ended with status {status}"
 
 
 def die_with_parent() -> dict[str, Any]:

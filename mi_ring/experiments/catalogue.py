@@ -61,9 +61,8 @@ def table2(options: ExperimentOptions) -> list[Run]:
                          "of DiLiGenT-MV as it is unpacked")  # fmt: skip
     runs = []
     for name in sorted({*(str(row["object"]) for row in published.TABLE2), *folders}):
-        place = options.captures / f"diligent-{name}"
         source = folders.get(name, root / f"{name}PNG")
-        dataset = DiligentObject(place.name, place / "scene.xml", place / "truth", source, fill_holes=name == "bear")
+        dataset = DiligentObject.of(options.captures / f"diligent-{name}", source, name == "bear")
         runs.append(Run(name, dataset, {"object": name}, measure=measures.in_millimetres))
     return runs
 
@@ -73,8 +72,7 @@ def table3(options: ExperimentOptions) -> list[Run]:
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:
-            name = f"{exact.name}-wrong-{seed}"
-            wrong = PerturbedCameras.of(name, options.captures, exact, POSE_ERROR, seed)
+            wrong = PerturbedCameras.of(options.captures / f"{exact.name}-wrong-{seed}", exact, POSE_ERROR, seed)
             label = {"seed": seed} if len(options.seeds) > 1 else {}
             for cameras, dataset, refine in (
                 ("exact", exact, "none"), ("wrong", wrong, "none"), ("refined", wrong, "cameras"),
@@ -116,7 +114,7 @@ def views(options: ExperimentOptions) -> list[Run]:
     for source in datasets(options):
         fewer = {count for count in (VIEWS[:1] if options.quick else VIEWS) if count < source.photographs}
         for count in sorted(fewer | {source.photographs}):
-            dataset = Subset.of(f"{source.name}-part-{count}", options.captures, source, count)
+            dataset = Subset.of(options.captures / f"{source.name}-part-{count}", source, count)
             runs.append(Run(f"{source.name}-{count}", dataset, {"capture": source.name, "views": count}))
     return runs
 
@@ -141,8 +139,7 @@ def single(options: ExperimentOptions) -> list[Run]:
                          f"get them from its authors: {DILIGENT}/single")  # fmt: skip
     runs = []
     for file in options.data:
-        place = options.captures / f"single-{file.stem}"
-        dataset = SingleView(place.name, place / "scene.xml", place / "truth", file)
+        dataset = SingleView.of(options.captures / f"single-{file.stem}", file)
         dataset.read()
         runs.append(Run(file.stem, dataset, {"object": file.stem}, measure=measures.single_view_normals))
     return runs

@@ -7,7 +7,7 @@ import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from mi_ring.system.files import locked, partial_path, read_json, whole_folder, 
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: in a checkout of the repository
 ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made from
-SCENE = "the folder of a capture with scene.xml and truth/mesh.ply, or its scene file"
+WANTED = "the folder of a capture with scene.xml and truth/mesh.ply, or its scene file"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Dataset:
 
     def prepare(self) -> None:
         """Write what is missing or outdated, one process at a time. Raises InputError if that is impossible."""
-        require_file(self.scene, SCENE)
+        require_file(self.scene, WANTED)
 
     @property
     def truth_files(self) -> list[Path]:
@@ -61,7 +61,7 @@ def given(path: Path) -> Dataset:
     The truth is in truth/ beside the scene file, or in NAME/truth/ beside NAME.xml.
     """
     scene = path / "scene.xml" if path.is_dir() else path
-    require_file(scene, SCENE)
+    require_file(scene, WANTED)
     folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
     for folder in folders:
         if (folder / "mesh.ply").is_file():
@@ -72,13 +72,20 @@ def given(path: Path) -> Dataset:
 
 def default_dataset(captures: Path) -> Dataset:
     """The dataset that needs no other data: pot2 in a checkout of the repository, else the example's pot."""
-    folder = captures / "example"
-    return given(POT2) if POT2.is_file() else ExamplePot("example", folder / "scene.xml", folder / "truth")
+    return given(POT2) if POT2.is_file() else ExamplePot.of(captures / "example")
+
+
+Cached = TypeVar("Cached", bound="CachedDataset")
 
 
 @dataclass(frozen=True)
 class CachedDataset(Dataset):
     """A dataset in a folder of its own. It is written again when what it is made from has changed."""
+
+    @classmethod
+    def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
+        """The dataset in a folder. `fields`: those of the subclass."""
+        return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
 
     def prepare(self) -> None:
         folder = self.scene.parent
@@ -158,9 +165,8 @@ class Derived(CachedDataset):
     source: Dataset
 
     @classmethod
-    def of(cls, name: str, captures: Path, source: Dataset, *fields: Any) -> "Derived":
-        """In the folder `captures` / `name`. `fields`: those of the subclass."""
-        return cls(name, captures / name / "scene.xml", source.truth, source, *fields)
+    def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
+        return cls(folder.name, folder / "scene.xml", fields[0].truth, *fields)
 
     def prepare(self) -> None:
         self.source.prepare()

@@ -8,22 +8,17 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import torch
-
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection.fits import fit_to_the_end
 from mi_ring.collection.jobs import Job, Record, modified
 from mi_ring.errors import InputError
 from mi_ring.experiments.experiment import NOT_RUN, Experiment, ExperimentOptions, Outcome, Row, Run
-from mi_ring.experiments.measures import COURSE, POINTS, evaluated
+from mi_ring.experiments.measures import COURSE, POINTS, evaluated, surface_errors
 from mi_ring.experiments.tables import csv_text, headings, markdown, table_of
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.light_selection import choose_lighting
 from mi_ring.metrics.evaluation import rounded
-from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.system.command import interrupted, one_line
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
@@ -109,16 +104,11 @@ def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
     """Fit in this process. Writes the errors of normals and depth at `POINTS` times during the fit."""
-    mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     rows: list[Row] = []
 
     def measure(it: Iteration) -> None:
         if it.number * POINTS // fit.iterations > len(rows):
-            s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
-            with torch.no_grad():
-                vertices = fit.ring.surface(s.to(fit.problem.device)).cpu().numpy()
-            diagonal = float(np.linalg.norm(mesh.extents))
-            numbers, _ = compare_surfaces(fit.capture, scene_of(vertices, faces), truth, diagonal)
+            _, numbers = surface_errors(run, fit.capture, fit.ring, *fit.ring.domain.sample(fit.ring.subdivisions))
             rows.append({"iteration": it.number, "seconds": fit.course.seconds, **numbers})
 
     with threads_of(options.threads):

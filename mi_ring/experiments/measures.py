@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.experiments.brdf_slices import brdf_slices, bsdf_of, is_second_material
 from mi_ring.experiments.datasets import PerturbedCameras, Synthetic
@@ -15,6 +17,7 @@ from mi_ring.experiments.single_view import TO_MITSUBA, SingleView
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
 from mi_ring.metrics.evaluation import evaluate_fit
 from mi_ring.metrics.surfaces import compare_surfaces, hits, load_true_mesh
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.results import read_log
 from mi_ring.scene.plain_mesh import scene_of
@@ -49,10 +52,19 @@ def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
     return 100 * float(np.mean(count(vertices, faces)))
 
 
+def surface_errors(
+    run: Run, capture: Capture, ring: FittedObject, s: Tensor, faces: np.ndarray
+) -> tuple[np.ndarray, Row]:
+    """Vertices (V, 3) of an object, sampled at points `s` (V, 3) of its domain, and the errors of this surface."""
+    mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
+    with torch.no_grad():
+        vertices = ring.surface(s.to(ring.center.device)).cpu().numpy()
+    return vertices, compare_surfaces(capture, scene_of(vertices, faces), truth, mesh.scale)[0]
+
+
 def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
     """As `evaluated`, only of what photographs show; and depth and Chamfer distance in scene units, which are mm."""
-    mesh, _ = load_true_mesh(run.dataset.truth / "mesh.ply")
-    percent = float(np.linalg.norm(mesh.extents)) / 100
+    percent = load_true_mesh(run.dataset.truth / "mesh.ply")[0].scale / 100
     (row,) = evaluated(run, folder, options, seen=True)
     return [row | {"depth_mm": row["depth_mean"] * percent, "chamfer_mm": row["chamfer"] * percent}]
 
@@ -74,13 +86,10 @@ def rotation_error(a: Path, b: Path) -> float:
 def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
     """A row for each of the `LEVELS` at which one fit is sampled."""
     ring, capture = load_fit(folder), load_capture(run.dataset.scene, images=False)
-    mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     rows = []
     for level in LEVELS:
         s, faces = ring.domain.sample(level)
-        with torch.no_grad():
-            vertices = ring.surface(s).numpy()
-        numbers, _ = compare_surfaces(capture, scene_of(vertices, faces), truth, float(np.linalg.norm(mesh.extents)))
+        vertices, numbers = surface_errors(run, capture, ring, s, faces)
         flaws = {"inside_out": 100 * float(inside_out(ring, s, faces).mean()), "crossing": crossing(vertices, faces)}
         rows.append({"level": level, "vertices": len(vertices), **numbers, **flaws})
     return rows

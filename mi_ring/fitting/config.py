@@ -245,7 +245,7 @@ class Config(Ablation, Tuning, Common):
                 raise InputError(f"{path}: {name}: is no setting of mi_ring {__version__}; remove it")
             try:
                 settings[name] = of_type(kinds[name], value)
-            except ValueError:
+            except (ValueError, OverflowError):  # a whole number beyond what a float can be
                 raise InputError(f"{path}: {name}: is {reprlib.repr(value)}, which this setting cannot be; see "
                                  "mi-ring fit --help-all") from None  # fmt: skip
         try:

@@ -1,4 +1,4 @@
-"""Cameras of other tools: lenses in COLMAP's terms, and poses."""
+"""Camera models of other tools: lenses as COLMAP describes them, and poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,60 +9,69 @@ import numpy as np
 import scipy.linalg
 
 from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
 from mi_ring.system.optional import need
 
-LARGEST = 10**6  #: side of a photograph [px]
+MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: from Mitsuba's camera axes (x left, y up, z forward) to OpenCV's
+MAX_SIDE = 10**6  #: of a photograph [px]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera without its pose, one of COLMAP's models: https://colmap.github.io/cameras.html"""
+    """A camera without its pose, as one of COLMAP's models: https://colmap.github.io/cameras.html"""
 
     model: str  #: COLMAP's name
     size: tuple[int, int]  #: (width, height) [px]
     params: tuple[float, ...]  #: in COLMAP's order
 
     def __post_init__(self) -> None:
-        if self.model == "EQUIRECTANGULAR":  # pycolmap crashes when it is asked for its focal length
+        if self.model == "EQUIRECTANGULAR":  # pycolmap crashes when asked for its focal length
             raise InputError("camera: is a panorama, EQUIRECTANGULAR; leave such photographs out")
-        if not all(1 <= side <= LARGEST for side in self.size):
+        if not all(1 <= side <= MAX_SIDE for side in self.size):
             raise InputError("camera: is for photographs of {:g} x {:g} pixels; must be 1 to {}".format(
-                *np.clip(self.size, -1e9, 1e9), LARGEST))  # fmt: skip
+                *np.clip(self.size, -1e9, 1e9), MAX_SIDE))  # fmt: skip
         object.__setattr__(self, "size", tuple(map(int, self.size)))
         object.__setattr__(self, "params", tuple(map(float, self.params)))
 
     @cached_property
     def colmap(self) -> Any:
-        """As a `pycolmap.Camera`, which knows the models. Raises InputError where pycolmap is not installed."""
+        """The lens as a `pycolmap.Camera`. Raises InputError if pycolmap is not installed."""
         pycolmap = need("pycolmap", f"camera model {self.model}")
         return pycolmap.Camera(model=self.model, width=self.size[0], height=self.size[1], params=list(self.params))
 
     @property
     def focal(self) -> tuple[float, float]:
-        """[px]"""
+        """Focal lengths (fx, fy) [px]."""
         if self.model == "PINHOLE":
             return self.params[0], self.params[1]
         return self.colmap.focal_length_x, self.colmap.focal_length_y
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Principal point [px]; the first pixel's centre is (0.5, 0.5)."""
+        """Principal point (cx, cy) [px]; the first pixel's centre is (0.5, 0.5)."""
         if self.model == "PINHOLE":
             return self.params[2], self.params[3]
         return self.colmap.principal_point_x, self.colmap.principal_point_y
 
     @property
     def is_pinhole(self) -> bool:
-        """Without distortion? Asked of its corners, for a fisheye without coefficients is none."""
+        """Has the lens no distortion? Tested with rays: a fisheye without coefficients is no pinhole."""
         if self.model == "PINHOLE":
             return True
         rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
-        straight = rays[:, :2] * self.focal + self.centre
-        return np.allclose(self.colmap.img_from_cam(rays), straight, atol=1e-6)
+        return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
+
+    def camera(self, pose: np.ndarray) -> Camera:
+        """The camera of the undistorted photograph; `pose` (4, 4) camera-to-world, OpenCV's axes."""
+        return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
 def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
-    """Of a calibration matrix; `shift` [px] is what its principal point lacks to have pixels' centres at 0.5."""
+    """The lens of a calibration matrix (3, 3).
+
+    `shift` [px] is added to the principal point: 0.5 if the tool puts the first pixel's centre at 0. Raises InputError,
+    about `what`, for a matrix with skew.
+    """
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
     K = K / K[2, 2]
@@ -73,26 +82,29 @@ def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what:
 
 
 def brown(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
-    """Of `intrinsics` fx, fy, cx, cy [px] and OpenCV's distortion: radial k1, k2, k3, tangential p1, p2."""
+    """A lens with OpenCV's distortion: radial k1, k2, k3 and tangential p1, p2; `intrinsics`: fx, fy, cx, cy [px]."""
     if not any((*k, *p)):
         return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))
     return Lens("FULL_OPENCV", (size[0], size[1]), (*intrinsics, *k[:2], *p, k[2], 0, 0, 0))
 
 
-def inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Camera-to-world (4, 4) of world-to-camera x ↦ R x + t."""
+def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a camera whose world-to-camera map is x ↦ R x + t."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
     return pose
 
 
-def decompose(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Calibration matrix (3, 3) and camera-to-world (4, 4) of a projection matrix K [R | t], up to scale (3, 4)."""
+def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Calibration matrix (3, 3) and camera-to-world pose (4, 4) of a projection matrix K [R | t] (3, 4) of any scale.
+
+    Raises InputError, about `what`, if the matrix is singular.
+    """
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])
     signs = np.sign(np.diag(K))
     K, R = K * signs, signs[:, None] * R
-    if np.linalg.det(R) < 0:  # P stands for -P as well
+    if np.linalg.det(R) < 0:  # P and -P are the same projection
         R, P = -R, -P
-    return K, inverse(R, np.linalg.solve(K, P[:, 3]))
+    return K, camera_to_world(R, np.linalg.solve(K, P[:, 3]))

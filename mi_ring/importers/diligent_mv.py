@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import inverse, pinhole
+from mi_ring.importers.camera_models import camera_to_world, pinhole
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
 from mi_ring.importers.reading import chosen, entry, existing, image_size, load_mat, load_table
 
@@ -26,18 +26,18 @@ class DiligentMV(Source):
     Use it for the bear, whose masks have wrong holes. Those of pot2 and cow are real."""
 
     def frames(self) -> Iterator[Frame]:
-        calibration = load_mat(self.src / "Calib_Results.mat")
+        file = self.src / "Calib_Results.mat"
+        calibration = load_mat(file)
         numbers = {int(f.name[5:]): f for f in self.src.glob("view_*") if f.name[5:].isdigit()}
         if not numbers:
             raise InputError(f"{self.src}: SRC: no folders view_01, view_02, …; give the folder of one object")
-        K = entry(calibration, "KK", (3, 3), self.src / "Calib_Results.mat")
+        K = entry(calibration, "KK", (3, 3), file)
         for view in chosen(self.views, numbers, "--views", self.src):
             folder = numbers[view]
-            R = entry(calibration, f"Rc_{view}", (3, 3), self.src / "Calib_Results.mat")
-            t = entry(calibration, f"Tc_{view}", (3, 1), self.src / "Calib_Results.mat")
-            pose = inverse(R, t[:, 0])
+            t = entry(calibration, f"Tc_{view}", (3, 1), file)
+            pose = camera_to_world(entry(calibration, f"Rc_{view}", (3, 3), file), t[:, 0])
             mask = existing(folder / "mask.png", "mask")
-            camera = pinhole(K, image_size(mask), 0.5, f"{self.src / 'Calib_Results.mat'}: KK")
+            camera = pinhole(K, image_size(mask), 0.5, f"{file}: KK")
             directions = load_table(folder / "light_directions.txt", 3)
             intensities = load_table(folder / "light_intensities.txt", 3)
             if len(directions) != len(intensities):
@@ -53,6 +53,6 @@ class DiligentMV(Source):
 
     @property
     def truth(self) -> Path | None:
-        """The true mesh, where there is one."""
+        """File of the true mesh; None if there is none."""
         mesh = self.src / "mesh_Gt.ply"
         return mesh if mesh.is_file() else None

@@ -1,6 +1,8 @@
-"""The table of all formats, by the names that `mi_ring.convert` knows them by."""
+"""The table of all formats, by their names in `mi_ring.convert`."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mi_ring.errors import InputError
 from mi_ring.importers.colmap import Colmap
@@ -8,11 +10,11 @@ from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.importers.frames import Source
 from mi_ring.importers.iron import Iron
 from mi_ring.importers.llff import Llff
-from mi_ring.importers.metashape import Metashape, chunk_of
+from mi_ring.importers.metashape import Metashape, find_chunk
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
-from mi_ring.importers.reading import load_json, load_xml, pictures
-from mi_ring.importers.realitycapture import POSE, RealityCapture, table, xmp_fields
+from mi_ring.importers.reading import list_images, load_json, load_xml
+from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, xmp_fields
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
 
@@ -24,72 +26,49 @@ FORMATS = {
 
 
 def detect(folder: Path) -> Source | None:
-    """The importer of the cameras that lie in a folder of photographs or else in the folder above it, if there are any.
+    """The importer of the cameras in a folder of photographs, or else in the folder above it; None without cameras.
 
-    Of several the first counts: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's XML,
+    The first match counts: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's XML,
     RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, then cameras.sfm, sfm.json,
-    sfm_data.json and other `*.sfm` with poses; of several files of one kind the first by name. Photographs are those of
-    `folder` if it has any, but transforms.json names its own. The importer's `scene` is no file yet.
+    sfm_data.json and other `*.sfm` with poses. Files of one kind are tried by name. The photographs are those in
+    `folder` if there are any; transforms.json names its own. The importer's `scene` does not exist yet.
     """
-    images = folder if pictures(folder) else None
+    images = folder if list_images(folder) else None
     places = (folder, folder.absolute().parent)
-    return next((source for place in places if (source := found_in(place, images))), None)
+    return next((source for place in places if (source := detect_in(place, images))), None)
 
 
-def found_in(place: Path, images: Path | None) -> Source | None:
-    """As `detect`, of cameras in one place."""
-    scene = place / "scene.xml"
-    if Colmap.model(place):
-        return Colmap(place, scene, images=images)
-    if (place / "transforms.json").is_file():
-        return Transforms(place / "transforms.json", scene)
-    for path in sorted(place.glob("*.xml")):
-        if is_metashape(path):
-            return Metashape(path, scene, images=images)
-    if any(map(has_pose, sorted(place.glob("*.xmp")))):
-        return RealityCapture(place, scene, images=images)
-    for path in sorted(place.glob("*.csv")):
-        if is_table(path):
-            return RealityCapture(path, scene, images=images)
-    if (place / "poses_bounds.npy").is_file():
-        return Llff(place, scene, images=images)
-    for path in sorted(place.glob("*_par.txt")):
-        return Middlebury(path, scene, images=images)
-    first = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
-    for path in (*first, *sorted(place.glob("*.sfm"))):
-        if has_poses(path):
-            return SfmData(path, scene, images=images)
+def detect_in(place: Path, images: Path | None) -> Source | None:
+    """As `detect`, for the cameras in one folder `place` and photographs in the folder `images`."""
+    scenes = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
+
+    def has_pose(path: Path) -> bool:
+        return "Rotation" in xmp_fields(load_xml(path))
+
+    def has_poses(path: Path) -> bool:
+        return isinstance(top := load_json(path), dict) and bool(top.get("poses") or top.get("extrinsics"))
+
+    candidates: list[tuple[type[Source], list[Path], Callable[[Path], Any]]] = [
+        (Colmap, [place], Colmap.model),
+        (Transforms, [place / "transforms.json"], Path.is_file),
+        (Metashape, sorted(place.glob("*.xml")), lambda path: find_chunk(load_xml(path)) is not None),
+        (RealityCapture, [place], lambda path: any(accepts(has_pose, file) for file in path.glob("*.xmp"))),
+        (RealityCapture, sorted(place.glob("*.csv")), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
+        (Llff, [place], lambda path: (path / "poses_bounds.npy").is_file()),
+        (Middlebury, sorted(place.glob("*_par.txt")), Path.exists),
+        (SfmData, [*scenes, *sorted(place.glob("*.sfm"))], has_poses),
+    ]
+    for importer, paths, check in candidates:
+        for path in paths:
+            if accepts(check, path):
+                options: dict[str, Any] = {} if importer is Transforms else {"images": images}
+                return importer(path, place / "scene.xml", **options)
     return None
 
 
-def is_metashape(path: Path) -> bool:
-    """Is an XML file one of Metashape's?"""
+def accepts(check: Callable[[Path], Any], path: Path) -> bool:
+    """Does a file pass a check? Not if reading it raises InputError."""
     try:
-        return chunk_of(load_xml(path)) is not None
+        return bool(check(path))
     except InputError:
         return False
-
-
-def has_pose(path: Path) -> bool:
-    """Is an XMP file a sidecar of RealityCapture's with a pose?"""
-    try:
-        return "Rotation" in xmp_fields(load_xml(path))
-    except InputError:
-        return False
-
-
-def is_table(path: Path) -> bool:
-    """Is a CSV file RealityCapture's table of cameras?"""
-    try:
-        return {"name", *POSE, "f"} <= {*table(path)[0]}
-    except InputError:
-        return False
-
-
-def has_poses(path: Path) -> bool:
-    """Is a JSON file a scene of Meshroom's or OpenMVG's with poses?"""
-    try:
-        top = load_json(path)
-    except InputError:
-        return False
-    return isinstance(top, dict) and bool(top.get("poses") or top.get("extrinsics"))

@@ -1,4 +1,4 @@
-"""What importers make: frames, each a photograph with its camera and light. One file a format beside this one."""
+"""Frames, the output of all importers: a photograph with its camera and light each."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,8 +18,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 
-MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: axes of a Mitsuba camera, x left, y up, z forward, in OpenCV's
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes of an OpenGL camera, x right, y up, z back, in OpenCV's
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right, y up, z back) to OpenCV's
 
 
 @dataclass
@@ -27,39 +26,32 @@ class Frame:
     """A photograph, its camera and its light."""
 
     image: Path
-    lens: Lens  #: size, focal lengths, principal point, distortion [px]
+    lens: Lens
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
-    mask: Path | None = None  #: of the same size; `image` itself if its alpha channel is meant
+    mask: Path | None = None  #: of the photograph's size; equal to `image` if the alpha channel is the mask
     light: Light | None = None  #: None: a point light of intensity 1 at the camera
     saturation: float = 1.0  #: encoded value from which pixels are clipped (1 = full scale)
     encoding: Encoding = "auto"
-    name: str = ""  #: in the scene; that of the file, without suffix, if empty
-    pixels: np.ndarray | None = None  #: of an image that is no file yet, (H, W, 3) float32
+    name: str = ""  #: in the scene; empty: the file's name without suffix
+    pixels: np.ndarray | None = None  #: (H, W, 3) float32, of an image that is not in a file of its own
     fill_mask: bool = False  #: fill the holes in the mask
 
     @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]"""
-        return self.lens.size
-
-    @property
     def camera(self) -> Camera:
-        """The camera that takes it once lens distortion is undone."""
-        return Camera(self.pose @ MITSUBA, np.array(self.lens.focal), np.array(self.lens.centre), self.lens.size)
+        """The camera of the undistorted photograph."""
+        return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """A point light beside this frame's camera, `offset` in the camera's axes [scene units]."""
+        """A point light of intensity `rgb`, `offset` from the camera in the camera's axes [scene units]."""
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
-def called(name: str, files: Sequence[Path]) -> Path | None:
-    """The photograph of this name, whatever its folder, its suffix and that of the name are; None if there is none."""
+def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
+    """The file of this name, whatever the folders and the suffixes of both are; None if there is none."""
     name = PureWindowsPath(name).name
     stem = PureWindowsPath(name).stem
-    for file in sorted(files, key=lambda file: (file.name != name, file.stem != name)):
-        if file.name == name or file.stem in (name, stem):
-            return file
-    return None
+    found = [file for file in files if file.name == name or file.stem in (name, stem)]
+    return min(found, key=lambda file: (file.name != name, file.stem != name), default=None)
 
 
 @dataclass(frozen=True)
@@ -80,17 +72,17 @@ class Source:
     """The photographs to take; cameras of others are left out. Without it each camera must have its photograph."""
 
     def frames(self) -> Iterator[Frame]:
-        """The photographs that have a pose. Raises InputError for what is no data of the format."""
+        """The photographs that have a pose. Raises InputError for invalid data."""
         raise NotImplementedError
 
     @cached_property
-    def left_out(self) -> set[str]:
-        """Names of the photographs that have no pose, complete once all `frames` were taken."""
+    def without_pose(self) -> set[str]:
+        """Names of the photographs without a pose; complete after all `frames` were read."""
         return set()
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """All frames of a source. Raises InputError, whatever files of strangers do to those who read them."""
+    """All frames of a source. Raises InputError for every failure of its reader."""
     try:
         return list(source.frames())
     except InputError:
@@ -101,18 +93,19 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError for invalid cameras, lights and names, and for files of another size than their camera's."""
+    """As `require_cameras`; also raise InputError if there are no frames or a file's size is not that of its camera."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)
     for frame in frames:
         for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
-            if file and (size := image_size(file)) != frame.size:
-                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *size, *frame.size))
+            if file and (size := image_size(file)) != frame.lens.size:
+                sizes = *size, *frame.lens.size
+                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *sizes))
 
 
 def require_cameras(frames: Sequence[Frame]) -> None:
-    """Raise InputError for invalid cameras, lights and names."""
+    """Raise InputError for invalid poses, lenses, lights and file names."""
     for frame in frames:
         what = f"{frame.image}: camera"
         command.require_utf8(str(frame.image))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from mi_ring.foreign import load_npy
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import existing, image_size, matrix, pictures
+from mi_ring.importers.reading import existing, image_size, list_images, matrix
 
 
 @dataclass(frozen=True)
@@ -27,25 +26,20 @@ class Llff(Photogrammetry):
         if array.ndim != 2 or array.shape[1] != 17:
             raise InputError(f"{path}: is of shape {array.shape}; must be N x 17 numbers")
         poses = matrix(array, array.shape, str(path))[:, :15].reshape(-1, 3, 5)
-        folders = [self.src / "images", *sorted(self.src.glob("images_*"), key=by_number), self.src]
-        folder = self.images or next((f for f in folders if pictures(f)), folders[0])
-        images = pictures(folder)
+        reduced = sorted(self.src.glob("images_*"), key=lambda f: (len(f.name), f.name))  # images_4 before images_16
+        folders = [self.src / "images", *reduced, self.src]
+        folder = self.images or next((f for f in folders if list_images(f)), folders[0])
+        images = list_images(folder)
         if len(images) != len(poses):
             raise InputError(f"{folder}: has {len(images)} photographs, {path.name} {len(poses)} poses; must be as "
                              "many, or give --images")  # fmt: skip
         for k, (image, own) in enumerate(zip(images, poses)):
             pose = np.eye(4)
-            pose[:3] = own[:, [1, 0, 2, 3]] * [1, 1, -1, 1]  # axes down, right, back
+            pose[:3] = own[:, [1, 0, 2, 3]] * [1, 1, -1, 1]  # LLFF's axes are down, right, back
             height, width, focal = own[:, 4]
             size = image_size(image)
-            if min(own[:, 4]) <= 0 or abs(size[0] / width * height - size[1]) > 2:  # smaller ones are rounded
+            if min(own[:, 4]) <= 0 or abs(size[0] / width * height - size[1]) > 2:  # reduced sizes are rounded
                 raise InputError(f"{image}: is {size[0]} x {size[1]} pixels, which is no scale of the {width:g} x "
                                  f"{height:g} of pose {k} in {path.name}")  # fmt: skip
-            centre = (size[0] / 2, size[1] / 2)
-            focals = (focal * size[0] / width, focal * size[1] / height)
-            yield image.name, Frame(image, Lens("PINHOLE", size, (*focals, *centre)), pose)
-
-
-def by_number(folder: Path) -> tuple[int, str]:
-    """Sorts images_4 before images_16."""
-    return len(folder.name), folder.name
+            params = (focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
+            yield image.name, Frame(image, Lens("PINHOLE", size, params), pose)

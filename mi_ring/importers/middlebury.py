@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import inverse, pinhole
+from mi_ring.importers.camera_models import camera_to_world, pinhole
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, load_lines, matrix
@@ -30,6 +30,6 @@ class Middlebury(Photogrammetry):
             what = f"{path}: {name}"
             values = matrix(numbers, (21,), f"{what}: K, R, t")
             K, R, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
-            if (image := self.photograph(name, what)) is None:
-                continue
-            yield image.name, Frame(image, pinhole(K, image_size(image), 0.5, what), inverse(R, t))  # OpenCV's pixels
+            if image := self.photograph(name, what):
+                lens = pinhole(K, image_size(image), 0.5, what)  # pixels as in OpenCV
+                yield image.name, Frame(image, lens, camera_to_world(R, t))

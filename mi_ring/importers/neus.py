@@ -8,9 +8,9 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import load_npy, load_npz
-from mi_ring.importers.camera_models import decompose, pinhole
+from mi_ring.importers.camera_models import decompose_projection, pinhole
 from mi_ring.importers.frames import Frame, Source
-from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered
+from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered_images
 
 
 @dataclass(frozen=True)
@@ -24,28 +24,27 @@ class Neus(Source):
         path = first_file([self.src / "cameras_sphere.npz", self.src / "cameras.npz"], "SRC")
         cameras = load_npz(path)
         numbers = sorted(int(key[10:]) for key in cameras if re.fullmatch(r"world_mat_\d+", key))
-        pictures, array = numbered(self.src / "image"), self.src / "images.npy"
+        images, array = numbered_images(self.src / "image"), self.src / "images.npy"
         if array.is_file():
             stack = load_npy(array)
             if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers) or stack.dtype.kind not in "fiu":
                 raise InputError(f"{array}: is of shape {stack.shape}, must be ({len(numbers)}, H, W, 3) numbers: "
                                  f"one photograph for each world_mat in {path.name}")  # fmt: skip
-            pictures = dict.fromkeys(numbers, array)
-        elif not pictures:
+            images = dict.fromkeys(numbers, array)
+        elif not images:
             raise InputError(f"{self.src}: image: no photographs in this folder, and no images.npy")
-        masks = numbered(self.src / "mask")
+        masks = numbered_images(self.src / "mask")
         energies = any(key.startswith("light_energy_") for key in cameras)
-        if not set(pictures) <= set(numbers):  # names that are no numbers of cameras: by their order
-            if len(pictures) != len(numbers):
-                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(pictures)} photographs")
-            pictures, masks = (dict(zip(numbers, [files[n] for n in sorted(files)])) for files in (pictures, masks))
-        for k, image in pictures.items():
+        if not set(images) <= set(numbers):  # the names are not the cameras' numbers: match them by order
+            if len(images) != len(numbers):
+                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(images)} photographs")
+            images, masks = (dict(zip(numbers, [files[n] for n in sorted(files)])) for files in (images, masks))
+        for k, image in images.items():
             pixels = stack[numbers.index(k)].astype(np.float32) if image == array else None
             size = image_size(image) if pixels is None else pixels.shape[1::-1]
-            projection = entry(cameras, f"world_mat_{k}", (4, 4), path)
-            K, pose = decompose(projection[:3], f"{path}: world_mat_{k}")
-            camera = pinhole(K, size, 0.5, f"{path}: world_mat_{k}")
-            frame = Frame(image, camera, pose, masks.get(k), name=f"{k:03}", pixels=pixels)
+            what = f"{path}: world_mat_{k}"
+            K, pose = decompose_projection(entry(cameras, f"world_mat_{k}", (4, 4), path)[:3], what)
+            frame = Frame(image, pinhole(K, size, 0.5, what), pose, masks.get(k), name=f"{k:03}", pixels=pixels)
             if masks and not frame.mask:
                 raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
             if energies:
@@ -53,7 +52,7 @@ class Neus(Source):
                 energy = matrix(np.repeat(energy, 3) if len(energy) == 1 else energy, (3,), f"{path}: light_energy_{k}")
                 if not energy.any():
                     continue
-                unit = entry(cameras, f"scale_mat_{k}", (4, 4), path)[0, 0]  # energies are for the object's unit sphere
+                unit = entry(cameras, f"scale_mat_{k}", (4, 4), path)[0, 0]  # energies refer to the unit sphere
                 frame.light = frame.at_camera(energy * unit**2)
                 frame.encoding = "linear"
                 if "max_intensity" in cameras:

@@ -1,4 +1,4 @@
-"""What formats of photogrammetry have in common: ordinary photographs, taken with a light beside the camera."""
+"""What photogrammetry formats have in common: ordinary photographs, taken with a light beside the camera."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -11,16 +11,17 @@ import numpy as np
 from PIL import ExifTags
 
 from mi_ring.errors import InputError
+from mi_ring.foreign import reading
 from mi_ring.images import open_image
-from mi_ring.importers.frames import Frame, Source, called
-from mi_ring.importers.reading import SUFFIXES, first_file, pictures, read_as
+from mi_ring.importers.frames import Frame, Source, find_by_name
+from mi_ring.importers.reading import SUFFIXES, existing, first_file, list_images
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
 
 
 @dataclass(frozen=True)
 class Photogrammetry(Source):
-    """Photographs with poses from photogrammetry; formats say where from in `posed`."""
+    """Photographs with poses from photogrammetry. Each format implements `posed`."""
 
     images: Path | None = None
     """Folder of the photographs. Without it: the nearest `images` beside or above SRC, else the folder of SRC."""
@@ -32,29 +33,29 @@ class Photogrammetry(Source):
     """Bring the photographs to one brightness by exposure time, ISO and aperture of their EXIF data."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
-        """Photographs that have a pose, each with its name, by which its mask is called."""
+        """The photographs that have a pose, each with the name that its mask is named after."""
         raise NotImplementedError
 
     @property
     def folder(self) -> Path:
-        """Of the photographs, unless the format knows better."""
+        """Folder of the photographs, unless the format has a rule of its own."""
         own = self.src if self.src.is_dir() else self.src.parent
-        beside = (own / "images", own.parent / "images")
-        return self.images or next((folder for folder in beside if folder.is_dir()), own)
+        candidates = (own / "images", own.parent / "images")
+        return self.images or next((folder for folder in candidates if folder.is_dir()), own)
 
     @cached_property
-    def pictures(self) -> list[Path]:
-        """The image files of `folder`."""
-        return pictures(self.folder)
+    def image_files(self) -> list[Path]:
+        """The image files in `folder`."""
+        return list_images(self.folder)
 
     def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, whatever its suffix and that of the name are; None if it is not meant.
+        """The photograph of this name, with any suffix; None if it is not among the wanted `photographs`.
 
-        Raises InputError if `folder` has none.
+        Raises InputError, about `what`, if `folder` has no such file.
         """
         if self.photographs is not None:
-            return called(name, self.photographs)
-        if file := called(name, self.pictures):
+            return find_by_name(name, self.photographs)
+        if file := find_by_name(name, self.image_files):
             return file
         name = PureWindowsPath(name).name[:99]
         raise InputError(f"{what}: no photograph {name!r} with any of {' '.join(SUFFIXES)} in {self.folder}; give "
@@ -67,26 +68,27 @@ class Photogrammetry(Source):
                 names = (f"{name}.png", str(Path(name).with_suffix(".png")))
                 frame.mask = first_file([self.masks / n for n in names], "mask")
             frames.append(frame)
-        exposures = [exif_exposure(frame.image) for frame in frames] if self.exif else []
-        known = np.array([exposure for exposure in exposures if exposure is not None])
-        scale = np.ones(len(frames))
-        if len(known) and len(known) == len(frames):
-            scale = known / np.median(known)
-        elif len(known):
+        exposures = [exif_exposure(frame.image) if self.exif else None for frame in frames]
+        known = [exposure for exposure in exposures if exposure is not None]
+        if known and len(known) < len(frames):
             k = exposures.index(None)
             raise InputError(f"{frames[k].image}: EXIF: no exposure time, ISO or aperture, but other photographs have "
                              "them; add them, or give --no-exif if all have the same exposure")  # fmt: skip
-        for frame, exposure in zip(frames, scale):
+        for frame, exposure in zip(frames, np.divide(known, np.median(known)) if known else np.ones(len(frames))):
             if exposure != 1 or any(self.flash_offset):
                 frame.light = frame.at_camera(np.full(3, exposure), self.flash_offset)
             yield frame
 
 
 def exif_exposure(path: Path) -> float | None:
-    """Exposure time · ISO / aperture², to which radiance as recorded is proportional; None if EXIF lacks one."""
+    """Exposure time · ISO / aperture², to which recorded radiance is proportional; None if EXIF data lack one of them.
+
+    Raises InputError if the file cannot be read or a value is not a positive number.
+    """
     if path.suffix.lower() == ".exr":
         return None
-    exif = read_as(path, "image", read_exif)
+    with reading(path, "image"), open_image(existing(path, "image")) as image:
+        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
     exposure = exposure_of(exif)
     if exposure is not None and not 0 < exposure < math.inf:
         values = ", ".join(str(exif[tag]) for tag in EXPOSURE)
@@ -96,7 +98,7 @@ def exif_exposure(path: Path) -> float | None:
 
 
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """The same of the part of EXIF data that is about it; None if there is nothing, NaN if it is no number."""
+    """As `exif_exposure`, from the Exif part of the data; None if a value is missing, NaN if one is no number."""
     values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
     if not all(values):
         return None
@@ -105,9 +107,3 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
         return seconds * iso / f_number**2
     except (TypeError, ValueError, ArithmeticError):
         return math.nan
-
-
-def read_exif(path: Path) -> dict[int, Any]:
-    """The part of the EXIF data that is about the exposure."""
-    with open_image(path) as image:
-        return image.getexif().get_ifd(ExifTags.IFD.Exif)

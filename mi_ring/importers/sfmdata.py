@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError, is_file
-from mi_ring.importers.camera_models import Lens, brown, inverse
+from mi_ring.importers.camera_models import Lens, brown, camera_to_world
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_json, matrix
 
-#: Models of distortion: coefficients, of which two after three of Brown are tangential, by either program's names.
+#: Models of distortion, by both programs' names: how many coefficients each has. Of five, the last two are tangential.
 MODELS = {
     "pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5, "fisheye4": 4,
     "fisheye": 4, "pinhole_radial_k1": 1, "pinhole_radial_k3": 3, "pinhole_brown_t2": 5,
 }  # fmt: skip
-COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields of them
+COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields for the coefficients
 
 
 @dataclass(frozen=True)
@@ -35,105 +35,101 @@ class SfmData(Photogrammetry):
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """Of Meshroom."""
+        """The photographs of a scene of Meshroom."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
         for k, view in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
-            file = text(entry(view, what), "path", what)
+            file = file_name(require_object(view, what), "path", what)
             own = poses.get(str(view.get("poseId", view.get("viewId"))))
             if own is None:
-                self.left_out.add(PureWindowsPath(file).name)
+                self.without_pose.add(PureWindowsPath(file).name)
                 continue
             if str(view.get("isPoseIndependant", True)).lower() == "false":
                 raise InputError(f"{what}: isPoseIndependant: is false; photographs of rigs are not supported")
-            transform = entry(entry(own, what).get("pose"), f"{what}: pose").get("transform")
-            transform = entry(transform, f"{what}: pose.transform")
-            pose = np.eye(4)  # the rotation is world-to-camera, column by column
+            transform = require_object(own.get("pose"), f"{what}: pose").get("transform")
+            transform = require_object(transform, f"{what}: pose.transform")
+            pose = np.eye(4)
+            # The file has the world-to-camera rotation column by column: read by rows it is camera-to-world.
             pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
             pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
             key = str(view.get("intrinsicId"))
-            lens = alicevision_lens(found(intrinsics, key, what), version, f"{self.src}: intrinsic {key!r}")
+            if key not in intrinsics:
+                raise InputError(f"{what}: intrinsics {key!r}: there are none")
+            lens = alicevision_lens(intrinsics[key], version, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """Of OpenMVG, whose JSON is cereal's: names of types stand where they come first."""
+        """The photographs of a scene of OpenMVG, which the library cereal writes: it names each type only once."""
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
         for own in intrinsics.values():
-            value = entry(own.get("value"), f"{self.src}: intrinsics")
+            value = require_object(own.get("value"), f"{self.src}: intrinsics")
             if "polymorphic_name" in value:
-                types[polymorphic(value, self.src)] = str(value["polymorphic_name"])
+                types[type_number(value, self.src)] = str(value["polymorphic_name"])
         poses = self.by_key(top, "extrinsics", "key")
         for k, own in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
-            view = cereal(own, what)
-            file = text(view, "filename", what)
-            file = str(Path(root, str(view.get("local_path", "")), file))
+            view = pointed_to(require_object(own, what), what)
+            file = str(Path(root, str(view.get("local_path", "")), file_name(view, "filename", what)))
             pose = poses.get(str(view.get("id_pose")))
             if pose is None:
-                self.left_out.add(PureWindowsPath(file).name)
+                self.without_pose.add(PureWindowsPath(file).name)
                 continue
-            pose = entry(pose.get("value"), f"{what}: extrinsics")
+            pose = require_object(pose.get("value"), f"{what}: extrinsics")
             R = matrix(pose.get("rotation"), (3, 3), f"{what}: extrinsics.rotation")
-            place = matrix(pose.get("center"), (3,), f"{what}: extrinsics.center")
+            center = matrix(pose.get("center"), (3,), f"{what}: extrinsics.center")
             key = str(view.get("id_intrinsic"))
-            intrinsic = found(intrinsics, key, what)
-            kind = types.get(polymorphic(intrinsic["value"], self.src))
-            lens = openmvg_lens(cereal(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
-            yield from self.frame(file, lens, inverse(R, -R @ place), what)
+            if key not in intrinsics:
+                raise InputError(f"{what}: intrinsics {key!r}: there are none")
+            kind = types.get(type_number(intrinsics[key]["value"], self.src))
+            lens = openmvg_lens(pointed_to(intrinsics[key], what), kind, f"{self.src}: intrinsic {key!r}")
+            yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """A list of the file by the keys of its entries; empty if there is none."""
+        """A list in the file as a dictionary, by the entries' `key`; empty if there is no such list."""
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
-        return {str(entry(value, f"{self.src}: {name}").get(key)): value for value in values}
+        return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[tuple[str, Frame]]:
-        """Of a photograph that may have been elsewhere, on another system, if it is meant."""
+        """The frame of a photograph, which may have been moved; nothing if the photograph is not wanted."""
         path = self.src.parent / file
         own = path if is_file(path) and not self.images and self.photographs is None else self.photograph(file, what)
         if own:
             yield own.name, Frame(own, lens, pose)
 
 
-def entry(value: Any, what: str) -> dict:
-    """An object of a JSON file. Raises InputError for anything else."""
+def require_object(value: Any, what: str) -> dict:
+    """The value. Raises InputError if it is not an object of JSON."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
 
 
-def found(values: dict[str, Any], key: str, what: str) -> dict:
-    """The intrinsics of a view."""
-    if key not in values:
-        raise InputError(f"{what}: intrinsics {key!r}: there are none")
-    return values[key]
+def file_name(view: dict, field: str, what: str) -> str:
+    """The name of a view's file. Raises InputError if it is missing."""
+    if not isinstance(view.get(field), str) or not view[field]:
+        raise InputError(f"{what}: {field}: is missing; must be the name of a photograph")
+    return view[field]
 
 
-def text(view: dict, name: str, what: str) -> str:
-    """The name of a file."""
-    if not isinstance(view.get(name), str) or not view[name]:
-        raise InputError(f"{what}: {name}: is missing; must be the name of a photograph")
-    return view[name]
-
-
-def cereal(own: Any, what: str) -> dict:
-    """What a pointer of cereal points to, fields of base classes included."""
-    wrapper = entry(entry(entry(own, what).get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
-    data = entry(wrapper.get("data"), f"{what}: data")
+def pointed_to(own: dict, what: str) -> dict:
+    """The object behind one of cereal's pointers, with the fields of its base class."""
+    wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
+    data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
 
 
-def polymorphic(value: dict, path: Path) -> int:
-    """The number of a type, whose highest bit says only that its name follows."""
+def type_number(value: dict, path: Path) -> int:
+    """The number of a polymorphic type. Its highest bit only says that the name follows."""
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
-    """Of AliceVision; pixels' centres are integers. What changed by version is in its sfmDataIO/CHANGES.md."""
+    """A lens of AliceVision, whose pixel centres are integers. Its sfmDataIO/CHANGES.md lists what versions changed."""
 
     def number(name: str, default: float | None = None) -> float:
         return float(matrix(own.get(name, default), (), f"{what}: {name}"))
@@ -160,7 +156,7 @@ def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
 
 
 def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
-    """Of OpenMVG; pixels' centres are integers."""
+    """A lens of OpenMVG, whose pixel centres are integers."""
     focal = float(matrix(own.get("focal_length"), (), f"{what}: focal_length"))
     centre = matrix(own.get("principal_point"), (2,), f"{what}: principal_point") + 0.5
     size = matrix([own.get("width"), own.get("height")], (2,), f"{what}: width, height")
@@ -169,7 +165,7 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """Of fx, fy, cx, cy [px] and a model of distortion; without coefficients there is none."""
+    """A lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind`, whose coefficients may be missing."""
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")
     count = MODELS[kind]

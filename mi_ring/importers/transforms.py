@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, brown
-from mi_ring.importers.frames import OPENGL, Frame, Light, Source, called
+from mi_ring.importers.frames import OPENGL, Frame, Light, Source, find_by_name
 from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
 
 
@@ -39,7 +39,7 @@ class Transforms(Source):
             if self.photographs is None:
                 image: Path | None = with_suffix(path.parent / name, f"{path}: {where}.file_path")
             else:
-                image = called(name, self.photographs)
+                image = find_by_name(name, self.photographs)
             if image is None:
                 continue
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
@@ -51,19 +51,17 @@ class Transforms(Source):
             elif has_alpha(image):
                 frame.mask = image
             intensity = np.ones(3)
-            if own.get("pl_intensity") is not None:
-                rgb = own["pl_intensity"]
+            if (rgb := own.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
                 intensity = matrix(rgb, (3,), f"{path}: {where}.pl_intensity")
                 frame.light = frame.at_camera(intensity)
-            if own.get("pl_pos") is not None:
-                position = matrix(own["pl_pos"], (3,), f"{path}: {where}.pl_pos")
-                frame.light = Light("point", position, intensity)
+            if (position := own.get("pl_pos")) is not None:
+                frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """The camera of one frame of transforms.json: `given` are the file's fields and above them the frame's own."""
+    """The lens of one frame of transforms.json. `given`: the fields of the frame, completed by those of the file."""
 
     def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)
@@ -74,7 +72,7 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    size: Any = ("w" in given and "h" in given and (number("w"), number("h"))) or image_size(image)  # cut by Lens
+    size: Any = (number("w"), number("h")) if "w" in given and "h" in given else image_size(image)  # Lens truncates
     width, height = size
     if given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")

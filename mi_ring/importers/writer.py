@@ -1,4 +1,4 @@
-"""Writes frames as a scene file with its images, whole or not at all."""
+"""Writes a scene file with its images, all or nothing."""
 
 import contextlib
 import filecmp
@@ -22,20 +22,20 @@ from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
-    """Files of a scene: gathered in a folder of their own, moved to their places when all are there."""
+    """Collects the files of a scene in a temporary folder; `finish` moves them to their places."""
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
-        #: What belongs to x/pot.xml is in x/pot/, what belongs to x/scene.xml is in x/.
+        #: The files of x/pot.xml go to x/pot/, those of x/scene.xml go to x/.
         self.folder = scene.parent if scene.stem == "scene" else scene.with_suffix("")
-        self.made = [folder for folder in (scene.parent, *scene.parent.parents) if not folder.exists()]
+        self.new_folders = [folder for folder in (scene.parent, *scene.parent.parents) if not folder.exists()]
         scene.parent.mkdir(parents=True, exist_ok=True)
         self.staging = Path(tempfile.mkdtemp(prefix=f".{scene.stem}.", dir=scene.parent))
         self.files: list[Path] = []
-        self.shared: dict = {}  # where masks are, by file and lens
+        self.shared: dict = {}  #: files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
-        """Have `write(path)` write a file and return where it is going to be."""
+        """Write a file by `write(path)`. Returns its final path."""
         path = self.staging / file
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
@@ -43,81 +43,78 @@ class Writer:
         return self.folder / file
 
     def image(self, file: str, pixels: np.ndarray) -> Path:
-        """Write an image: PNG if it has integers, else EXR."""
+        """Write an image, `file` without suffix: EXR for float32, else PNG. Returns its final path."""
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """As the scene names it."""
+        """The path as the scene file names it."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
-        """Move everything to its place. Raises InputError if there are other files, which may be the sources.
+        """Move all files to their places, then write the scene file.
 
-        Files that are the same are left by one that was ended here.
+        Raises InputError if a place holds a different file, which may be a source. Equal files are fine: a run that was
+        interrupted here has left them.
         """
         for file in self.files:
             place = self.folder / file
             if place.exists() and not filecmp.cmp(self.staging / file, place, shallow=False):
-                raise InputError(f"{self.folder / file}: exists already and is another; remove it, or write elsewhere")
+                raise InputError(f"{place}: exists already and is another; remove it, or write elsewhere")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove what has not been moved, and folders that were made for nothing."""
+        """Remove the temporary folder, and new folders that stayed empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
-        for folder in self.made:
+        for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
                 folder.rmdir()
 
 
-def place_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """The files of a frame, relative to the scene file; written anew where they must be."""
+def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
+    """Write the files of a frame that change, or all of them to `copy`. Other files stay where they are."""
     straight = frame.lens.is_pinhole
 
-    def placed(folder: str, path: Path, pixels: np.ndarray | None) -> Path:
+    def place(folder: str, path: Path, pixels: np.ndarray | None) -> Path:
         if pixels is not None:
             return writer.image(f"{folder}/{name}", pixels)
         if copy:
             return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
         return path
 
-    def shared(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
-        """Of several photographs: written once."""
+    def place_once(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
-            writer.shared[folder, key] = placed(folder, path, pixels())
+            writer.shared[folder, key] = place(folder, path, pixels())
         return writer.relative(writer.shared[folder, key])
 
     pixels = frame.pixels
     if pixels is None and (not straight or encoding == "linear"):
         pixels = pixels_of(frame.image)
-        if encoding == "linear" and pixels.dtype == np.uint8:  # of which the scene file would say that it is sRGB
+        if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
             pixels = pixels * np.uint16(257)
         elif straight:
-            pixels = None  # the file will do
+            pixels = None  # the file can stay
     valid = None
     if not straight:
-        assert pixels is not None  # they were read above
+        assert pixels is not None  # read above
         srgb = not is_linear(encoding, pixels)
         pixels, shown = undistort(pixels, frame.lens, srgb, frame.saturation)
         if not shown.all():
-            white = np.where(shown, 255, 0).astype(np.uint8)[..., None]
-            valid = shared("valid", frame.lens, Path(), lambda: white)
-    image = writer.relative(placed("images", frame.image, pixels))
+            valid = place_once("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
+    image = writer.relative(place("images", frame.image, pixels))
     file = frame.mask
-    if file is None:
-        return Files(image, None, valid)
-    if file == frame.image:
-        return Files(image, image, valid)
+    if file is None or file == frame.image:
+        return Files(image, image if file else None, valid)
 
     def mask() -> np.ndarray | None:
         if straight and not frame.fill_mask:
             return None
         mask = pixels_of(file)
         if frame.fill_mask:
-            mask = 255 * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None].astype(np.uint8)
-        return mask if straight else undistort(mask, frame.lens, saturation=np.inf).pixels
+            mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
+        return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]
 
-    return Files(image, shared("masks", (file, frame.lens), file, mask), valid)
+    return Files(image, place_once("masks", (file, frame.lens), file, mask), valid)

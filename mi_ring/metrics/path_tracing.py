@@ -1,4 +1,4 @@
-"""Photographs by `photometric` and by Mitsuba's path tracer, side by side."""
+"""The same photographs by `photometric` and by Mitsuba's path tracer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ from mi_ring.scene.assembly import assembled, split_tables, top_level_emitters
 from mi_ring.scene.lights import is_room
 from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
 
-BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
-LANES = 1 << 21  #: rays per launch, at most
+BATCHES = 16  #: independent renderings of each photograph; their spread is the Monte Carlo noise
+LANES = 1 << 21  #: most rays in one launch
 
 
 @dataclass
@@ -26,13 +26,13 @@ class Pictures:
     """Independent renderings (16, H, W, 3) of one photograph: linear radiance."""
 
     photometric: np.ndarray
-    unshadowed: np.ndarray  #: same samples as photometric
+    unshadowed: np.ndarray  #: photometric without shadows, same samples
     path: np.ndarray
-    direct: np.ndarray  #: the direct light of `path`, same samples
+    direct: np.ndarray  #: direct light of `path`, same samples
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """The scene without tables and its sensors, lit for stock integrators too. Raises InputError, one line."""
+    """The scene without tables, lit for stock integrators, too, and its photographs. Raises InputError, one line."""
     scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
@@ -46,7 +46,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def without_rooms(scene: mi.Scene) -> mi.Scene:
-    """The scene without `room` emitters: what they add is path traced either way (`render_indirect`)."""
+    """The scene without `room` emitters: both renderers path trace their light (`render_indirect`)."""
     emitters = top_level_emitters(scene)
     if not any(map(is_room, emitters)):
         return scene
@@ -54,10 +54,9 @@ def without_rooms(scene: mi.Scene) -> mi.Scene:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with one `flash` emitter, through which stock integrators see the light of a photograph.
+    """The scene with one `flash` emitter, by which stock integrators see the light of a photograph.
 
-    A `shapenet` brings it along; a scene of other shapes is assembled anew. Raises SceneError if there are several,
-    each of which would add the light once more.
+    A `shapenet` includes one; to other scenes it is added. Raises SceneError if there are several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
@@ -71,10 +70,10 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
 def render_both(
     scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
 ) -> Pictures:
-    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 times, each with `spp` samples per pixel of its own.
+    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 independent renderings with `spp` samples per pixel.
 
-    `photometric` and `path` have different samples, but both along rays of ours: the film's filter has no part in it.
-    Seeds up to `seed` + 31 are used.
+    `photometric` and `path` have different samples along rays of the same kind: the film's filter is not used. Uses
+    seeds from `seed` to `seed` + 31.
     """
     size = sensor.camera.size
     width, height = (s // scale for s in size)
@@ -100,7 +99,7 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """Like `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
+    """As `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

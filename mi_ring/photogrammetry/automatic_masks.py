@@ -1,13 +1,13 @@
-"""Masks that nobody has to draw: a first guess, then GrabCut in each photograph and votes of all in space, in turn.
+"""Masks without user input: a first guess, then GrabCut in each photograph and a vote of all masks on voxels, in turn.
 
-Votes keep what most photographs that show a place call object, so that lamps, highlights and the neighbours of one
-photograph drop out, and GrabCut finds the outline that the coarse votes leave open. What fills a hollow in some
-photographs, a shadow for one, drops out where a few others see through it.
+The vote keeps a voxel if most photographs that show it have it in their mask. So lamps, highlights and neighbours of
+the object drop out of single masks, and concavities are emptied that some masks fill, for instance with a shadow.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -17,38 +17,39 @@ from skimage.filters import threshold_otsu
 
 from mi_ring.capture.grabcut import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
-from mi_ring.photogrammetry.reduced_photographs import View
+from mi_ring.photogrammetry.reduced_photographs import ReducedView
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
-SHOWN = 0.25  #: share of the photographs that must show a place, else it is not the object
-AGREE = 0.9  #: share of those that must call it object
-RESOLUTION = 96  #: voxels along an edge of the space that is looked at
-FEWEST = 30  #: voxels of an object: a few agree anywhere, and then agree perfectly
-SETTLED = 0.995  #: share of the masks' union that is the same as before
-MISSES, SOME = 2.0, 0.01  #: a mask that misses so many times the usual and some is wrong, of what all say together
-DARKEST = 1e-3  #: radiance below which nothing is told
+Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, 1 the object
+MIN_VISIBLE = 0.25  #: share of the photographs that must show a voxel of the object
+MIN_AGREEMENT = 0.9  #: share of those that must have the voxel in their mask
+RESOLUTION = 96  #: voxels along an edge of the grid
+MIN_VOXELS = 30  #: of an object: a few voxels get a unanimous vote by chance
+CONVERGED = 0.995  #: overlap of the masks with those of the iteration before
+MAX_MISSING, OFFSET = 2.0, 0.01  #: an outlier misses more of the silhouette than this times the median, plus offset
+MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
-class Care(NamedTuple):
-    """How masks are settled."""
+class RefinementSettings(NamedTuple):
+    """Settings of `refine_masks`."""
 
-    agree: float  #: share of the masks that must call a place object
-    band: float  #: of the object's size, by which their common outline may be off
-    rounds: int  #: at most
-    strict: bool = True  #: does a mask that misses much more than the others have no vote?
+    agreement: float  #: share of the masks that must contain a voxel
+    band: float  #: width of the band around the silhouette that GrabCut decides, as a share of the object's size
+    iterations: int  #: at most
+    reject_outliers: bool = True  #: exclude masks from the vote that miss much more than the others?
 
 
-WHEREABOUTS = Care(AGREE, 0.04, 6, False)
-HOLLOWS = Care(0.96, 0.15, 2)  #: shadows fill them, until a few photographs see through
-OUTLINES = Care(0.96, 0.04, 2)
+LOCATION = RefinementSettings(MIN_AGREEMENT, 0.04, 6, False)
+CONCAVITIES = RefinementSettings(0.96, 0.15, 2)  #: high agreement: a few photographs see through a shadowed concavity
+OUTLINES = RefinementSettings(0.96, 0.04, 2)
 
 
 @dataclass
-class Body:
-    """Voxels that the photographs take for the object."""
+class VoxelObject:
+    """The voxels of the object."""
 
-    corner: np.ndarray  #: (3,) of the first voxel's centre
+    corner: np.ndarray  #: (3,) centre of the first voxel
     spacing: float
     voxels: np.ndarray  #: (n, n, n) bool
 
@@ -57,41 +58,37 @@ class Body:
         """(N, 3) centres of the object's voxels."""
         return self.corner + self.spacing * np.argwhere(self.voxels)
 
-    def coverage(self, view: View) -> np.ndarray:
-        """(H, W) uint8: which pixels show it."""
-        row, column, inside = view.places(self.points)
-        mask = np.zeros(view.shown.shape, np.uint8)
+    def silhouette(self, view: ReducedView) -> np.ndarray:
+        """(H, W) uint8: 1 where a view shows the object."""
+        row, column, inside = view.project(self.points)
+        mask = np.zeros(view.valid.shape, np.uint8)
         mask[row[inside], column[inside]] = 1
-        return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.pixels(view) + 1))
+        return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.voxel_pixels(view) + 1))
 
-    def reach(self, view: View, coverage: np.ndarray) -> np.ndarray:
-        """(H, W) uint8: where the object may be by its coverage of the view, which is coarse by a voxel."""
-        return cv2.dilate(coverage, disk(self.pixels(view)))
-
-    def pixels(self, view: View) -> float:
-        """How wide a voxel is in a view."""
-        away = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
-        return float(self.spacing * view.camera.focal.mean() / away)
+    def voxel_pixels(self, view: ReducedView) -> float:
+        """Width of a voxel in a view [px]."""
+        distance = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
+        return float(self.spacing * view.camera.focal.mean() / distance)
 
 
-class Space:
-    """The voxels about the point that the cameras look at, and where each view has them."""
+class VoxelGrid:
+    """A cube of voxels, `half_size` from `center` (3,) to each side, and the views that see it."""
 
-    def __init__(self, views: Sequence[View], center: np.ndarray, reach: float) -> None:
-        self.views, self.center, self.reach = views, center, reach
-        self.axis = np.linspace(-reach, reach, RESOLUTION)
-        grid = np.stack(np.meshgrid(*[self.axis] * 3, indexing="ij"), -1).reshape(-1, 3) + center
-        self.allowed = np.ones(len(grid), bool)  #: may it be the object?
-        self.grid = grid.astype(np.float32)
+    def __init__(self, views: Sequence[ReducedView], center: np.ndarray, half_size: float) -> None:
+        self.views, self.center, self.half_size = views, center, half_size
+        self.axis = np.linspace(-half_size, half_size, RESOLUTION)
+        points = np.stack(np.meshgrid(*[self.axis] * 3, indexing="ij"), -1).reshape(-1, 3) + center
+        self.points = points.astype(np.float32)  #: (N, 3) centres of the voxels
+        self.allowed = np.ones(len(points), bool)  #: (N,) may the voxel belong to the object?
 
     @property
-    def distance(self) -> float:
-        """The middle one of the cameras'."""
+    def camera_distance(self) -> float:
+        """Median distance from the cameras to the centre."""
         return float(np.median([np.linalg.norm(view.camera.position - self.center) for view in self.views]))
 
     @classmethod
-    def seen_by(cls, views: Sequence[View]) -> "Space":
-        """As large as the middle one of the photographs shows."""
+    def seen_by(cls, views: Sequence[ReducedView]) -> "VoxelGrid":
+        """A grid around the point that the cameras look at, as large as the median photograph shows."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -99,119 +96,103 @@ class Space:
         return cls(views, center, 1.2 * float(np.median(np.linalg.norm(origins - center, axis=1)) * half))
 
     @classmethod
-    def about(cls, views: Sequence[View], body: Body) -> "Space":
-        """Somewhat larger than what has been found."""
-        low, high = body.points.min(0), body.points.max(0)
-        return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + body.spacing)
+    def around(cls, views: Sequence[ReducedView], found: VoxelObject) -> "VoxelGrid":
+        """A grid that is somewhat larger than an object."""
+        low, high = found.points.min(0), found.points.max(0)
+        return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
-    def vote(self, masks: Sequence[np.ndarray], agree: float, voters: Sequence[bool] | None = None) -> Body | None:
-        """The largest piece of what this share of the masks (H, W) calls object; None if it is next to nothing.
+    def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
+        """The largest connected piece of voxels in this share of the masks (H, W), or in those of some `voters`.
 
-        `voters`: whose masks count; by default all.
+        None if it is too small.
         """
-        yes, shown = np.zeros(len(self.grid), np.int16), np.zeros(len(self.grid), np.int16)
+        yes, shown = np.zeros((2, len(self.points)), np.int16)
 
-        def said(view: View, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            row, column, inside = view.places(self.grid)
+        def look(view: ReducedView, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            row, column, inside = view.project(self.points)
             return inside, inside & (mask[row, column] > 0)
 
-        voting = [k for k in range(len(masks)) if voters is None or voters[k]]
-        for inside, object_ in in_threads(said, [self.views[k] for k in voting], [masks[k] for k in voting]):
+        pairs = itertools.compress(zip(self.views, masks), voters or itertools.repeat(True))
+        for inside, within in in_threads(look, *zip(*pairs)):
             shown += inside
-            yes += object_
-        object_ = (yes >= agree * shown) & (shown >= SHOWN * len(self.views)) & self.allowed
-        pieces, _ = ndimage.label(object_.reshape([len(self.axis)] * 3))
+            yes += within
+        chosen = (yes >= agreement * shown) & (shown >= MIN_VISIBLE * len(self.views)) & self.allowed
+        pieces, _ = ndimage.label(chosen.reshape([RESOLUTION] * 3))
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
-        if sizes.max() < FEWEST:
+        if sizes.max() < MIN_VOXELS:
             return None
-        return Body(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
+        return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
 
 
-def nothing(views: Sequence[View]) -> list[np.ndarray]:
-    """Empty masks."""
-    return [np.zeros(view.shown.shape, np.uint8) for view in views]
+def empty_masks(views: Sequence[ReducedView]) -> list[np.ndarray]:
+    """A mask (H, W) uint8 of zeros for each view."""
+    return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
 
-def bright(view: View) -> np.ndarray:
-    """(H, W) uint8: what is nearer to the flash than the rest, by Otsu's threshold of the photograph's log radiance."""
-    log = np.log(np.maximum(view.linear.max(-1), DARKEST))
+def bright_mask(view: ReducedView) -> np.ndarray:
+    """(H, W) uint8: 1 where log radiance is above Otsu's threshold, which is near the flash."""
+    log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def outlined(view: View, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
-    """(H, W) uint8: the object near its coverage (H, W). `background` (H, W) surely is not the object."""
-    return grabcut(view.rgb, coverage, ~view.shown | (background > 0), band)
-
-
-def reliable(views: Sequence[View], masks: Sequence[np.ndarray], covered: Sequence[np.ndarray]) -> list[bool]:
-    """Which masks do not miss far more than others of what all say together (H, W each): what a lamp has swallowed."""
-    missed = [
-        (cover > mask)[view.shown].sum() / max(1, cover.sum()) for view, mask, cover in zip(views, masks, covered)
+def are_complete(views: Sequence[ReducedView], masks: Masks, silhouettes: Masks) -> list[bool]:
+    """Which masks miss about as much of the common silhouette (H, W each) as the others? Lamps make them miss more."""
+    missing = [
+        (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
+        for view, mask, silhouette in zip(views, masks, silhouettes)
     ]
-    return [share <= MISSES * np.median(missed) + SOME for share in missed]
+    return [share <= MAX_MISSING * np.median(missing) + OFFSET for share in missing]
 
 
-@dataclass(frozen=True)
-class Found:
-    """Masks of all views, and how sure they are."""
+class Segmentation(NamedTuple):
+    """The object and its masks in all views."""
 
     masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
-    body: Body
-    agreement: list[float]  #: of each, intersection over union with what all say together
-
-    @property
-    def quality(self) -> float:
-        """Of most of them."""
-        return float(np.quantile(self.agreement, 0.2))
+    object: VoxelObject
+    agreement: list[float]  #: of each mask with the common silhouette, intersection over union
 
 
-def settle(
-    space: Space, guesses: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], progress: Progress,
-    care: Care = WHEREABOUTS,
-) -> Found | None:  # fmt: skip
-    """Masks from a first guess of each (H, W): votes and GrabCut in turn until nothing changes.
+def refine_masks(
+    grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
+) -> Segmentation | None:  # fmt: skip
+    """Masks from first guesses (H, W), by votes and GrabCut in turn; None if the guesses have no object in common.
 
-    `backgrounds` (H, W): what surely is not the object. None if the guesses have nothing in common.
+    `backgrounds` (H, W): above 0 where the object certainly is not.
     """
-    body, masks = space.vote(guesses, AGREE), list(guesses)
-    if body is None:
-        return None
-    covered = [body.coverage(view) for view in space.views]
-    for number in range(care.rounds):
-        before = masks
-        found = in_threads(partial(outlined, band=care.band), space.views, covered, backgrounds)
-        masks = list(progress(found, f"masks, round {number + 1}", len(covered)))
-        body = space.vote(masks, care.agree, reliable(space.views, masks, covered) if care.strict else None)
-        if body is None:
-            return None
-        covered = [body.coverage(view) for view in space.views]
-        masks = [mask & body.reach(view, cover) for mask, view, cover in zip(masks, space.views, covered)]
-        if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > SETTLED:
+
+    def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
+        return grabcut(view.rgb, silhouette, ~view.valid | (background > 0), settings.band)
+
+    masks, found = list(guesses), grid.vote(guesses, MIN_AGREEMENT)
+    silhouettes = [found.silhouette(view) for view in grid.views] if found else []
+    for number in range(settings.iterations if found else 0):
+        before, outlined = masks, in_threads(outline, grid.views, silhouettes, backgrounds)
+        masks = list(progress(outlined, f"masks, round {number + 1}", len(silhouettes)))
+        voters = are_complete(grid.views, masks, silhouettes) if settings.reject_outliers else None
+        if (found := grid.vote(masks, settings.agreement, voters)) is None:
             break
-    return Found(masks, body, [overlap(mask, cover) for mask, cover in zip(masks, covered)])
+        silhouettes = [found.silhouette(view) for view in grid.views]
+        masks = [m & cv2.dilate(s, disk(found.voxel_pixels(v))) for m, v, s in zip(masks, grid.views, silhouettes)]
+        if np.mean([overlap(a, b) for a, b in zip(masks, before)]) > CONVERGED:
+            break
+    agreement = [overlap(mask, silhouette) for mask, silhouette in zip(masks, silhouettes)]
+    return Segmentation(masks, found, agreement) if found else None
 
 
-def resized(mask: np.ndarray, view: View) -> np.ndarray:
-    """A mask of another size as large as the view: (H, W) bool."""
+def resize_mask(mask: np.ndarray, view: ReducedView) -> np.ndarray:
+    """A mask of another size, at the size of the view: (H, W) bool."""
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def disputed(mask: np.ndarray, coverage: np.ndarray, pixels: float) -> np.ndarray:
-    """(H, W) uint8: where a mask and what all say together, the coverage of voxels so wide, are not of one mind.
-
-    Mostly a shadow that one mask takes for the object.
-    """
-    wide, narrow = cv2.dilate(coverage, disk(pixels)), cv2.erode(coverage, disk(pixels))
+def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) -> np.ndarray:
+    """(H, W) uint8: 1 where a mask and the common silhouette differ by more than a tolerance [px]: mostly shadows."""
+    wide, narrow = cv2.dilate(silhouette, disk(tolerance)), cv2.erode(silhouette, disk(tolerance))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
-def unsure(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: what looks like the object, touches it and is not in its mask: a rod, a stand, a lamp behind.
-
-    Whether it hides the object cannot be told.
-    """
-    beside = (guess > 0) & (mask == 0)
-    pieces, _ = ndimage.label(beside)
+def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """(H, W) uint8: 1 on pieces of the guess that touch the mask, such as a rod, which may hide the object or not."""
+    pieces, _ = ndimage.label((guess > 0) & (mask == 0))
     touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
     return np.isin(pieces, touching[touching > 0]).astype(np.uint8)

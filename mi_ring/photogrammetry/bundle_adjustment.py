@@ -1,4 +1,7 @@
-"""Bundle adjustment of cameras, points and lenses together, with the printed sheet's corners where it is seen."""
+"""Bundle adjustment of cameras, points and lenses, with the corners of the printed sheet where it is seen.
+
+A `model` is a `pycolmap.Reconstruction` throughout.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -7,85 +10,81 @@ import numpy as np
 
 from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.marker_sheet import Sighting, triangulate
-from mi_ring.photogrammetry.matching import file_of
-from mi_ring.system.optional import need
+from mi_ring.photogrammetry.marker_sheet import SheetDetection, triangulate
+from mi_ring.photogrammetry.matching import grey_file
+from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
-ROBUST = 0.5  #: [px of the pictures] residuals beyond count less: highlights and shadows move with the flash
-TOLD = 1e-3  #: of a picture's longer side, standard deviation to which a principal point must be known to be taken
-CORNER = 12  #: features that a corner of the sheet counts like: it is found that much more precisely
-WORSE = 1.1  #: how much farther off features may be where the corners count
-SETTLED = 1e-5  #: share of the error by which an iteration of a bundle adjustment lessens it that is nearly the last
-ITERATIONS = 10  #: of a bundle adjustment at a time: the library does not let go meanwhile
+pycolmap = LazyPackage("pycolmap", "structure from motion")
+ROBUST = 0.5  #: residual beyond which an observation counts less [px]: highlights and shadows move with the flash
+DETERMINED = 1e-3  #: standard deviation of a principal point, as a share of the picture's longer side, to accept it
+CORNER_WEIGHT = 12  #: a corner of the sheet counts like so many features, because it is found more precisely
+MAX_WORSE = 1.1  #: factor by which corners may increase the features' reprojection error
+CONVERGED = 1e-5  #: relative decrease of the error at which an adjustment ends
+ITERATIONS = 10  #: of the solver per call: pycolmap cannot be interrupted in a call
 
 
-def adjusted(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Sighting], progress: Progress) -> Any:
-    """The model after bundle adjustments, in which the corners of the printed sheet count if the features go with them.
+def adjust(
+    model: Any, pictures: Sequence[Picture], detections: Mapping[str, SheetDetection], progress: Progress
+) -> Any:
+    """The model after bundle adjustment with the sheet's corners, or without if features contradict them.
 
-    They do not where the object was moved on its sheet, or the sheet under it.
+    They do if the object was moved on the sheet.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
-    model.tear_down()  # covariances are refused where some images have no pose
-    for _ in progress(adjustments(model), "bundle adjustment"):
-        pass
+    model.tear_down()  # covariances are refused if an image has no pose
+    list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
-    if not (corners := add_corners(held, pictures, sightings)):
-        return with_principal_points(model, progress)
-    for _ in progress(adjustments(held), "bundle adjustment by the sheet"):
-        pass
-    held = with_principal_points(held, progress)
+    if not (corners := add_corners(held, pictures, detections)):
+        return refine_principal_points(model, progress)
+    list(progress(robust_adjustment(held), "bundle adjustment by the sheet"))
+    held = refine_principal_points(held, progress)
     for corner in filter(held.exists_point3D, corners):
         held.delete_point3D(corner)
     held.update_point_3d_errors()
     fewer = held.compute_num_observations() / model.compute_num_observations()
     worse = held.compute_mean_reprojection_error() / model.compute_mean_reprojection_error()
-    return held if worse < WORSE * min(1.0, fewer) else with_principal_points(model, progress)
+    return held if worse < MAX_WORSE * min(1.0, fewer) else refine_principal_points(model, progress)
 
 
-def add_corners(model: Any, pictures: Sequence[Picture], sightings: Mapping[str, Sighting]) -> list[int]:
-    """Put corners of the printed sheet among the points of a model, where they weigh more than others; which these are.
+def add_corners(model: Any, pictures: Sequence[Picture], detections: Mapping[str, SheetDetection]) -> list[int]:
+    """Add the sheet's corners to the points of a model, `CORNER_WEIGHT` times each. Returns the ids of the new points.
 
-    Where the sheet is seen at a low angle there are few features, and highlights and shadows among them.
+    Where the sheet is seen at a low angle, features are few and many are wrong.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
-    by_file = {file_of(picture): picture for picture in pictures}
-    for image in [model.images[k] for k in model.reg_image_ids()]:
-        picture = by_file[image.name]
-        if sighting := sightings.get(picture.name):
-            for corner, place in zip(sighting.ids.tolist(), sighting.pixels / reduction(model, image, picture.size)):
-                seen.setdefault(corner, []).append((image, place))
+    for image, picture, scale in registered(model, pictures):
+        if detection := detections.get(picture.name):
+            for corner, pixel in zip(detection.ids.tolist(), detection.pixels / scale):
+                seen.setdefault(corner, []).append((image, pixel))
     added: list[int] = []
-    for corner, point, _ in triangulate(sightings, cameras_of(model, pictures)):
-        for _ in range(CORNER):
+    for corner, point, _ in triangulate(detections, model_cameras(model, pictures)):
+        for _ in range(CORNER_WEIGHT):
             track = pycolmap.Track()
-            for image, place in seen[corner]:
-                image.points2D.append(pycolmap.Point2D(place))
+            for image, pixel in seen[corner]:
+                image.points2D.append(pycolmap.Point2D(pixel))
                 track.add_element(image.image_id, len(image.points2D) - 1)
             added.append(model.add_point3D(point, track))
     return added
 
 
-def adjustments(model: Any) -> Iterator[None]:
-    """Bundle adjustment with a robust loss, and points that do not fit left out, a few iterations at a time.
+def robust_adjustment(model: Any) -> Iterator[None]:
+    """Adjust a model with a robust loss, and remove points that do not fit; yields before each call of the solver.
 
-    Highlights and the flash's shadows move with the camera: features on them are wrong but match, and by least squares
-    alone they would bend all cameras.
+    Features on highlights and on the flash's shadows move with the camera. They match but are wrong, and plain least
+    squares would bend all cameras after them.
     """
-    observations = need("pycolmap", "bundle adjustment").ObservationManager(model)
+    observations = pycolmap.ObservationManager(model)
     for _ in range(3):
-        yield from solved(model, *adjustment(model), 100 // ITERATIONS)
+        yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
         if observations.filter_all_points3D(4 * ROBUST, 2.0) < 1e-3 * model.num_points3D():
             break
 
 
-def adjustment(model: Any) -> tuple[Any, Any]:
-    """Options of a bundle adjustment with a robust loss, and what takes part in it: all of a model."""
-    pycolmap = need("pycolmap", "bundle adjustment")
+def adjustment_problem(model: Any) -> tuple[Any, Any]:
+    """Options of a bundle adjustment with a robust loss, and its configuration with all of a model."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
-    options.ceres.solver_options.function_tolerance = SETTLED
+    options.ceres.solver_options.function_tolerance = CONVERGED
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, ROBUST
     config = pycolmap.BundleAdjustmentConfig()
     for k in model.reg_image_ids():
@@ -94,65 +93,60 @@ def adjustment(model: Any) -> tuple[Any, Any]:
     return options, config
 
 
-def solved(model: Any, options: Any, config: Any, times: int) -> Iterator[None]:
-    """Adjust a model so many times, or until it changes no more."""
-    pycolmap = need("pycolmap", "bundle adjustment")
-    for _ in range(times):
+def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
+    """Run the solver so many times, or until it converges; yields before each call."""
+    for _ in range(calls):
         yield
         summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         if summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE:
             break
 
 
-def with_principal_points(model: Any, progress: Progress) -> Any:
-    """The model with the principal points that the photographs tell, adjusted; those of other lenses stay.
+def refine_principal_points(model: Any, progress: Progress) -> Any:
+    """The model with refined principal points, where the photographs determine them; other lenses keep theirs.
 
-    A long lens tells it hardly, for a shift of the picture is nearly a turn of the camera.
+    A long lens hardly determines it, because a shift of the picture resembles a turn of the camera.
     """
-    pycolmap = need("pycolmap", "bundle adjustment")
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
-    untold: set[int] = set()
-    while untold < lenses:
-        found = pycolmap.Reconstruction(model)
-        options, config = adjustment(found)
+    fixed: set[int] = set()
+    while fixed < lenses:
+        refined = pycolmap.Reconstruction(model)
+        options, config = adjustment_problem(refined)
         options.refine_principal_point = True
-        for k in untold:
+        for k in fixed:
             config.set_constant_cam_intrinsics(k)
-        for _ in progress(solved(found, options, config, 3), "principal points"):
-            pass
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
-        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), found, adjuster)
-        more = {k for k in lenses - untold if not told(found.cameras[k], covariance)}
-        if not more:
-            return found
-        untold |= more
+        list(progress(solve(refined, options, config, 3), "principal points"))
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, refined)
+        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), refined, adjuster)
+        undetermined = {k for k in lenses - fixed if not is_determined(refined.cameras[k], covariance)}
+        if not undetermined:
+            return refined
+        fixed |= undetermined
     return model
 
 
-def told(camera: Any, covariance: Any) -> bool:
-    """Do photographs tell the principal point of a camera? By a `pycolmap.BACovariance`, None if there is none."""
+def is_determined(camera: Any, covariance: Any) -> bool:
+    """Does a `pycolmap.BACovariance`, or None, say that the principal point of a camera is accurate?"""
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
         return False
     variance = np.diag(own)[camera.principal_point_idxs()].max()
-    return bool(variance < (TOLD * max(camera.width, camera.height)) ** 2)
+    return bool(variance < (DETERMINED * max(camera.width, camera.height)) ** 2)
 
 
-def cameras_of(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """By photograph, as `Motion` has them."""
-    by_file, cameras = {file_of(picture): picture for picture in pictures}, {}
-    for k in model.reg_image_ids():
-        image = model.images[k]
-        picture, pose = by_file[image.name], np.eye(4)
-        scale = reduction(model, image, picture.size)
+def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
+    """The images with a pose, their photographs, and how many times smaller than these they are."""
+    by_file = {grey_file(picture): picture for picture in pictures}
+    for image in [model.images[k] for k in model.reg_image_ids()]:
+        camera, picture = model.cameras[image.camera_id], by_file[image.name]
+        yield image, picture, max(picture.size) // max(camera.width, camera.height)
+
+
+def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
+    """Lens and camera-to-world pose (4, 4) by the photograph's name, as `SparseModel` has them."""
+    cameras = {}
+    for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params
-        pose[:3] = image.cam_from_world().inverse().matrix()
         lens = Lens("SIMPLE_RADIAL", picture.size, (scale * f, scale * cx, scale * cy, radial))
-        cameras[picture.name] = lens, pose
+        cameras[picture.name] = lens, np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
     return dict(sorted(cameras.items()))
-
-
-def reduction(model: Any, image: Any, size: tuple[int, int]) -> int:
-    """How many pixels of a photograph of this size one of its image in a model is, across."""
-    own = model.cameras[image.camera_id]
-    return max(size) // max(own.width, own.height)

@@ -1,4 +1,4 @@
-"""The photographs of a folder: which there are, their pixels and what their EXIF data say."""
+"""The photographs in a folder: their pixels, orientation and EXIF data."""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import require_plausible_size
+from mi_ring.foreign import reading, require_plausible_size
 from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
@@ -19,99 +20,115 @@ from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
-TRANSPARENT = (".png", ".tif", ".tiff")  #: what may have an alpha channel
-FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of how a raw photograph is turned, as orientations of EXIF
-FEWEST = 8  #: photographs that a reconstruction needs at least
+TRANSPARENT = (".png", ".tif", ".tiff")  #: suffixes of files that may have an alpha channel
+FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: EXIF orientations by LibRaw's numbers
+MIN_PHOTOGRAPHS = 8
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph."""
+    """A photograph in a file."""
 
     path: Path
-    upright: bool = True  #: turned as EXIF says; else as the file has it, which other tools' cameras refer to
+    upright: bool = True  #: turn pixels as EXIF says? Cameras of other tools refer to the pixels as stored
 
     @property
     def name(self) -> str:
-        """That of the file, without suffix."""
+        """The file's name without suffix."""
         return self.path.stem
+
+    @property
+    def suffix(self) -> str:
+        """The file's suffix, lower case."""
+        return self.path.suffix.lower()
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """(H, W, C) uint8 sRGB, or uint16: linear of raw files, else as the file has it.
-
-        Raises InputError if it cannot be read.
-        """
-        return turned(self.stored(), self.orientation)
+        """(H, W, C) uint8 sRGB, or uint16: linear if raw, else as in the file. Raises InputError if that fails."""
+        return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
         """`pixels` before they are turned."""
-        suffix = self.path.suffix.lower()
-        if suffix in RAW:
-            return read_as(self.path, "raw photograph", develop)
-        if suffix in HEIF:
-            let_open(self.path)
-            return read_as(self.path, "HEIF photograph", decode_heif)
+
+        def develop(raw: Any) -> np.ndarray:
+            require_plausible_size(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
+            # Linear radiance in sRGB's primaries, with the camera's white balance.
+            return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
+
+        if self.suffix in RAW + HEIF:
+            return self.decode(develop if self.suffix in RAW else lambda image: np.array(image.convert("RGB")))
         pixels = read_as(self.path, "image", read_image)
         if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
-    @property
-    def orientation(self) -> int:
-        """By EXIF's numbers, how the pixels of the file are still to be turned; HEIF's reader has done so."""
-        return self.held if self.upright and self.path.suffix.lower() not in HEIF else 1
+    def decode(self, read: Callable[[Any], Any]) -> Any:
+        """The result of `read` on the file, opened by LibRaw if it is raw, else by Pillow, which turns HEIF upright."""
+        register_heif(self.path)
+        raw = self.suffix in RAW
+        with (
+            reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
+            need("rawpy", f"{self.path}").imread(str(self.path)) if raw else open_image(self.path) as file,
+        ):
+            return read(file)
 
     @cached_property
-    def held(self) -> int:
-        """By EXIF's numbers, how the camera was held, whoever turns the pixels, if anybody does."""
-        suffix = self.path.suffix.lower()
-        if suffix in HEIF:
-            let_open(self.path)
-            return read_as(self.path, "HEIF photograph", turned_before)
-        if suffix in RAW:
-            return FLIPS.get(read_as(self.path, "raw photograph", flip), 1)
+    def camera_orientation(self) -> int:
+        """How the camera was held, as an EXIF orientation. The file's pixels may be turned already."""
+        if self.suffix in HEIF:
+            return self.decode(lambda image: image.info.get("original_orientation") or 1)
+        if self.suffix in RAW:
+            return FLIPS.get(self.decode(lambda raw: raw.sizes.flip), 1)
         value = self.exif.get(ExifTags.Base.Orientation)
         return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
     @property
+    def orientation(self) -> int:
+        """How the file's pixels must still be turned, as an EXIF orientation; HEIF's reader has turned them."""
+        return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
+
+    @property
     def axes(self) -> np.ndarray:
-        """(3, 3): from the axes of the sensor, x right, y down, z forward, to those of `pixels`."""
-        return axes_of(self.held if self.upright or self.path.suffix.lower() in HEIF else 1)
+        """(3, 3) from the sensor's axes (x right, y down, z forward) to those of `pixels`."""
+        return orientation_axes(self.camera_orientation if self.upright or self.suffix in HEIF else 1)
 
     @cached_property
     def exif(self) -> Image.Exif:
-        """EXIF data, empty where there are none."""
+        """EXIF data; empty if there are none."""
         try:
-            let_open(self.path)
+            register_heif(self.path)
             with open_image(self.path) as image:
                 exif = image.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
                 return exif
-        except Exception:  # damaged, in one of many ways, or a raw format that Pillow does not know
+        except Exception:  # damaged data raise many kinds; Pillow does not know all raw formats
             return Image.Exif()
+
+    def exif_field(self, tag: int) -> Any:
+        """A field of the Exif part of the data; None if there is none."""
+        return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @cached_property
     def exposure(self) -> float:
-        """By EXIF, NaN where it says nothing."""
-        found = exposure_of(self.exif.get_ifd(ExifTags.IFD.Exif)) or 0.0
-        return found if found > 0 else np.nan
+        """Exposure time · ISO / aperture² by EXIF; NaN if unknown."""
+        exposure = exposure_of(self.exif.get_ifd(ExifTags.IFD.Exif)) or 0.0
+        return exposure if exposure > 0 else np.nan
 
     @property
     def encoding(self) -> Encoding:
-        """`linear` or `srgb`: what the numbers mean."""
-        return "linear" if self.path.suffix.lower() in RAW else "srgb"
+        """`linear` or `srgb`: the encoding of `pixels`."""
+        return "linear" if self.suffix in RAW else "srgb"
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """(width, height) [px]"""
-        let_open(self.path)
-        raw = self.path.suffix.lower() in RAW
-        width, height = read_as(self.path, "raw photograph", developed_size) if raw else image_size(self.path)
-        return (height, width) if self.orientation > 4 else (width, height)
+        """(width, height) of `pixels` [px]."""
+        register_heif(self.path)
+        raw = self.suffix in RAW
+        size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight)) if raw else image_size(self.path)
+        return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
-        """For features: (h, w) uint8 of so many pixels at most, each the mean of as many whole ones."""
+        """(h, w) uint8 for features: means of whole blocks of pixels, `longest` pixels along at most."""
         rgb = self.srgb()
         scale = -(-max(rgb.shape[:2]) // longest)
         height, width = (n // scale * scale for n in rgb.shape[:2])
@@ -128,7 +145,7 @@ class Picture:
 
     @cached_property
     def white(self) -> float:
-        """Of raw data, that has no brightness of its own: what is to look white, a share of full scale."""
+        """The value that raw data show as white, 1 = full scale: their brightness is arbitrary."""
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def linear(self) -> np.ndarray:
@@ -138,116 +155,79 @@ class Picture:
         return (value if self.encoding == "linear" else srgb_to_linear(value))[rgb]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
-        """The object as the user brings it, (H, W) uint8, 255 the object; None if this photograph has none.
+        """The user's mask, (H, W) uint8, 255 the object; None if this photograph has none.
 
-        `source`: "alpha", the channel of the photograph itself; "rembg", what that package thinks; else a folder with
-        masks called like the photographs. Raises InputError if one cannot be had or is of another size.
+        `source`: "alpha" for the alpha channel, "rembg" for a mask by that package, else a folder of masks named after
+        the photographs. Raises InputError if the mask cannot be read or has another size.
         """
-        if source == "alpha":
-            alpha = self.pixels[:, :, 3] if self.pixels.shape[2] == 4 else None
-            return None if alpha is None else (alpha // (np.iinfo(alpha.dtype).max // 255)).astype(np.uint8)
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
-        file = self.mask_file(Path(source))
-        if file is None:
+        if source == "alpha":
+            if self.pixels.shape[2] != 4:
+                return None
+            mask = self.pixels[:, :, 3]
+        elif file := self.mask_file(Path(source)):
+            mask = Picture(file, self.upright).pixels[:, :, 0]
+            if mask.shape[::-1] != self.size:
+                sizes = *mask.shape[::-1], *self.size
+                raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
+        else:
             return None
-        mask = Picture(file, self.upright).pixels[:, :, 0]
-        if mask.shape[::-1] != self.size:
-            sizes = *mask.shape[::-1], *self.size
-            raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
 
     def mask_file(self, folder: Path) -> Path | None:
-        """That of a folder that is called like this photograph; None if there is none."""
+        """The file in a folder that is named after this photograph; None if there is none."""
         files = (folder / f"{self.path.name}.png", folder / f"{self.name}.png")
         return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
-        """Let go of the pixels."""
+        """Free the memory of the pixels."""
         self.__dict__.pop("pixels", None)
 
 
-def let_open(path: Path) -> None:
-    """See that Pillow can open a file, if that is HEIF."""
+def register_heif(path: Path) -> None:
+    """Enable Pillow to open a file, if it is HEIF."""
     if path.suffix.lower() in HEIF:
         need("pillow_heif", f"{path}").register_heif_opener()
 
 
-def decode_heif(path: Path) -> np.ndarray:
-    """A HEIF photograph (H, W, 3) uint8, upright."""
-    with open_image(path) as image:
-        return np.array(image.convert("RGB"))
-
-
-def turned_before(path: Path) -> int:
-    """By EXIF's numbers, how a HEIF photograph would have to be turned, had its reader not done so."""
-    with open_image(path) as image:
-        return image.info.get("original_orientation") or 1
-
-
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
-    """What that package makes masks of photographs with; its network is loaded once."""
+    """The function of rembg that makes masks, with its network loaded."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
-def develop(path: Path) -> np.ndarray:
-    """A raw photograph (H, W, 3) uint16, linear radiance in sRGB's primaries, white balance as the camera chose it."""
-    rawpy = need("rawpy", f"{path}")
-    with rawpy.imread(str(path)) as raw:
-        require_plausible_size(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
-        return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
+def orientation_axes(orientation: int) -> np.ndarray:
+    """(3, 3) from the axes of pixels (x right, y down, z forward) to those after they are turned by an orientation."""
+    column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
+    return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
 
-def developed_size(path: Path) -> tuple[int, int]:
-    """(width, height) of what `develop` makes of a raw photograph."""
-    with need("rawpy", f"{path}").imread(str(path)) as raw:
-        return raw.sizes.iwidth, raw.sizes.iheight
+def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels (H, W, …) turned by an EXIF orientation."""
+    column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
+    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
-def flip(path: Path) -> int:
-    """How a raw photograph is turned, by LibRaw's numbers."""
-    with need("rawpy", f"{path}").imread(str(path)) as raw:
-        return raw.sizes.flip
+def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
+    """A vector (3,) fixed to the camera, or columns (3, n), in the axes of each photograph, by its name.
 
-
-def mirrors(orientation: int) -> tuple[bool, int, int]:
-    """What turns a picture of an orientation by EXIF: are rows columns, then the signs of columns and rows."""
-    columns, rows = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
-    return orientation > 4, columns, rows
-
-
-def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels (H, W, …) of an orientation by EXIF as they are to be shown."""
-    across, columns, rows = mirrors(orientation)
-    return np.ascontiguousarray((pixels.swapaxes(0, 1) if across else pixels)[::rows, ::columns])
-
-
-def axes_of(orientation: int) -> np.ndarray:
-    """(3, 3): from the axes of the sensor, x right, y down, z forward, to those of the photograph as it is shown."""
-    across, columns, rows = mirrors(orientation)
-    return np.diag([columns, rows, 1.0]) @ np.eye(3)[[1, 0, 2] if across else [0, 1, 2]]
-
-
-def turned_with(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """A direction (3,) of the camera that is given as most photographs show it, in the axes of each, by its name.
-
-    Several are the columns of a matrix (3, n).
+    `vector` is in the axes of most photographs as they are shown.
     """
-    usual, _ = Counter(picture.held for picture in pictures).most_common(1)[0]
-    return {p.name: p.axes @ axes_of(usual).T @ vector for p in pictures}
+    usual, _ = Counter(picture.camera_orientation for picture in pictures).most_common(1)[0]
+    return {p.name: p.axes @ orientation_axes(usual).T @ vector for p in pictures}
 
 
-def ups(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
-    """Where up is as each photograph is to be shown (3,), in the axes of its pixels, by its name."""
-    return {p.name: p.axes @ axes_of(p.held).T @ [0, -1, 0] for p in pictures}
+def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
+    """The direction that is up in each photograph as shown (3,), in the axes of its pixels, by its name."""
+    return {p.name: p.axes @ orientation_axes(p.camera_orientation).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
-    """The photographs of a folder, by name, turned or not.
+    """The photographs in a folder, by name. `upright`: turn their pixels as EXIF says?
 
-    Raises InputError if there is no such folder, if they are too few or if some are the same.
+    Raises InputError for a missing folder, for names that cannot be used, and for too few or identical photographs.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "
@@ -260,64 +240,49 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
         command.require_utf8(str(path))
         if "$" in path.name:
             raise InputError(f"{path}: FOLDER: has a $ in its name, which scene files take for a parameter; rename it")
-        # A camera that writes both raw and JPEG: the raw one is linear.
-        if path.stem not in found or kind in RAW:
+        if path.stem not in found or kind in RAW:  # of a raw file and a JPEG, the raw one is linear
             found[path.stem] = path
-    if len(found) < FEWEST:
+    if len(found) < MIN_PHOTOGRAPHS:
         raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({', '.join(PLAIN + HEIF)} or raw); at least "
-                         f"{FEWEST} are needed, better 40, from all around")  # fmt: skip
+                         f"{MIN_PHOTOGRAPHS} are needed, better 40, from all around")  # fmt: skip
     if "object" in found:
         raise InputError(f'{found["object"]}: FOLDER: "object" is what the scene calls the surface; rename the file')
-    require_different(list(found.values()))
+    sizes = Counter(path.stat().st_size for path in found.values())
+    copies = defaultdict(list)
+    for path in found.values():
+        if sizes[path.stat().st_size] > 1:
+            copies[hashlib.sha256(path.read_bytes()).digest()].append(path.name)
+    if names := next((names for names in copies.values() if len(names) > 1), None):
+        raise InputError(f"{folder}: FOLDER: {', '.join(names)} are the same photograph; keep one of them")
     return [Picture(path, upright) for path in found.values()]
 
 
-def require_different(files: Sequence[Path]) -> None:
-    """Raise InputError, which says which, if files have the same content."""
-    sizes = Counter(path.stat().st_size for path in files)
-    alike = defaultdict(list)
-    for path in files:
-        if sizes[path.stat().st_size] > 1:
-            alike[hashlib.sha256(path.read_bytes()).digest()].append(path.name)
-    for names in alike.values():
-        if len(names) > 1:
-            raise InputError(f"{files[0].parent}: FOLDER: {', '.join(names)} are the same photograph; keep one of them")
-
-
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """The focal length by EXIF, as of a frame 36 mm wide, of the first photograph that says; None if none does."""
-    for picture in pictures:
-        value = picture.exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
-        if isinstance(value, int | float) and value > 0:
-            return float(value)
-    return None
-
-
-def exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """(N,) by EXIF, NaN where it says nothing."""
-    return np.array([picture.exposure for picture in pictures])
+    """The focal length for film 36 mm wide, by the first photograph with one in EXIF; None if there is none [mm]."""
+    values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
+    return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """Which photographs do not say their exposure, where others do."""
-    missing = np.isnan(exposures(pictures))
-    return [] if missing.all() else [picture.path.name for picture, lacks in zip(pictures, missing) if lacks]
+    """Files of the photographs without an exposure in EXIF; empty if all are without."""
+    missing = [picture.path.name for picture in pictures if np.isnan(picture.exposure)]
+    return missing if len(missing) < len(pictures) else []
 
 
-def relative_exposures(pictures: Sequence[Picture], untold: float = 1.0) -> np.ndarray:
-    """(N,) by EXIF, 1 for the one in the middle, and `untold` where nothing is said."""
-    found = exposures(pictures)
-    known = np.isfinite(found)
-    return np.where(known, found / np.median(found[known]) if known.any() else 1.0, untold)
+def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
+    """(N,) exposures by EXIF, relative to their median; `unknown` for photographs without one."""
+    exposures = np.array([picture.exposure for picture in pictures])
+    known = np.isfinite(exposures)
+    return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 
 
-def unlit(pictures: Sequence[Picture]) -> list[str]:
-    """In which photographs the flash did not fire, by EXIF, where it fired in most; else in none: it may be a torch."""
-    fired = [picture.exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.Flash) for picture in pictures]
+def without_flash(pictures: Sequence[Picture]) -> list[str]:
+    """Files of the photographs whose flash did not fire, by EXIF; empty unless it fired in most: it may be a torch."""
+    fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
-def models(pictures: Sequence[Picture]) -> dict[str, int]:
-    """With which models of camera, by EXIF, how many photographs were taken."""
+def camera_names(pictures: Sequence[Picture]) -> dict[str, int]:
+    """The camera models in EXIF data, and how many photographs each has taken."""
     return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

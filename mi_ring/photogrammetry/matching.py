@@ -1,4 +1,4 @@
-"""What photographs have in common: features of each and matches between them, by COLMAP's library."""
+"""Features of the photographs and matches between them, by COLMAP's library."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -12,62 +12,61 @@ from PIL import Image
 from mi_ring.errors import InputError
 from mi_ring.photogrammetry.folder import Picture, focal_35mm
 from mi_ring.system.machine import interruptible
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
-#: Features are looked for in pictures of so many pixels at most, and so many of them. An evenly lit, smooth object has
-#: few strong ones: weak ones are let in, and what they are worth is told by geometry.
+pycolmap = LazyPackage("pycolmap", "structure from motion")
+#: Pixels along the pictures that features are searched in, number of features, and their least contrast. A smooth
+#: object under even light has few strong features: weak ones are kept, and geometric verification sorts them.
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
-ALL_PAIRS = 150  #: photographs up to which each is compared with each: with fewer pairs some are put in mirrored
-NEIGHBOURS, KEYS = 12, 40  #: beyond: with so many before and after, and so many of them with each other
-PAIRS_AT_ONCE = 60
-MATCHED = 50  #: matches of two photographs, from which they are worth something
-STILL, MOST = 0.01, 0.9  #: two photographs are alike if features move so little, in widths; and pairs that must not be
+ALL_PAIRS = 150  #: photographs up to which all pairs are matched: with fewer pairs some cameras come out mirrored
+NEIGHBOURS, KEYS = 12, 40  #: with more: so many neighbours on each side, and so many key photographs with each other
+BATCH = 60  #: pairs that are matched at a time
+MIN_MATCHES = 50  #: of a pair of photographs that overlap
+STATIC, MAX_STATIC = 0.01, 0.9  #: motion of features of a static pair, relative to the width; share of such pairs
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Reduced pictures in grey, and their features in the database."""
-    pycolmap = need("pycolmap", "features")
+    """Write reduced grey pictures, and their features to the database; those that are there are kept."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
-    cameras = {image.name: image.camera_id for image in images_of(database)}
-    lenses: dict[tuple[int, int], int] = {}
-    equivalent = {size: focal_35mm([p for p in pictures if p.size == size]) for size in {p.size for p in pictures}}
+    cameras = camera_ids(database)
+    shared: dict[tuple[int, int], int] = {}  # cameras by the size of the photographs
+    focal_lengths = {size: focal_35mm([p for p in pictures if p.size == size]) for size in {p.size for p in pictures}}
     for picture in progress(pictures, "features"):
-        file = file_of(picture)
+        file = grey_file(picture)
         if file not in cameras:
             reduced = Image.fromarray(picture.grey(LONGEST))
             picture.close()
             reduced.save(grey / file)
             reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-            if picture.size in lenses:
-                reader.existing_camera_id = lenses[picture.size]
-            elif known := equivalent[picture.size]:
-                focal = known / 36 * max(reduced.size)
+            if picture.size in shared:
+                reader.existing_camera_id = shared[picture.size]
+            elif equivalent := focal_lengths[picture.size]:
+                focal = equivalent / 36 * max(reduced.size)
                 reader.camera_params = f"{focal},{reduced.width / 2},{reduced.height / 2},0"
             mode = pycolmap.CameraMode.SINGLE
             interruptible(pycolmap.extract_features, database, grey, [file], mode, reader, options)
-            cameras = {image.name: image.camera_id for image in images_of(database)}
-        lenses.setdefault(picture.size, cameras[file])
+            cameras = camera_ids(database)
+        shared.setdefault(picture.size, cameras[file])
 
 
-def file_of(picture: Picture) -> str:
-    """The reduced picture's file name, without spaces, at which COLMAP's lists of pairs end a name."""
+def grey_file(picture: Picture) -> str:
+    """The name of a reduced picture, without spaces, which end names in COLMAP's lists of pairs."""
     return f"{quote(picture.name, safe='')}.png"
 
 
-def images_of(database: Path) -> list[Any]:
-    """The images of COLMAP's database; none if there is no database."""
+def camera_ids(database: Path) -> dict[str, int]:
+    """The cameras of the images in COLMAP's database, by file; empty if there is no database."""
     if not database.is_file():
-        return []
-    pycolmap = need("pycolmap", "features")
+        return {}
     with pycolmap.Database.open(database) as opened:
-        return opened.read_all_images()
+        return {image.name: image.camera_id for image in opened.read_all_images()}
 
 
 def pairs_to_match(count: int) -> list[tuple[int, int]]:
-    """Which of so many photographs are compared, by their place in the order of their names."""
+    """Which of `count` photographs, in the order of their names, are matched with each other."""
     pairs = itertools.combinations(range(count), 2)
     if count <= ALL_PAIRS:
         return list(pairs)
@@ -76,48 +75,45 @@ def pairs_to_match(count: int) -> list[tuple[int, int]]:
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Compare photographs with each other; pairs that the database has already are left as they are.
+    """Match pairs of photographs, except those in the database already.
 
-    Raises InputError after the first of them if they show everything from one place.
+    Raises InputError after the first batch if all photographs are from one viewpoint.
     """
-    pycolmap = need("pycolmap", "features")
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # else it depends on which thread has a pair
+    verification.ransac.random_seed = 0  # else it depends on the thread
     pairs = pairs_to_match(len(pictures))
-    batches = [pairs[k : k + PAIRS_AT_ONCE] for k in range(0, len(pairs), PAIRS_AT_ONCE)]
-    chosen = folder / "pairs.txt"
+    batches = [pairs[k : k + BATCH] for k in range(0, len(pairs), BATCH)]
+    database, listed = folder / "database.db", folder / "pairs.txt"
     for batch in progress(batches, "matching"):
-        named = [(file_of(pictures[a]), file_of(pictures[b])) for a, b in batch]
-        chosen.write_text("".join(f"{a} {b}\n" for a, b in named), "utf-8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
-        interruptible(pycolmap.match_image_pairs, folder / "database.db", matching, pairing, verification)
-        if batch is batches[0] and (share := alike(folder / "database.db", named)) >= MOST:
+        named = [(grey_file(pictures[a]), grey_file(pictures[b])) for a, b in batch]
+        listed.write_text("".join(f"{a} {b}\n" for a, b in named), "utf-8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+        interruptible(pycolmap.match_image_pairs, database, matching, pairing, verification)
+        if batch is batches[0] and (share := static_share(database, named)) >= MAX_STATIC:
             raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {len(batch)} pairs are "
                              "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
 
 
-def alike(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """The share of these pairs of files that match and where features move together, as from one place."""
-    pycolmap = need("pycolmap", "features")
+def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
+    """The share of these pairs of files that match and were taken from one viewpoint: all features move alike."""
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
-    asked, still = set(map(frozenset, pairs)), 0
-    for a, b, first, second in matches_of(database):
-        if frozenset((a.name, b.name)) in asked and len(first) >= MATCHED:
-            moved = first - second
-            away = np.linalg.norm(moved - np.median(moved, 0), axis=1)  # nobody holds a camera quite still
-            still += float(np.median(away)) < STILL * width[a.camera_id]
-    return still / len(pairs)
+    asked, static = set(map(frozenset, pairs)), 0
+    for a, b, first, second in read_matches(database):
+        if frozenset((a.name, b.name)) in asked and len(first) >= MIN_MATCHES:
+            motion = first - second
+            spread = np.linalg.norm(motion - np.median(motion, 0), axis=1)  # a hand moves the whole picture a little
+            static += float(np.median(spread)) < STATIC * width[a.camera_id]
+    return static / len(pairs)
 
 
-def matches_of(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Of every two images of COLMAP's database that match: both, and where the matches are in each, (n, 2) [px]."""
-    pycolmap = need("pycolmap", "features")
+def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
+    """Of each matched pair in COLMAP's database: both images, and the matches' positions (n, 2) in each [px]."""
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
-        places = {k: opened.read_keypoints(k)[:, :2] for k in images}
+        keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}
         for number, geometry in zip(*opened.read_two_view_geometries()):
             a, b = pycolmap.pair_id_to_image_pair(number)
             first, second = geometry.inlier_matches.T
-            yield images[a], images[b], places[a][first], places[b][second]
+            yield images[a], images[b], keypoints[a][first], keypoints[b][second]

@@ -1,4 +1,4 @@
-"""The object as the photographs show it: where it is, and its masks."""
+"""Finds the object in the photographs: where it is, and its masks."""
 
 import contextlib
 import hashlib
@@ -18,115 +18,106 @@ from mi_ring.images import read_image, write_image
 from mi_ring.importers.reading import read_as
 from mi_ring.importers.undistortion import Window
 from mi_ring.photogrammetry import automatic_masks
-from mi_ring.photogrammetry.capture_files import OBJECT, UNSURE, reduction
+from mi_ring.photogrammetry.automatic_masks import RefinementSettings, Segmentation, VoxelGrid, VoxelObject
+from mi_ring.photogrammetry.capture_files import OBJECT, UNKNOWN, reduction
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.reduced_photographs import View, around, camera_of, pasted, reduced, reduced_mask, whole_of
-from mi_ring.photogrammetry.shading_trial import coverages, sphere_of
-from mi_ring.photogrammetry.structure_from_motion import Motion
-from mi_ring.photogrammetry.table_plane import FLAT, Ground, Plane, Table, bare, find_plane
-from mi_ring.system.files import write_file
-from mi_ring.system.machine import in_threads
+from mi_ring.photogrammetry.reduced_photographs import ReducedView, paste_mask, read_windows, reduce_mask, window_around
+from mi_ring.photogrammetry.shading_trial import initial_sphere, shading_silhouettes
+from mi_ring.photogrammetry.structure_from_motion import SparseModel
+from mi_ring.photogrammetry.table_plane import FLATNESS, Plane, TableAppearance, TexelGrid, bare_table, find_plane
+from mi_ring.system.files import read_json, write_file
 from mi_ring.system.progress import Progress
 
-SURE = 0.8  #: agreement of a mask with what all say together that is needed at least
-COARSE, BROUGHT = 600, 1200  #: pixels at most along photographs in which the object is looked for, and of masks given
-SMALL, CLOSE = 200, 400  #: along the object, in the pictures that its hollows are found in, and its outlines
-FINE = 640  #: texels across the table's picture there
-WIDE = 2.0  #: how far the table is known from whole photographs, in their reach
+MIN_AGREEMENT = 0.8  #: of a mask with the common silhouette, intersection over union; else it is not used
+COARSE, GIVEN = 600, 1200  #: pixels along photographs in which the object is looked for, and along given masks; at most
+SMALL, CLOSE = 200, 400  #: pixels along the object in the views for its concavities and for its outlines
+TEXELS = 640  #: across the table's texture for those views
+WIDE = 2.0  #: half size of the table's texture from whole photographs, in that of their voxel grid
 
 
-class Object(NamedTuple):
+class SegmentedObject(NamedTuple):
     """The object as the photographs show it."""
 
-    masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, but for those that are not sure
+    masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, of `OBJECT`, `UNKNOWN` and 0
     center: np.ndarray  #: (3,)
-    level: float  #: its mean radiance, 1 = full scale
-    plane: Plane | None  #: of the table that it stands on, if there is one
+    radiance: float  #: of the object, mean, 1 = full scale
+    plane: Plane | None  #: the table under the object; None if there is none
 
 
-class Hints(NamedTuple):
-    """What is known of the object beforehand."""
+class SegmentationInput(NamedTuple):
+    """What the user, or the sheet, says of the object."""
 
-    plane: Plane | None = None  #: of the table
-    box: tuple[float, ...] | None = None  #: lowest and highest x, y, z of the object, one after another
-    masks: str | Path = "auto"  #: where masks come from, as `Picture.mask` says; "auto": they are found
+    plane: Plane | None = None  #: the table
+    box: tuple[float, ...] | None = None  #: lowest and highest x, y and z of the object, one after another
+    masks: str | Path = "auto"  #: "auto": find them; else as `Picture.mask` has it
 
     def digest(self) -> str:
-        """What tells where masks come from, and those of a folder, from others."""
+        """A text that changes with the source of the masks, and with the files in a folder of masks."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
-    def allow(self, points: np.ndarray, distance: float, flat: float = 2 * FLAT) -> np.ndarray:
-        """Where the object may be, of points (N, 3): (N,) bool. `distance` is that of the cameras.
+    def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
+        """(N,) bool: may points (N, 3) belong to the object? They must be in the box and above the table.
 
-        `flat`: in units of it, height up to which it may be the table.
+        `flatness`: height of the table's relief, in units of the distance from the cameras.
         """
         allowed = np.ones(len(points), bool)
         if self.plane:
-            allowed &= self.plane.height(points) > flat * distance
+            allowed &= self.plane.height(points) > flatness * camera_distance
         if self.box:
             low, high = np.reshape(self.box, (3, 2)).T
             allowed &= ((points >= low) & (points <= high)).all(1)
         return allowed
 
 
-def find_object(pictures: Sequence[Picture], motion: Motion, hints: Hints, folder: Path, progress: Progress) -> Object:
-    """The object and its masks.
+def find_object(
+    pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
+) -> SegmentedObject:
+    """The object and its masks. Masks in `folder` are used again: the user may have edited or removed some.
 
-    Masks that `folder` has already are taken as they are: anybody may have painted in them, or removed some. Raises
-    InputError if they were found with other cameras or hints.
+    Raises InputError if they were found with other cameras or another `known`, and if no object is found.
     """
     folder.mkdir(exist_ok=True)
-    kept = folder / "object.json"
-    asked = {"masks": hints.digest(), "box": hints.box and list(hints.box), "cameras": motion.digest()}
-    shown = [picture for picture in pictures if picture.name in motion.cameras]
-    if kept.exists():
-        known = json.loads(kept.read_text("utf-8"))
-        if other := [name for name, value in asked.items() if known["asked"][name] != value]:
+    record = folder / "object.json"
+    asked = {"masks": known.digest(), "box": known.box and list(known.box), "cameras": sparse.digest()}
+    placed = [picture for picture in pictures if picture.name in sparse.cameras]
+    if saved := read_json(record):
+        if other := [name for name, value in asked.items() if saved["asked"][name] != value]:
             what = "cameras" if "cameras" in other else f"--{other[0]}"
             raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
                              "anew, or give another DIR")  # fmt: skip
-        plane = known["plane"] and Plane(np.array(known["plane"][0]), known["plane"][1])
-        return Object(kept_masks(shown, folder), np.array(known["center"]), known["level"], plane)
-    for lens, _ in motion.cameras.values():
-        lens.is_pinhole  # noqa: B018  (loads pycolmap, if need be: it handles signals, which threads may not)
-
-    def whole(picture: Picture) -> View:
-        lens, pose = motion.cameras[picture.name]
-        view = reduced(picture, lens, pose, whole_of(lens, COARSE))
-        picture.close()
-        return view
-
-    views = list(progress(in_threads(whole, shown), "reading", len(shown)))
-    space = automatic_masks.Space.seen_by(views)
-    plane, sheet = hints.plane, hints.plane is not None
-    if not sheet:
-        positions = np.stack([view.camera.position for view in views])
-        plane = find_plane(motion.points, positions, space.center, space.reach)
-    if hints.masks == "auto":
-        body, shades = searched(shown, motion, space, hints._replace(plane=plane), sheet, progress)
+        plane = saved["plane"] and Plane(np.array(saved["plane"][0]), saved["plane"][1])
+        return SegmentedObject(kept_masks(placed, folder), np.array(saved["center"]), saved["level"], plane)
+    for lens, _ in sparse.cameras.values():
+        lens.colmap  # noqa: B018  (loads pycolmap here, not in a thread: it installs signal handlers)
+    windows = [[Window.whole(sparse.cameras[picture.name][0], COARSE)] for picture in placed]
+    views = [view for (view,) in read_windows(placed, windows, sparse.cameras, progress)]
+    grid, positions = VoxelGrid.seen_by(views), np.stack([view.camera.position for view in views])
+    plane = known.plane or find_plane(sparse.points, positions, grid.center, grid.half_size)
+    if known.masks == "auto":
+        sheet = known.plane is not None
+        found, masks = find_masks(placed, sparse, grid, known._replace(plane=plane), sheet, progress)
     else:
-        body, shades = brought(shown, motion, space, hints, progress)
-    for name, mask in shades.items():
+        found, masks = given_masks(placed, sparse, grid, known, progress)
+    for name, mask in masks.items():
         write_image(mask[..., None], folder / f"{name}.png")
-    small = {
-        view.name: automatic_masks.resized(shades[view.name] == OBJECT, view) for view in views if view.name in shades
-    }
-    levels = [view.linear[small[view.name]].mean() for view in views if view.name in small and small[view.name].any()]
-    result = Object(shades, body.points.mean(0), float(np.median(levels)), plane)
-    write_file(kept, json.dumps({
-        "asked": asked, "center": result.center.tolist(), "level": result.level,
+    shown = [view for view in views if view.name in masks]
+    small = [automatic_masks.resize_mask(masks[view.name] == OBJECT, view) for view in shown]
+    radiance = float(np.median([view.linear[mask].mean() for view, mask in zip(shown, small) if mask.any()]))
+    result = SegmentedObject(masks, found.points.mean(0), radiance, plane)
+    write_file(record, json.dumps({
+        "asked": asked, "center": result.center.tolist(), "level": radiance,
         "plane": plane and [plane.normal.tolist(), plane.offset],
     }))  # fmt: skip
     return result
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """By the photograph's name, masks of a folder as `Object` has them; what anybody painted is the nearest of these.
+    """The masks in a folder as `SegmentedObject` has them; other grey values are rounded.
 
-    Raises InputError if there is none, or one that is no reduction of its photograph.
+    Raises InputError if there are no masks, or if the size of one is no whole fraction of its photograph's.
     """
     found = {}
     for picture in pictures:
@@ -137,41 +128,42 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
             if (width, height) != (picture.size[0] // scale, picture.size[1] // scale):
                 raise InputError("{}: is {} x {} pixels, which is no whole part of the {} x {} of its photograph; keep "
                                  "the size of masks".format(file, width, height, *picture.size))  # fmt: skip
-            shade = mask / np.iinfo(mask.dtype).max if mask.dtype != np.float32 else mask
-            found[picture.name] = np.array([0, UNSURE, OBJECT], np.uint8)[np.digitize(shade, [0.25, 0.75])]
+            grey = mask / np.iinfo(mask.dtype).max if mask.dtype != np.float32 else mask
+            found[picture.name] = np.array([0, UNKNOWN, OBJECT], np.uint8)[np.digitize(grey, [0.25, 0.75])]
     if not found:
         raise InputError(f"{folder}: has no masks any more; remove it to have them found anew")
     return found
 
 
-def brought(
-    pictures: Sequence[Picture], motion: Motion, space: automatic_masks.Space, hints: Hints, progress: Progress
-) -> tuple[automatic_masks.Body, dict[str, np.ndarray]]:
-    """What the user's masks say the object is, and these masks by name, as `Object` has them."""
-    source, shades = hints.masks, {}
+def given_masks(
+    pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
+) -> tuple[VoxelObject, dict[str, np.ndarray]]:
+    """The object in the user's masks, and these masks as `SegmentedObject` has them.
+
+    Raises InputError if too few photographs have a mask, or if the masks have no object in common.
+    """
+    masks = {}
     for picture in progress(pictures, "masks"):
-        mask = picture.mask(source)
+        mask = picture.mask(known.masks)
         picture.close()
         if mask is not None:
-            lens, pose = motion.cameras[picture.name]
-            shade = OBJECT * reduced_mask(mask, lens, BROUGHT)
-            if hints.box:
-                shade *= box_in(camera_of(lens, pose).shrunk(whole_of(lens, BROUGHT).scale), hints.box)
-            shades[picture.name] = shade
-    require_half(len(shades), pictures, source)
-    space = automatic_masks.Space([view for view in space.views if view.name in shades], space.center, space.reach)
-    space.allowed = hints.allow(space.grid, space.distance)
-    body = space.vote(
-        [automatic_masks.resized(shades[view.name] == OBJECT, view) for view in space.views], automatic_masks.AGREE
-    )
-    if body is None:
-        raise InputError(f"--masks: {source}: no point in space {'of --box ' * bool(hints.box)}is inside most of these "
-                         "masks; are they of these photographs?")  # fmt: skip
-    return body, shades
+            lens, pose = sparse.cameras[picture.name]
+            masks[picture.name] = OBJECT * reduce_mask(mask, lens, GIVEN)
+            if known.box:
+                masks[picture.name] *= box_mask(lens.camera(pose).shrunk(Window.whole(lens, GIVEN).scale), known.box)
+    require_half(len(masks), pictures, known.masks)
+    grid = VoxelGrid([view for view in grid.views if view.name in masks], grid.center, grid.half_size)
+    grid.allowed = known.allows(grid.points, grid.camera_distance)
+    small = [automatic_masks.resize_mask(masks[view.name] == OBJECT, view) for view in grid.views]
+    found = grid.vote(small, automatic_masks.MIN_AGREEMENT)
+    if found is None:
+        raise InputError(f"--masks: {known.masks}: no point in space {'of --box ' * bool(known.box)}is inside most of "
+                         "these masks; are they of these photographs?")  # fmt: skip
+    return found, masks
 
 
 def require_half(count: int, pictures: Sequence[Picture], source: str | Path) -> None:
-    """Raise InputError unless half of the photographs have a mask."""
+    """Raise InputError if the `count` of masks is below half of the photographs."""
     if count < len(pictures) / 2:
         name = pictures[0].path.name
         what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
@@ -179,111 +171,96 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
         raise InputError(f"{what} masks for {count} of {len(pictures)} photographs; must be half of them: {how}")
 
 
-def box_in(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """(H, W) uint8: 1 where a photograph shows a box, as `Hints.box` has it."""
-    corners = np.array(list(itertools.product(*np.reshape(box, (3, 2)))))
-    pixels, depth = camera.project(corners)
-    if depth.min() <= 0:  # the camera is next to it
+def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
+    """(H, W) uint8: 1 where a photograph shows the box, as `SegmentationInput` has it."""
+    pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
+    if depth.min() <= 0:  # a corner is behind the camera
         return np.ones(camera.size[::-1], np.uint8)
     hull = cv2.convexHull(np.clip(pixels, -1e6, 1e6).astype(np.float32))
     return cv2.fillConvexPoly(np.zeros(camera.size[::-1], np.uint8), np.round(hull).astype(np.int32), 1)
 
 
-def searched(
-    pictures: Sequence[Picture],
-    motion: Motion,
-    space: automatic_masks.Space,
-    hints: Hints,
-    sheet: bool,
+def find_masks(
+    pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, sheet: bool,
     progress: Progress,
-) -> tuple[automatic_masks.Body, dict[str, np.ndarray]]:
-    """The object, and masks of all photographs but those that do not show it or are not sure.
+) -> tuple[VoxelObject, dict[str, np.ndarray]]:  # fmt: skip
+    """The object, located in whole photographs, and its masks where it is clear, refined in windows around it.
 
-    First in whole photographs, reduced; then closer to what was found. `sheet`: is the plane that of the sheet?
+    `sheet`: is the plane that of the printed sheet? Raises InputError if no object is found or too few masks agree.
     """
-    folder, plane = pictures[0].path.parent, hints.plane
-    body = find_body(space, motion.points, hints, sheet, progress)
-    covered = [(p, body.coverage(view)) for p, view in zip(pictures, space.views)] if body else []
-    showing = [(picture, cover) for picture, cover in covered if cover.any()]
-    if body is None or len(showing) < len(pictures) / 2:
-        where = " in --box" if hints.box else ""
+    folder = pictures[0].path.parent
+    found = locate_object(grid, sparse.points, known, sheet, progress)
+    silhouettes = [found.silhouette(view) for view in grid.views] if found else []
+    showing = [(picture, silhouette) for picture, silhouette in zip(pictures, silhouettes) if silhouette.any()]
+    if found is None or len(showing) < len(pictures) / 2:
+        where = " in --box" if known.box else ""
         raise InputError(f"{folder}: masks: no object was found{where}, neither one that stands on a table nor one "
                          "that the flash lights more than what is around it; give --masks")  # fmt: skip
-
-    def near(picture: Picture, cover: np.ndarray) -> tuple[View, View, Window]:
-        lens, pose = motion.cameras[picture.name]
-        window = around(lens, cover, CLOSE)
-        coarse, fine = (reduced(picture, lens, pose, part) for part in (around(lens, cover, SMALL), window))
-        picture.close()
-        return coarse, fine, window
-
-    small, close, windows = zip(*progress(in_threads(near, *zip(*showing)), "reading", len(showing)))
-    found = outlines(small, body, space, hints, automatic_masks.HOLLOWS, progress)
-    found = found and outlines(close, found.body, space, hints, automatic_masks.OUTLINES, progress)
-    sure = sum(agreed >= SURE for agreed in found.agreement) if found else 0
-    if found is None or sure < len(pictures) / 2:
+    windows = [[window_around(sparse.cameras[picture.name][0], silhouette, pixels) for pixels in (SMALL, CLOSE)]
+               for picture, silhouette in showing]  # fmt: skip
+    small, close = zip(*read_windows([picture for picture, _ in showing], windows, sparse.cameras, progress))
+    result = refine_object(small, found, grid, known, automatic_masks.CONCAVITIES, progress)
+    result = result and refine_object(close, result.object, grid, known, automatic_masks.OUTLINES, progress)
+    sure = sum(agreement >= MIN_AGREEMENT for agreement in result.agreement) if result else 0
+    if result is None or sure < len(pictures) / 2:
         raise InputError(f"{folder}: masks: those of {sure} of {len(pictures)} photographs agree; give --masks")
-    shades = {}
-    for view, window, mask, agreed in zip(close, windows, found.masks, found.agreement):
-        if agreed >= SURE:
-            if plane:  # beside the object there are shadows
-                maybe = automatic_masks.disputed(mask, found.body.coverage(view), found.body.pixels(view))
+    masks = {}
+    for view, (_, window), mask, agreement in zip(close, windows, result.masks, result.agreement):
+        if agreement >= MIN_AGREEMENT:
+            if known.plane:  # there are shadows beside the object
+                silhouette, tolerance = result.object.silhouette(view), result.object.voxel_pixels(view)
+                unknown = automatic_masks.disputed_pixels(mask, silhouette, tolerance)
             else:
-                maybe = automatic_masks.unsure(mask, automatic_masks.bright(view))
-            shade = np.where(maybe, UNSURE, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
-            shades[view.name] = pasted(shade, motion.cameras[view.name][0], window)
-    return found.body, shades
+                unknown = automatic_masks.touching_pixels(mask, automatic_masks.bright_mask(view))
+            mask = np.where(unknown, UNKNOWN, np.where(mask > 0, OBJECT, 0)).astype(np.uint8)
+            masks[view.name] = paste_mask(mask, sparse.cameras[view.name][0], window)
+    return result.object, masks
 
 
-def outlines(
-    views: Sequence[View],
-    body: automatic_masks.Body,
-    whole: automatic_masks.Space,
-    hints: Hints,
-    care: automatic_masks.Care,
-    progress: Progress,
-) -> automatic_masks.Found | None:
-    """Masks of views that are near to the object, from what is known of it by now. `whole`: the whole photographs."""
-    space = automatic_masks.Space.about(views, body)
-    space.allowed = hints.allow(space.grid, space.distance, FLAT / 2)
-    covered, tables = [body.coverage(view) for view in views], automatic_masks.nothing(views)
-    if hints.plane:
-        near = Ground(hints.plane, space.center, space.reach, FINE)
-        far = Ground(hints.plane, space.center, WIDE * whole.reach, FINE)
-        places = (views, near, covered), (whole.views, far, [body.coverage(view) for view in whole.views])
-        known = [Table(of, ground, progress, [grown(c, care.band) for c in shown]) for of, ground, shown in places]
-        tables = bare(views, covered, known, progress) or known[0].patterns()
-    else:  # a part of the object that the flash grazes is as dark as the room: a few photographs do not tell
-        care = care._replace(agree=automatic_masks.AGREE)
-    return automatic_masks.settle(space, covered, tables, progress, care)
+def refine_object(
+    views: Sequence[ReducedView], found: VoxelObject, whole: VoxelGrid, known: SegmentationInput,
+    settings: RefinementSettings, progress: Progress,
+) -> Segmentation | None:  # fmt: skip
+    """Refined masks in views of the object, which is `found` so far. `whole`: the grid with the whole photographs."""
+    grid = VoxelGrid.around(views, found)
+    grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
+    silhouettes, backgrounds = [found.silhouette(view) for view in views], automatic_masks.empty_masks(views)
+    if known.plane:
+        near = TexelGrid(known.plane, grid.center, grid.half_size, TEXELS)
+        far = TexelGrid(known.plane, grid.center, WIDE * whole.half_size, TEXELS)
+        parts = (views, near, silhouettes), (whole.views, far, [found.silhouette(view) for view in whole.views])
+        tables = [TableAppearance(own, texels, progress, [grown(s, settings.band) for s in hidden])
+                  for own, texels, hidden in parts]  # fmt: skip
+        backgrounds = bare_table(views, silhouettes, tables, progress) or tables[0].pattern_masks()
+    else:  # parts that the flash grazes are as dark as the room: a few photographs must not decide
+        settings = settings._replace(agreement=automatic_masks.MIN_AGREEMENT)
+    return automatic_masks.refine_masks(grid, silhouettes, backgrounds, progress, settings)
 
 
-def find_body(
-    space: automatic_masks.Space, points: np.ndarray, hints: Hints, sheet: bool, progress: Progress
-) -> automatic_masks.Body | None:
-    """The object by what differs from the table that it stands on; else by brightness; else by a trial fit.
+def locate_object(
+    grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, sheet: bool, progress: Progress
+) -> VoxelObject | None:
+    """The object by its difference from the table, else by its brightness, else by a short fit; None if all fail.
 
-    Not by brightness on a `sheet`, which differs from any object: there it would be the paper. Elsewhere what has the
-    table's pattern is left out, for the flash lights the middle of the table, too. `points` (N, 3): the sparse ones,
-    which say where the trial begins.
+    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used on a `sheet`, as paper is bright,
+    nor on pixels with the table's pattern, as the flash lights the middle of the table.
     """
-    space.allowed = hints.allow(space.grid, space.distance)
-    ground = hints.plane and Ground(hints.plane, space.center, space.reach)
-    table = ground and Table(space.views, ground, progress)
-    tables = table.patterns() if table else automatic_masks.nothing(space.views)
+    grid.allowed = known.allows(grid.points, grid.camera_distance)
+    table = known.plane and TableAppearance(grid.views, TexelGrid(known.plane, grid.center, grid.half_size), progress)
+    backgrounds = table.pattern_masks() if table else automatic_masks.empty_masks(grid.views)
 
     def guesses() -> Iterator[list[np.ndarray]]:
         if table:
-            yield table.others()
+            yield table.foreign_masks()
         if not sheet:
-            yield [automatic_masks.bright(view) & (1 - known) for view, known in zip(space.views, tables)]
-        sphere = sphere_of(points[hints.allow(points, space.distance)], space.center, space.reach)
-        with contextlib.suppress(InputError):  # it diverged
+            yield [automatic_masks.bright_mask(view) & (1 - mask) for view, mask in zip(grid.views, backgrounds)]
+        sphere = initial_sphere(points[known.allows(points, grid.camera_distance)], grid.center, grid.half_size)
+        with contextlib.suppress(InputError):  # the fit diverged
             if sphere:
-                yield coverages(space.views, *sphere, progress)
+                yield shading_silhouettes(grid.views, *sphere, progress)
 
     for guess in guesses():
-        found = automatic_masks.settle(space, guess, tables, progress)
-        if found and found.quality >= SURE:
-            return found.body
+        result = automatic_masks.refine_masks(grid, guess, backgrounds, progress)
+        if result and np.quantile(result.agreement, 0.2) >= MIN_AGREEMENT:
+            return result.object
     return None

@@ -1,4 +1,4 @@
-"""What the object might be by its shading alone: a short fit without masks, from the sphere of the sparse points."""
+"""Finds the object by its shading alone: a short fit without masks, which starts from a sphere of sparse points."""
 
 from collections.abc import Sequence
 
@@ -7,43 +7,46 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.photogrammetry.reduced_photographs import View
+from mi_ring.photogrammetry.reduced_photographs import ReducedView
 from mi_ring.rendering import prediction
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
 
 ITERATIONS = 100
-FEWEST = 30  #: points that tell where the object is
-INNER, OUTER = 0.15, 0.8  #: least and largest radius of the sphere, in the reach of what is looked at
-DIM = 3.0  #: mean albedo by lights of unknown intensity: more than all light is reflected, which tells that they are
+MIN_POINTS = 30  #: near the object
+MIN_RADIUS, MAX_RADIUS = 0.15, 0.8  #: of the sphere, relative to the half size of the voxel grid
+#: Mean albedo that the assumed intensity implies if the true one is unknown. It is above 1, so that fits notice.
+ASSUMED_ALBEDO = 3.0
 SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128,), shares=(1,), subdivisions=4,
                          masks="given", domain="sphere", weights={"mask": 0.0})  # fmt: skip
 
 
-def sphere_of(points: np.ndarray, center: np.ndarray, reach: float) -> tuple[np.ndarray, float] | None:
-    """Centre (3,) and radius of a sphere of about the size of what most points (N, 3) near `center` show.
+def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
+    """Centre (3,) and radius of a sphere that holds most of the points (N, 3) near `center`.
 
-    None if there are too few: then nothing may be there.
+    None if there are too few points: there may be no object.
     """
-    near = points[np.linalg.norm(points - center, axis=1) < reach]
-    if len(near) < FEWEST:
+    near = points[np.linalg.norm(points - center, axis=1) < half_size]
+    if len(near) < MIN_POINTS:
         return None
     middle = np.median(near, axis=0)
     radius = float(np.quantile(np.linalg.norm(near - middle, axis=1), 0.8))
-    return middle, float(np.clip(radius, INNER * reach, OUTER * reach))
+    return middle, float(np.clip(radius, MIN_RADIUS * half_size, MAX_RADIUS * half_size))
 
 
-def coverages(views: Sequence[View], center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """What a surface that explains the photographs covers of each view: (H, W) uint8, 1 the object.
+def shading_silhouettes(
+    views: Sequence[ReducedView], center: np.ndarray, radius: float, progress: Progress
+) -> list[np.ndarray]:
+    """(H, W) uint8 of each view: 1 where it shows the fitted surface, which starts as a sphere.
 
-    The light is taken to be at the lens. The surface starts as a sphere about `center` (3,) with this `radius`.
+    The flash is taken to be at the lens. Raises InputError if the fit diverges.
     """
-    away = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
-    level = float(np.median([view.linear[view.shown].mean() for view in views]))
-    intensity = np.full(3, np.pi * level / DIM * away**2)
+    distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
+    level = float(np.median([view.linear[view.valid].mean() for view in views]))
+    intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)
     lights = [Light("point", view.camera.position, intensity) for view in views]
     capture = Capture.from_arrays(
-        [view.rgb for view in views], valid=[view.shown for view in views], cameras=[view.camera for view in views],
+        [view.rgb for view in views], valid=[view.valid for view in views], cameras=[view.camera for view in views],
         lights=lights, center=center, radius=radius, name="a trial fit",
     )  # fmt: skip
     fit = Fit(capture, SETTINGS)

@@ -1,4 +1,4 @@
-"""The way from photographs to a capture, stage by stage; what each has found is kept, to go on from there."""
+"""The stages from photographs to a capture. Each keeps its results, so that an interrupted run continues from there."""
 
 import contextlib
 import json
@@ -17,187 +17,176 @@ from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
-from mi_ring.photogrammetry.flash_light import Ball, Flash, find_flash
-from mi_ring.photogrammetry.folder import Picture, let_open, relative_exposures, turned_with
-from mi_ring.photogrammetry.marker_sheet import Board, Sighting, White, calibrate, white
-from mi_ring.photogrammetry.object_masks import Object
-from mi_ring.photogrammetry.shading_trial import DIM
-from mi_ring.photogrammetry.structure_from_motion import Motion, model_points, structure_from_motion
+from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
+from mi_ring.photogrammetry.folder import Picture, register_heif, relative_exposures, turn_with_cameras
+from mi_ring.photogrammetry.marker_sheet import MarkerSheet, PaperSamples, SheetDetection, calibrate, sample_paper
+from mi_ring.photogrammetry.object_masks import SegmentedObject
+from mi_ring.photogrammetry.shading_trial import ASSUMED_ALBEDO
+from mi_ring.photogrammetry.structure_from_motion import SparseModel, model_points, structure_from_motion
 from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.scene.lights import Light
-from mi_ring.system.files import write_file, writing
+from mi_ring.system.files import read_json, write_file, writing
 from mi_ring.system.machine import in_threads
+from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
 
-FEWEST_DEGREES = 15.0  #: between the directions of two of the photographs
-FEWEST_SIGHTINGS = 3  #: photographs that must show the sheet
-FORMAT = 2  #: of what is kept; to be raised whenever that changes
+MIN_DEGREES = 15.0  #: between the directions of two of the photographs
+MIN_DETECTIONS = 3  #: photographs that must show the sheet
+FORMAT = 2  #: of the kept results; raise it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if what a folder holds was found in other photographs, or by another version."""
+    """Raise InputError if the results in `folder` are of other photographs or of another version of the format."""
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
-    kept, first = folder / "photographs.json", folder / "sheet.json"  # before this is there, nothing was found in them
-    photographs = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}
-    if first.exists() and kept.exists():
-        known = json.loads(kept.read_text("utf-8"))
-        if known.get("format") != FORMAT:
+    record, first = folder / "photographs.json", folder / "sheet.json"  # without the latter there are no results
+    photographs, saved = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}, read_json(record)
+    if first.exists() and saved:
+        if saved.get("format") != FORMAT:
             raise InputError(f"{folder}: was begun by another version of mi_ring, which kept other things; remove it, "
                              "or give another DIR")  # fmt: skip
-        if known["photographs"] != photographs:
+        if saved["photographs"] != photographs:
             raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, "
                              "or give another DIR")  # fmt: skip
-    write_file(kept, json.dumps({"format": FORMAT, "photographs": photographs}))
+    write_file(record, json.dumps({"format": FORMAT, "photographs": photographs}))
 
 
-def upright(
-    motion: Motion, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
-) -> tuple[Motion, Plane | None, bool]:
-    """Moved so that the object's `center` (3,) is the origin, and z the table's normal or the photographs' mean up.
+def make_upright(
+    sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
+) -> tuple[SparseModel, Plane | None, bool]:
+    """The model and the table in a frame with origin `center` (3,), z up, and unit the cameras' distance; is up known?
 
-    `ups` (3,): where that is in the axes of each camera.
-
-    The unit is the median distance from the cameras to the object. Also: is there an up? Not if photographs without a
-    table were held in every way.
+    Up is the table's normal, or else the mean of `ups` (3,), each in the axes of its camera, unless these cancel out.
     """
-    poses = np.stack([pose for _, pose in motion.cameras.values()])
-    scale = 1 / float(np.median(np.linalg.norm(poses[:, :3, 3] - center, axis=1)))
-    up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in motion.cameras.items()], 0)
+    scale = 1 / sparse.distance(center)
+    up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
     known = bool(np.linalg.norm(up) > 0.1)
-    rotation = rotation_to_z(up / np.linalg.norm(up)) if known else np.eye(3)
+    rotation = Rotation.align_vectors([[0, 0, 1.0]], [up / np.linalg.norm(up)])[0].as_matrix() if known else np.eye(3)
     table = plane and Plane(rotation @ plane.normal, scale * (plane.offset - float(center @ plane.normal)))
-    return motion.moved(scale, rotation, -scale * rotation @ center), table, known
+    return sparse.moved(scale, rotation, -scale * rotation @ center), table, known
 
 
-def rotation_to_z(direction: np.ndarray) -> np.ndarray:
-    """The shortest rotation (3, 3) of a unit vector to z."""
-    return Rotation.align_vectors([[0, 0, 1.0]], [direction])[0].as_matrix()
+class SheetObservations(NamedTuple):
+    """The printed sheet in the photographs, by the photograph's name."""
+
+    detections: dict[str, SheetDetection]
+    papers: dict[str, PaperSamples]
 
 
-class Sheet(NamedTuple):
-    """What photographs show of the printed sheet."""
+def find_sheet(
+    pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
+) -> SheetObservations | None:
+    """The sheet with squares of this size [mm]; None if fewer than three photographs show it.
 
-    sightings: dict[str, Sighting]  #: by the photograph's name
-    white: dict[str, White]  #: by the same
+    Raises InputError, which names them, if photographs cannot be read.
+    """
+    record = folder / "sheet.json"
+    if (saved := read_json(record)) is None:
 
-
-def require_read(pictures: Sequence[Picture], found: Sequence[object]) -> None:
-    """Raise InputError, which names all of them, if photographs could not be read: those with an error."""
-    bad = [(picture.path, error) for picture, error in zip(pictures, found) if isinstance(error, InputError)]
-    if len(bad) > 1:
-        names = ", ".join(path.name for path, _ in bad)
-        raise InputError(f"{bad[0][1]}; {len(bad)} photographs cannot be read: {names}; mend or remove them")
-    if bad:
-        raise InputError(f"{bad[0][1]}; mend or remove it")
-
-
-def find_sheet(pictures: Sequence[Picture], square: float, folder: Path, progress: Progress) -> Sheet | None:
-    """Where photographs show the sheet, whose squares measure so much [mm]; None if fewer than three do."""
-    kept = folder / "sheet.json"
-    if kept.exists():
-        known = json.loads(kept.read_text("utf-8"))
-    else:
-
-        def seen(picture: Picture) -> list | InputError | None:
+        def observe(picture: Picture) -> list | InputError | None:
             try:
-                return shown(picture)
+                detection = MarkerSheet(1.0).detect(picture.srgb())
+                paper = sample_paper(picture.linear(), detection) if detection else ()
+                return [a.tolist() for a in (*detection, *paper)] if detection else None
             except InputError as error:
-                if isinstance(error.__cause__, ImportError):  # not the file's fault: a package is missing
+                if isinstance(error.__cause__, ImportError):  # a package is missing: not the file's fault
                     raise
                 return error
+            finally:
+                picture.close()
 
-        def shown(picture: Picture) -> list | None:
-            sighting = Board(1.0).detect(picture.srgb())
-            paper = white(picture.linear(), sighting) if sighting else ()
-            picture.close()
-            return [a.tolist() for a in (*sighting, *paper)] if sighting else None
-
-        found = list(progress(in_threads(seen, pictures), "sheet", len(pictures)))
-        require_read(pictures, found)
-        known = {picture.name: values for picture, values in zip(pictures, found) if values}
-        write_file(kept, json.dumps(known))
-    sightings, papers = {}, {}
-    for name, (ids, points, pixels, places, colours, beside) in known.items():
-        sightings[name] = Sighting(np.array(ids), square * np.array(points), np.array(pixels))
-        papers[name] = White(square * np.reshape(places, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(beside, bool))
-    if len(sightings) < FEWEST_SIGHTINGS:
-        return None
-    return Sheet(sightings, papers)
+        results = list(progress(in_threads(observe, pictures), "sheet", len(pictures)))
+        if bad := [(p.path.name, error) for p, error in zip(pictures, results) if isinstance(error, InputError)]:
+            names = ", ".join(name for name, _ in bad)
+            more = f"{len(bad)} photographs cannot be read: {names}; mend or remove them"
+            raise InputError(f"{bad[0][1]}; {more if len(bad) > 1 else 'mend or remove it'}")
+        saved = {picture.name: values for picture, values in zip(pictures, results) if values}
+        write_file(record, json.dumps(saved))
+    detections, papers = {}, {}
+    for name, (ids, corners, pixels, points, colours, in_margin) in saved.items():
+        detections[name] = SheetDetection(np.array(ids), square * np.array(corners), np.array(pixels))
+        points, colours = square * np.reshape(points, (-1, 3)), np.reshape(colours, (-1, 3))
+        papers[name] = PaperSamples(points, colours, np.array(in_margin, bool))
+    return SheetObservations(detections, papers) if len(detections) >= MIN_DETECTIONS else None
 
 
-def cameras_beside(pictures: Sequence[Picture]) -> Motion | None:
-    """The cameras that lie beside the photographs in the format of another tool; None if there are none."""
+def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
+    """The cameras beside the photographs in the format of another tool; None if there are none.
+
+    Raises InputError if they are invalid, of another size, or missing for most photographs.
+    """
     source = detect(pictures[0].path.parent)
     if source is None:
         return None
     source = replace(source, photographs=[picture.path for picture in pictures])
-    if isinstance(source, Photogrammetry):  # exposures are found elsewhere, where some may be missing
+    if isinstance(source, Photogrammetry):  # exposures come from `Picture`, where some may be missing
         source = replace(source, exif=False)
     for picture in pictures:
-        let_open(picture.path)
-    taken = frames_of(source)
-    require_cameras(taken)
-    frames = {frame.image.stem: frame for frame in taken}
+        register_heif(picture.path)
+    imported = frames_of(source)
+    require_cameras(imported)
+    frames = {frame.image.stem: frame for frame in imported}
     for p in pictures:
-        if p.name in frames and frames[p.name].size != p.size:
+        if p.name in frames and frames[p.name].lens.size != p.size:
             raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
-                source.src, *frames[p.name].size, p.path.name, *p.size))  # fmt: skip
+                source.src, *frames[p.name].lens.size, p.path.name, *p.size))  # fmt: skip
     cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
     failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
     if len(cameras) < len(failed):
         raise InputError(f"{source.src}: has cameras for {len(cameras)} of {len(pictures)} photographs; move it away "
                          "to have cameras found in the photographs")  # fmt: skip
-    model = Colmap.model(source.src)
-    points = model_points(model) if isinstance(source, Colmap) and model else np.zeros((0, 3))
-    # Geocentric coordinates of metres are too large for float32.
+    points, folder = np.zeros((0, 3)), Colmap.model(source.src)
+    if isinstance(source, Colmap) and folder:
+        points = model_points(need("pycolmap", f"{folder}").Reconstruction(folder))
+    # Geocentric coordinates in metres are too large for float32.
     middle = np.median([pose[:3, 3] for _, pose in cameras.values()], axis=0)
-    return Motion(cameras, points, None, failed, f"{source.src}").moved(1.0, np.eye(3), -middle)
+    return SparseModel(cameras, points, None, failed, f"{source.src}").moved(1.0, np.eye(3), -middle)
 
 
-def require_sides(motion: Motion, folder: Path) -> None:
-    """Raise InputError if all photographs are from one side, which does not tell how deep anything is."""
-    ahead = np.stack([pose[:3, 2] for _, pose in motion.cameras.values()])
-    widest = float(np.degrees(np.arccos(np.clip((ahead @ ahead.T).min(), -1, 1))))
-    if widest < FEWEST_DEGREES:
+def require_parallax(sparse: SparseModel, folder: Path) -> None:
+    """Raise InputError if all photographs are from one side: depth is then unknown."""
+    forward = np.stack([pose[:3, 2] for _, pose in sparse.cameras.values()])
+    widest = float(np.degrees(np.arccos(np.clip((forward @ forward.T).min(), -1, 1))))
+    if widest < MIN_DEGREES:
         raise InputError(f"{folder}: photographs: all are from one side, within {widest:.0f} degrees; walk around the "
                          "object, 10 degrees at a time")  # fmt: skip
 
 
 def find_cameras(
-    pictures: Sequence[Picture], sheet: Sheet | None, turntable: bool, folder: Path, progress: Progress
-) -> Motion:
-    """Cameras: those that lie beside the photographs, else from structure from motion, else from the sheet.
+    pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
+) -> SparseModel:
+    """The cameras of another tool, else from structure from motion, else from the sheet.
 
-    On a turntable structure from motion would take the room that stands still for the object.
+    On a turntable from the sheet only: structure from motion would track the room. Raises InputError if too few
+    photographs get a camera.
     """
     if turntable:
         if sheet is None:
             raise InputError(f"{pictures[0].path.parent}: --turntable: the sheet of `mi-ring board` must turn with the "
                              "object; fewer than three photographs show it")  # fmt: skip
-        return cameras_of_sheet(pictures, sheet)
-    if beside := cameras_beside(pictures):
-        return beside
+        return cameras_from_sheet(pictures, sheet)
+    if imported := imported_cameras(pictures):
+        return imported
     try:
-        return structure_from_motion(pictures, sheet.sightings if sheet else {}, folder, progress)
+        return structure_from_motion(pictures, sheet.detections if sheet else {}, folder, progress)
     except InputError as error:
-        if sheet is None or len(sheet.sightings) < len(pictures) / 2:
+        if sheet is None or len(sheet.detections) < len(pictures) / 2:
             raise
         print(f"{error}\nThe cameras are those by the sheet alone.")
-        return cameras_of_sheet(pictures, sheet)
+        return cameras_from_sheet(pictures, sheet)
 
 
-def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
-    """Cameras from the sheet alone, in its frame [mm]: of objects without texture, and on turntables."""
-    by_size: dict[tuple[int, int], list[str]] = {}
-    for picture in pictures:
-        by_size.setdefault(picture.size, []).append(picture.name)
+def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
+    """Cameras from the sheet alone, in its frame [mm]: for objects without texture, and for turntables.
+
+    Raises InputError if less than half of the photographs get a camera.
+    """
     cameras: dict[str, tuple[Lens, np.ndarray]] = {}
     errors: list[float] = []
-    for size, names in by_size.items():
-        sightings = {name: sheet.sightings[name] for name in names if name in sheet.sightings}
+    for size in dict.fromkeys(picture.size for picture in pictures):
+        names = [p.name for p in pictures if p.size == size and p.name in sheet.detections]
         with contextlib.suppress(InputError):  # too few of this size
-            lens, poses, own = calibrate(sightings, size)
+            lens, poses, own = calibrate({name: sheet.detections[name] for name in names}, size)
             cameras |= {name: (lens, pose) for name, pose in poses.items()}
             errors += own.values()
     if len(cameras) < len(pictures) / 2:
@@ -205,50 +194,45 @@ def cameras_of_sheet(pictures: Sequence[Picture], sheet: Sheet) -> Motion:
                          "of it and fit each other; must be half of them: let more show more of it")  # fmt: skip
     why = "does not show enough of the sheet, or does not fit the others of its size"
     failed = {picture.name: why for picture in pictures if picture.name not in cameras}
-    return Motion(cameras, np.zeros((0, 3)), float(np.mean(errors)), failed, "the sheet")
+    return SparseModel(cameras, np.zeros((0, 3)), float(np.mean(errors)), failed, "the sheet")
 
 
-def flash_of(
-    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, sheet: Sheet
-) -> Flash | None:  # fmt: skip
-    """What the sheet tells of the flash, about so far from the lens (3,), and of the room; None if it tells nothing."""
-    poses = {name: pose for name, (_, pose) in motion.cameras.items()}
-    taken = [picture for picture in pictures if picture.name in poses]
-    exposures = dict(zip((picture.name for picture in taken), relative_exposures(taken, np.nan)))
-    raw = any(picture.encoding == "linear" for picture in taken)  # has no curve
-    return find_flash(sheet.white, poses, turned_with(pictures, np.eye(3)), exposures, offset, ball_of(motion, object_),
-                      curved=not raw)  # fmt: skip
-
-
-def ball_of(motion: Motion, object_: Object) -> Ball | None:
-    """A ball in the object's place that looks as large in the middle of the photographs; None if it has no mask."""
+def flash_from_sheet(
+    pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
+    sheet: SheetObservations,
+) -> FlashCalibration | None:  # fmt: skip
+    """The flash, about `offset` (3,) from the lens, by the sheet; None if that is not seen. The object is a sphere."""
     radii = []
-    for name, mask in object_.masks.items():
-        lens, pose = motion.cameras[name]
-        size = np.sqrt((mask == OBJECT).sum() / np.pi) * reduction(mask, lens.size) / lens.focal[0]
-        radii.append(size * np.linalg.norm(pose[:3, 3] - object_.center))
-    return Ball(object_.center, float(np.median(radii))) if radii else None
+    for name, mask in found.masks.items():
+        lens, pose = sparse.cameras[name]
+        pixels = np.sqrt((mask == OBJECT).sum() / np.pi) * reduction(mask, lens.size)
+        radii.append(pixels / lens.focal[0] * np.linalg.norm(pose[:3, 3] - found.center))
+    sphere = ObjectSphere(found.center, float(np.median(radii))) if radii else None
+    poses = {name: pose for name, (_, pose) in sparse.cameras.items()}
+    placed = [picture for picture in pictures if picture.name in poses]
+    exposures = dict(zip((picture.name for picture in placed), relative_exposures(placed, np.nan)))
+    curved = all(picture.encoding != "linear" for picture in placed)  # raw files are linear
+    axes = turn_with_cameras(pictures, np.eye(3))
+    return calibrate_flash(sheet.papers, poses, axes, exposures, offset, sphere, curved)
 
 
 def posed_pictures(
-    pictures: Sequence[Picture], motion: Motion, object_: Object, offset: np.ndarray, flash: Flash | None
-) -> list[PosedPicture]:
-    """The photographs of the scene, in its frame; the `offset` (3,) of a flash is in the camera's axes [scene units].
+    pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
+    flash: FlashCalibration | None,
+) -> list[PosedPicture]:  # fmt: skip
+    """The photographs that have a camera, with their calibration.
 
-    The sheet tells where it is and how strong. Without one it is where the offset says, and how strong is not known: it
-    is made so weak that fits see that.
+    `offset` (3,): of the flash from the lens [scene units], used if there is no calibrated flash. The intensity is then
+    unknown, and is set so low that fits notice.
     """
-    places = turned_with(pictures, flash.offset if flash else offset)
+    offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
-    away = np.median([np.linalg.norm(pose[:3, 3] - object_.center) for _, pose in motion.cameras.values()])
-    usual = flash.power if flash else np.full(3, np.pi * object_.level / DIM * away**2)
-    result, taken = [], [picture for picture in pictures if picture.name in motion.cameras]
-    for picture, exposure in zip(taken, relative_exposures(taken)):
-        lens, pose = motion.cameras[picture.name]
-        name = picture.name
-        light = Light("point", pose[:3, :3] @ places[name] + pose[:3, 3], known.get(name, exposure * usual))
-        posed = PosedPicture(picture, lens, pose, object_.masks.get(name), light)
-        if flash:
-            posed = replace(posed, measured=name in known, falloff=flash.falloff, gamma=flash.gamma)
-        result.append(posed)
+    assumed = np.full(3, np.pi * found.radiance / ASSUMED_ALBEDO * sparse.distance(found.center) ** 2)
+    result, placed = [], [picture for picture in pictures if picture.name in sparse.cameras]
+    for picture, exposure in zip(placed, relative_exposures(placed)):
+        name, (lens, pose) = picture.name, sparse.cameras[picture.name]
+        intensity = known.get(name, exposure * (flash.power if flash else assumed))
+        light = Light("point", pose[:3, :3] @ offsets[name] + pose[:3, 3], intensity)
+        posed = PosedPicture(picture, lens, pose, found.masks.get(name), light, measured=name in known)
+        result.append(replace(posed, falloff=flash.falloff, gamma=flash.gamma) if flash else posed)
     return result

@@ -14,17 +14,8 @@ from typing import NamedTuple, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.scenefile import (
-    Element,
-    add_pose,
-    emitter_element,
-    move_names,
-    numbers,
-    photograph_element,
-    room_elements,
-    scene_bytes,
-    scene_element,
-)
+from mi_ring.capture import scenefile
+from mi_ring.capture.scenefile import Element, move_names
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
@@ -117,10 +108,10 @@ class Studio:
         file = Path(str(self.config.environment)).resolve()
         element = ElementTree.Element("emitter", type="envmap")
         ElementTree.SubElement(element, "string", name="filename", value=str(file))
-        ElementTree.SubElement(element, "float", name="scale", value=numbers(scale))
+        ElementTree.SubElement(element, "float", name="scale", value=scenefile.numbers(scale))
         upright = np.eye(4)
         upright[:3, :3] = Rotation.align_vectors([self.config.up_axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
-        add_pose(element, upright)
+        scenefile.add_pose(element, upright)
         with reading(f"{file}: --environment", "an EXR or HDR file of latitude and longitude"):
             if file.suffix.lower() == ".exr":
                 read_image(file)  # refuses files that would need too much memory; Mitsuba does not
@@ -137,11 +128,12 @@ class Studio:
             shapes.append(load_element(element))
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
-    def radiance(
-        self, scene: ObjectOnTable, photograph: PlannedPhotograph, camera: Camera, spp: int
-    ) -> tuple[np.ndarray, np.ndarray | float]:
-        """Linear radiance (H, W, 3) by the photographs' light of 1 W/m² and further lamps; and by the room, or 0."""
-        config, view = self.config, LensCamera(camera)
+    def radiance(self, scene: ObjectOnTable, photograph: PlannedPhotograph, spp: int, scale: int = 1) -> tuple:
+        """Linear radiance (H, W, 3) by the photograph's light of 1 W/m² and further lamps; and by the room, or 0.
+
+        The pictures are `scale` times smaller than the photograph.
+        """
+        config, view = self.config, LensCamera(photograph.camera.shrunk(scale))
         light = photograph.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, photograph.seed, config.depth, hidden=self.environment is None)
         for n, lamp in enumerate(self.further_lamps(photograph.light), 1):
@@ -149,7 +141,7 @@ class Studio:
         if not config.room:
             return picture, 0.0
         # In a picture of its own: paths that choose between two lights are much noisier.
-        room = self.room_level * light_sources.room_envmap(self.room, camera.to_world)
+        room = self.room_level * light_sources.room_envmap(self.room, photograph.camera.to_world)
         light = light_sources.environment_map(room)
         return picture, scene.radiance(view, light, spp, photograph.seed + 1, config.depth)
 
@@ -158,20 +150,18 @@ class Studio:
         config = self.config
         if config.exposure is not None:
             return config.exposure * (1.0 if self.environment is not None else np.pi)
-        values = []
-        scale = max(1, min(TRIAL_SCALE, min(config.size) // 8))
+        values, scale = [], max(1, min(TRIAL_SCALE, min(config.size) // 8))
         for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
-            camera = photograph.camera.shrunk(scale)
-            inside = scene.coverage(LensCamera(camera), 16) > 0.9
-            own, ambient = self.radiance(scene, photograph, camera, 36)
+            inside = scene.coverage(LensCamera(photograph.camera.shrunk(scale)), 16) > 0.9
+            own, ambient = self.radiance(scene, photograph, 36, scale)
             values.append((own + ambient)[inside].max(-1))
         if not np.concatenate(values).size:
             raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows it alone, by which "
                              "the exposure would be chosen; give --exposure, for instance 0.5")  # fmt: skip
-        bright = np.quantile(np.concatenate(values), 1 - config.clipped)
+        bright = float(np.quantile(np.concatenate(values), 1 - config.clipped))
         if not bright > 0:
             raise InputError(f"{config.mesh}: MESH: is black, whatever the light; do its faces point inward?")
-        return float(1 / bright)
+        return 1 / bright
 
 
 def write_capture(config: SynthesizeConfig) -> None:
@@ -195,7 +185,7 @@ def write_capture(config: SynthesizeConfig) -> None:
             for photograph in photographs if not (folder / "images" / photograph.file).is_file()
             or not (folder / "masks" / f"{photograph.name}.png").is_file()]  # fmt: skip
     for photograph, folder in progress(todo, "photographing", unit="photograph", leave=True):
-        own, ambient = studio.radiance(scene, photograph, photograph.camera, studio.spp)
+        own, ambient = studio.radiance(scene, photograph, studio.spp)
         pictures = {"images": exposure * (own + ambient)}
         coverage = scene.coverage(LensCamera(photograph.camera))
         write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{photograph.name}.png")
@@ -217,27 +207,26 @@ def write_scenes(
     studio: Studio, seen: list[PlannedPhotograph], novel: list[PlannedPhotograph], exposure: float
 ) -> None:
     """Write scene.xml, truth/scene.xml of the novel views, and, if scene.xml has errors, truth/exact.xml without."""
-    config = studio.config
-    out = config.out
+    config, out = studio.config, studio.config.out
     strength = exposure if studio.environment is None else 0.0
     emitters: list[Element] = []
     if studio.environment is not None:
         emitters = [studio.environment_element(exposure)]
     elif config.room:
-        emitters = room_elements(exposure * studio.room_level * studio.room)
+        emitters = scenefile.room_elements(exposure * studio.room_level * studio.room)
     for lamp in studio.further_lamps((seen + novel)[0].light):
-        emitters.append(emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
+        emitters.append(scenefile.emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
     up, ground = (config.up_axis, studio.ground) if config.table != "none" else (None, None)
     metres = 0.001 if config.table == "sheet" else None
 
-    def scene(folder: Path, photographs: list[PlannedPhotograph], images: str, masks: str, exact: bool) -> bytes:
+    def scene(folder: Path, photographs: list[PlannedPhotograph], place: str, exact: bool) -> bytes:
         paired = config.pairs and photographs is seen
         gains = studio.gains if exact and photographs is seen else np.ones((len(photographs), 3))
         shots: Sequence[Shot] = [
             Shot(
                 p.name, p.camera, p.light._replace(rgb=strength * p.light.rgb),
                 response=Response(gain=tuple(gain.tolist())),
-                files=Files(Path(images, p.file), Path(masks, f"{p.name}.png"),
+                files=Files(Path(place, "images", p.file), Path(place, "masks", f"{p.name}.png"),
                             ambient=Path("ambient", p.file) if paired else None),
                 saturation=HALF_LIMIT if config.format == "exr" else 1.0, calibrated=exact,
             )
@@ -249,17 +238,17 @@ def write_scenes(
             if config.light == "lamp":  # it does not move with a camera
                 shots = [replace(shot, light=shot.own_light._replace(vector=p.light.vector))
                          for shot, p in zip(shots, photographs)]  # fmt: skip
-        root = scene_element(map(photograph_element, shots), ground=ground, up=up, metres=metres)
+        root = scenefile.scene_element(map(scenefile.photograph_element, shots), ground=ground, up=up, metres=metres)
         root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(emitters))
         root.extend(deepcopy(studio.tables))
         move_names(root, out, folder)
-        return scene_bytes(root)
+        return scenefile.scene_bytes(root)
 
     if novel:
-        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/images", "truth/masks", True))
+        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/", exact=True))
     if not config.exact:
-        write_file(out / "truth/exact.xml", scene(out / "truth", seen, "images", "masks", True))
-    write_file(out / "scene.xml", scene(out, seen, "images", "masks", config.exact))
+        write_file(out / "truth/exact.xml", scene(out / "truth", seen, "", exact=True))
+    write_file(out / "scene.xml", scene(out, seen, "", config.exact))
 
 
 def digest(file: Path) -> str:

@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from types import ModuleType
+from typing import Any
 
 from mi_ring.errors import InputError
 
@@ -40,3 +41,13 @@ def keeping_handlers() -> Iterator[None]:
     finally:
         if handler is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
+
+
+class LazyPackage:
+    """A package that `need` imports when it is first used."""
+
+    def __init__(self, package: str, what: str) -> None:
+        self.package, self.what = package, what
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(need(self.package, self.what), name)

@@ -40,7 +40,7 @@ from mi_ring.importers.reading import has_alpha, image_size, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.capture_findings import told_before
+from mi_ring.metrics.capture_findings import findings_of_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import read_log
@@ -204,7 +204,7 @@ def picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], Read
             for ask in (image_size, has_alpha, exif_exposure, pixels_of):
                 documented(lambda ask=ask: ask(path))
             one = Picture(path)
-            for ask in ("exif", "exposure", "held", "size", "pixels"):
+            for ask in ("exif", "exposure", "camera_orientation", "size", "pixels"):
                 documented(lambda ask=ask: getattr(one, ask))
 
         return Reader([path], read)
@@ -230,7 +230,7 @@ def own_picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], 
 
         def read() -> None:
             one = Picture(path)
-            for ask in ("exif", "exposure", "held", "size", "pixels"):
+            for ask in ("exif", "exposure", "camera_orientation", "size", "pixels"):
                 documented(lambda ask=ask: getattr(one, ask))
 
         return Reader([path], read)
@@ -326,7 +326,7 @@ def results(folder: Path) -> Reader:
 
     def read() -> None:
         read_log(folder)
-        told_before(folder / "scene.xml", ["000", "001"])
+        findings_of_fit(folder / "scene.xml", ["000", "001"])
         planned_before(config, [config], folder)
 
     return Reader([folder / name for name in names], read)
