@@ -3,8 +3,8 @@
     python benchmarks/lamps.py MESH … [--lamps 1 2 3] [--views 32] [--width 256] [--spp 16] [--out out/lamps]
         [-- OPTIONS OF FIT]
 
-`mi-ring synthesize` path traces each mesh, of plastic, under fixed lamps as far away as the cameras. The scene file
-has no useful place for the first lamp and does not mention the others. `--light lamps` finds number, places and strengths.
+`mi-ring synthesize` path traces each mesh, of plastic, under fixed lamps as far away as the cameras. The scene file has
+no useful place for the first lamp and does not mention the others. `--light lamps` finds number, places and strengths.
 Two fits are compared with it: one by `--light environment`, and one that knows the lamps exactly.
 
 Prints a Markdown table with machine and date: errors of normals; the number of lamps that was found; the largest error

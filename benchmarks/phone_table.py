@@ -4,8 +4,9 @@
         [--paths 36] [OPTIONS OF mi-ring fit]
 
 --rows all: every disturbance, with room light of two strengths, calibration and masks by `mi-ring photos`, and the
-exact capture of the same views. --rows alone: no disturbance, all that exact calibration undoes, and each of the others, with
-exact calibration and masks. All captures are cropped to the object. The preset `fast` hides errors of masks.
+exact capture of the same views. --rows alone: no disturbance, all that exact calibration undoes, and each of the
+others, with exact calibration and masks. All captures are cropped to the object. The preset `fast` hides errors of
+masks.
 
 Prints a Markdown table with machine and date. Each cell has the mean error of normals and depth where both surfaces are
 seen, after a similarity; the ratio of the first to that of the exact capture; and the error of the scale. The same

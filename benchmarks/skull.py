@@ -3,8 +3,8 @@
     python benchmarks/skull.py PHOTOS OUT [--preset default] [--flash-offset X Y Z] [--fit OPTIONS]
 
 PHOTOS is the folder of all 66 JPEG files. Every eighth photograph, from the fifth on, is kept out of the fit, but not
-out of the search for cameras and masks. OUT gets the capture, the fit and predictions of the held-out photographs, from which
-`docs/make_skull.py` makes pictures.
+out of the search for cameras and masks. OUT gets the capture, the fit and predictions of the held-out photographs, from
+which `docs/make_skull.py` makes pictures.
 
 If the folder `shared` is beside the checkout, it prints the errors of the cameras against COLMAP with the full-size
 photographs, the overlap of the masks, and PSNR of the held-out photographs.

@@ -137,7 +137,8 @@ def test_the_documentation_is_short():
 def options_of_commands() -> set[str]:
     """All options of all commands."""
     pages = [help_of(*words) for words in [("convert",), *PAGES]]
-    return set(re.findall(r"--[a-z][\w.-]*", re.sub("[│╭╮╰╯─]", " ", "".join(pages)))) | {"--version", "--traceback", "--help-all"}
+    found = re.findall(r"--[a-z][\w.-]*", re.sub("[│╭╮╰╯─]", " ", "".join(pages)))
+    return {*found, "--version", "--traceback", "--help-all"}
 
 
 @pytest.mark.parametrize("page", ["README.md", *(f"docs/{part}" for part in ("tutorial", "how-to", "reference"))])
