@@ -1,8 +1,7 @@
-"""What simulated phone captures show and how it is lit: objects, sheet, table, room and flash; path traced by Mitsuba.
+"""Objects, sheet, table, room and flash of simulated phone captures, path traced by Mitsuba. Used by `phone.py`.
 
-Used by `phone.py`. World: that of the sheet [mm], origin in its middle, x right, y up the page, z out of the paper.
-Rays and paths are those of `mi_ring.synthesis.tracing`. Nothing in here shares code or model with what reconstructs it,
-but for the layout of a camera.
+World: the sheet's [mm], origin in its middle, x right, y up the page, z out of the paper. Rays and paths are those of
+`mi_ring.synthesis.tracing`. It shares no code and no model with the reconstruction, except the layout of a camera.
 """
 
 import sys

@@ -135,8 +135,8 @@ def single(options: ExperimentOptions) -> list[Run]:
     """Each object of DiLiGenT, seen from one side."""
     require_no_materials(options)
     if not options.data:
-        raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/paper.md says; "
-                         f"get them from its authors: {DILIGENT}/single")  # fmt: skip
+        raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "
+                         f"says; get them from its authors: {DILIGENT}/single")  # fmt: skip
     runs = []
     for file in options.data:
         dataset = SingleView.of(options.captures / f"single-{file.stem}", file)

@@ -133,7 +133,7 @@ def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
     """Errors of BRDF slices (V, angles, 3) at points of the surface.
 
-    `slice_error`: |found − truth| / max(truth, `BLACK`), mean over angles and channels, median over points [%].
+    `slice_error`: abs(found − truth) / max(truth, `BLACK`), mean over angles and channels, median over points [%].
     `right_material`: share of points [%] whose slice, in logarithms, is nearer to the true one than to that of the
     `other` material.
     """
