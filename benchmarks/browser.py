@@ -1,11 +1,12 @@
-"""What a browser draws of a fit's GLB beside what we render of the fit, photograph by photograph.
+"""How near a browser's picture of an exported GLB comes to ours.
 
     python benchmarks/browser.py out/pot2 [--picture docs/glb.png]
 
-The viewer of the run's report.html draws every photograph of the fit in headless Chromium; `photometric` renders the
-same from the networks. The viewer has neither shadows nor interreflection, so that ours is first without them. Prints a
-Markdown table with machine and date: mean absolute difference of sRGB values, in % of full scale, over all pixels and
-over those that show the object, and PSNR.
+The viewer of the run's report.html draws every photograph of the fit in headless Chromium. `photometric` renders the
+same photographs from the networks. The viewer has neither shadows nor interreflection, so our first row has none.
+
+Prints a Markdown table with machine and date: mean absolute difference of sRGB values in % of full scale, over all
+pixels and over the pixels of the object, and PSNR. --picture writes three photographs side by side.
 """
 
 import argparse

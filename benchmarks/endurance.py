@@ -1,9 +1,11 @@
-"""Does the renderer keep memory or compile anew? What a fit does with it, 500 times, as a Markdown table.
+"""Does the renderer keep memory, or compile kernels again, in a long fit?
 
     python benchmarks/endurance.py [--iterations 500]
 
-Every iteration turns the domain at random, writes 10,242 vertices and their material, renders eight photographs of 128²
-pixels under lamps off the camera, with shadows and interreflection, and takes the gradient with respect to all of it.
+Each iteration rotates the domain at random, writes 10,242 vertices and their material, renders eight photographs of
+128² pixels under lamps beside the camera with shadows and interreflection, and takes all gradients.
+
+Prints a Markdown table with machine and date: memory and number of compiled kernels after some iterations.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""How well is an object found whose light is unknown? As Markdown: normals, light and relit pictures by environment.
+"""How accurate is a fit under an unknown environment?
 
     python benchmarks/environments.py MESH … [--views 50] [--width 512] [--spp 64] [--maps overcast indoor sun]
         [--out out/environments] [-- OPTIONS OF FIT]
 
-Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an
-overcast sky (its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps,
-and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light.
-Then the object is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after
-one factor for each colour, over the object's pixels). The light's direction: how far the brightest place of the map
-that was found is from that of the true map, both as harmonics of order 4, which says little where none is bright; and
-how far the directions are from which the light comes on the whole, the sums of all by their radiance. With `--flash` a
-flash capture of the same views stands beside them.
+`mi-ring synthesize` path traces each mesh, of plastic, in three environments that this script makes: an overcast sky
+(CIE: radiance 1 at the horizon, 3 at the zenith), a room with a window and two lamps, and a clear sky with the sun. The
+scene file does not mention them. `--light environment` finds shape, material and light. The object is then lit by the
+next of the three environments. --flash adds a flash capture of the same views.
+
+Prints a Markdown table: errors of normals and depth; the angle between the brightest directions of the true and of the
+found map, both as harmonics of order 4; the angle between the radiance-weighted mean directions; PSNR of the relit
+object, after one factor per colour.
 """
 
 import argparse

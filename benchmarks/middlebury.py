@@ -1,11 +1,13 @@
-"""Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw what is found.
+"""Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw the result.
 
     python benchmarks/middlebury.py FOLDER [--light lamps] [--halves] [--out out/middlebury] [-- OPTIONS OF FIT]
 
-FOLDER is the data set as it is unpacked, of a bright object before a dark background. Masks are what is brighter than a
-tenth of full scale, closed and filled: shadows on the object belong to it. Every eighth photograph is kept out; printed
-is the PSNR of these over the object's pixels, as sRGB. The picture shows some photographs as predicted, and normals.
-With `--halves` two fits instead, of every second photograph each: how far their surfaces are apart is their precision.
+FOLDER is the unpacked data set: a bright object before a dark background. A mask is what is brighter than a tenth of
+full scale, closed and filled. Every eighth photograph is kept out.
+
+Prints the PSNR of these over the pixels of the object, as sRGB, with machine and date. Writes a picture with some
+predictions and normals. --halves fits every second photograph, then the others, and prints how far apart the two
+surfaces are.
 """
 
 import argparse

@@ -1,26 +1,25 @@
-"""Simulated phone captures with their truth: an object on a printed sheet, photographed by hand with the flash on.
+"""Make a simulated phone capture with its truth: an object on the printed sheet, photographed by hand with the flash.
 
     python benchmarks/phone.py OUT [--object NAME|MESH] [--disturbances all|none|NAME,NAME…] [--ambient 0.03]
         [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|white|none] [--turntable] [--spp N]
         [--no-exact]
 
-Writes, in the world of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
+Writes, in the frame of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
 
-    OUT/photos/                  the photographs, as the phone wrote them
+    OUT/photos/                  the photographs as the phone writes them
     OUT/truth/mesh.ply           the object
-    OUT/truth/masks/             what each photograph shows of it, as photographed: with the lens' distortion
-    OUT/truth/transforms.json    cameras, lens, flash (pl_pos [mm], pl_intensity with exposure and white balance) and
-                                 masks, for `mi_ring.convert transforms`: the photographs with exact calibration
-    OUT/truth/settings.json      the settings, which photographs failed, exposure and white balance of each
-    OUT/exact/scene.xml          the same views without any disturbance (but the principal point), exactly calibrated,
-                                 cropped as by `mi_ring.photos`
+    OUT/truth/masks/             true masks, with the distortion of the lens
+    OUT/truth/transforms.json    cameras, lens, masks and flash (pl_pos [mm], pl_intensity with exposure and white
+                                 balance), for `mi-ring convert transforms`: exact calibration
+    OUT/truth/settings.json      settings, failed photographs, exposure and white balance
+    OUT/exact/scene.xml          the same views without disturbances (but with the principal point), exactly
+                                 calibrated, cropped as by `mi-ring photos`
 
-Disturbances, each a switch: sheet (and table, which reflect light onto the object), ambient (light of the room),
-offset (the flash is beside the lens), cone (and does not shine alike in all directions), lens (distortion), principal
-(point, off the middle), exposure (and white balance: EXIF tells exposure, nothing the balance), jpeg, noise, blur,
-failures (of 40 photographs one is blurred and one shows something else). Without them: black room, object
-alone, flash in the lens, 8-bit PNG. With --turntable object and sheet turn, camera and light
-stand. Deterministic by seed.
+Disturbances: sheet (sheet and table reflect light onto the object), ambient (room light), offset (the flash is beside
+the lens), cone (the flash is weaker to the sides), lens (distortion), principal (point off the middle), exposure (and
+white balance; EXIF has only the exposure), jpeg, noise, blur, failures (of 40 photographs one is blurred and one shows
+something else). Without them: black room, flash in the lens, 8-bit PNG, object alone. With --turntable object and sheet
+turn. The same seed gives the same files.
 """
 
 import argparse

@@ -1,8 +1,7 @@
-"""What simulated phone captures show and how it is lit: objects, sheet, table, room and flash; path traced by Mitsuba.
+"""Objects, sheet, table, room and flash of simulated phone captures, path traced by Mitsuba. Used by `phone.py`.
 
-Used by `phone.py`. World: that of the sheet [mm], origin in its middle, x right, y up the page, z out of the paper.
-Rays and paths are those of `mi_ring.synthesis.tracing`. Nothing in here shares code or model with what reconstructs it,
-but for the layout of a camera.
+World: the sheet's [mm], origin in its middle, x right, y up the page, z out of the paper. Rays and paths are those of
+`mi_ring.synthesis.tracing`. It shares no code and no model with the reconstruction, except the layout of a camera.
 """
 
 import sys
@@ -250,7 +249,7 @@ class Stage:
 
     def radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
-        flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, brightest=self.brightest)
+        flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, limit=self.brightest)
         if self.bare:
             return pixel_means(flashed, shot, shot.around(self.mesh.vertices), spp, seed)
         return self.pictured(flashed, shot, spp, seed)
@@ -269,7 +268,7 @@ class Stage:
         which no photograph has, and darker to all who ask for medians.
         """
         near = shot.around(self.mesh.vertices)
-        picture = pixel_means(trace, shot, shot.whole, spp, seed)
+        picture = pixel_means(trace, shot, (0, 0, *shot.camera.size), spp, seed)
         rounds = range(-(-FINE // spp))
         fine = np.mean([pixel_means(trace, shot, near, spp, seed + k * ROUND) for k in rounds], 0)
         left, top, right, bottom = near

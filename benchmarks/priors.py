@@ -1,12 +1,14 @@
-"""Fit small captures with and without each prior and print, as Markdown with machine and date, where it pays.
+"""What the priors are worth: small captures, fitted with and without each.
 
     python benchmarks/priors.py [--only NAME] [--weights 0 0.03] [--seeds 0 1] [--iterations 150] [--level 4]
                                 [--width 96] [--batch 8] [--out out/priors]
 
-Each capture is made for its prior: `normal_variation` a faceted body, `material_rank` one whose gloss goes with its
-colour. All are path traced with `cooktorrance` from few sides, and
-photographed with much noise: what the photographs leave open is where a prior can help. Errors are those of the whole
-surface: of normals in degrees, of colour, gloss and roughness as shares of the truth's mean, at the nearest points.
+Each prior has its capture: a faceted body for `normal_variation`, and a body whose gloss follows its colour for
+`material_rank`. They are path traced with `cooktorrance` from few sides, with much noise, so that the photographs leave
+something open.
+
+Prints a Markdown table with machine and date. Errors are those of the whole surface: normals in degrees; colour, gloss
+and roughness as shares of the true mean, at the nearest points.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The README's picture: how a sphere becomes the object, and what a fit with the default settings finds.
+"""The picture of the pot: how a sphere becomes the object, and what a fit with the default settings finds.
 
 python -m mi_ring.fit scenes/pot2.xml
 python -m mi_ring.fit scenes/pot2.xml --domain sphere --out out/pot2_sphere

@@ -1,4 +1,4 @@
-"""The pictures of docs/skull.md, of what `python benchmarks/skull.py PHOTOS OUT` left in OUT.
+"""The pictures of docs/tutorial/own-photographs.md, from the OUT of `benchmarks/skull.py PHOTOS OUT`.
 
 python docs/make_skull.py PHOTOS OUT docs/skull
 """

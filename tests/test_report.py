@@ -426,7 +426,7 @@ def test_the_bundle_is_whole_small_as_stated_and_can_be_embedded():
     bundle = (VIEWER / "viewer.min.js").read_text("utf-8")
     assert "three.js authors" in bundle and "WITHOUT WARRANTY OF ANY KIND" in bundle
     assert "</script" not in bundle and "<!--" not in bundle
-    guide = (Path(__file__).parents[1] / "docs" / "guide.md").read_text("utf-8")
-    stated = int(re.search(r"three\.js, (\d+) kB", guide)[1])
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "results-folder.md").read_text("utf-8")
+    stated = int(re.search(r"three\.js, (\d+) kB", page)[1])
     assert abs((VIEWER / "viewer.min.js").stat().st_size / 1000 - stated) < 1
     assert "resolved" not in (VIEWER / "package-lock.json").read_text()

@@ -20,6 +20,7 @@ from mi_ring.system.files import write_file
 DISTANCE = 1500.0  #: assumed, from the camera to the object [mm]; one camera does not determine it
 TO_MITSUBA = np.array([-1.0, 1.0, -1.0])  #: factors of x right, y up, z back that make them Mitsuba's camera axes
 DIMENSIONS = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: of the arrays
+MANUAL = "docs/how-to/paper.md"  #: describes these arrays
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,16 @@ class SingleView(CachedDataset):
         arrays = load_npz(self.file)
         for name, dimensions in DIMENSIONS.items():
             if name not in arrays or arrays[name].ndim != dimensions:
-                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
+                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see {MANUAL}")
         if (kind := arrays["pixels_uint16"].dtype) != np.uint16:
-            raise InputError(f"{self.file}: pixels_uint16: is of {kind}, must be of uint16, linear; see docs/paper.md")
+            raise InputError(f"{self.file}: pixels_uint16: is of {kind}, must be of uint16, linear; see {MANUAL}")
         mask, lights = arrays["mask"], len(arrays["pixels_uint16"])
         shapes = {"pixels_uint16": (lights, int((mask > 0).sum()), 3), "light_dir": (lights, 3),
                   "light_int": (lights, 3), "normal_gt": (*mask.shape, 3), "K": (3, 3)}  # fmt: skip
         for name, shape in shapes.items():
             if arrays[name].shape != shape:
                 raise InputError(f"{self.file}: {name}: is of shape {arrays[name].shape}, must be {shape} by mask and "
-                                 "number of photographs; see docs/paper.md")  # fmt: skip
+                                 f"number of photographs; see {MANUAL}")  # fmt: skip
         return arrays
 
     @property

@@ -12,12 +12,12 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 class Table(mi.Mesh):
     """A rectangle on which the object stands. It reflects light onto the object and hides the room's light from it.
 
-    ============ ========= ===================================================================== =====
-    Parameter    Type      Description                                                           Flags
-    ============ ========= ===================================================================== =====
+    ============ ========= ========================================================================= =====
+    Parameter    Type      Description                                                               Flags
+    ============ ========= ========================================================================= =====
     ``to_world`` transform of the square from −1 to 1 in x and y that faces z. Default: the identity
-    (nested)     bsdf      usually diffuse with a bitmap; the first row of a bitmap is at y = −1 P, ∂
-    ============ ========= ===================================================================== =====
+    (nested)     bsdf      usually diffuse with a bitmap; the first row of a bitmap is at y = −1     P, ∂
+    ============ ========= ========================================================================= =====
 
     Stock integrators render it like any other rectangle. In the photographs that a fit predicts it is part of
     interreflection only, and cameras do not see it: a fit compares the object inside of its mask. ``mi-ring photos``
