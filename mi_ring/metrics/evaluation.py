@@ -28,9 +28,10 @@ LINES = {
 }  # fmt: skip
 
 
-def evaluate_fit(
-    run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False, align: str | None = None
-) -> dict:
+def evaluate(
+    run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
+    align: str | None = None,
+) -> dict:  # fmt: skip
     """Errors of the results folder `run`, and lists of those of each photograph: `views` and `novel_views`.
 
     `mesh`: true surface; `novel`: scene file of novel views; `seen`: distances between surfaces are of parts that a
@@ -38,6 +39,7 @@ def evaluate_fit(
     the motion is `aligned_*`. Numbers of fitted photographs end in `_input`, those of held-out ones in `_held_out`.
     Undefined numbers are missing: the genus of an open surface, for instance.
     """
+    run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml")
     unseen = novel and load_capture(novel)
     truth_mesh, truth = load_true_mesh(mesh)
