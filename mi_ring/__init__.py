@@ -61,8 +61,8 @@ _API = {
 
 __all__ = [
     "BRDFNet", "Camera", "Capture", "Config", "Fit", "FittedObject", "Flow", "InputError", "Iteration", "Light",
-    "Lighting", "MaterialNet", "Response", "ShapeNet", "Shot", "Term", "__version__", "choose_lighting", "default_terms",
-    "evaluate", "export", "load_capture", "load_fit", "plain_autograd", "register_network",
+    "Lighting", "MaterialNet", "Response", "ShapeNet", "Shot", "Term", "__version__", "choose_lighting",
+    "default_terms", "evaluate", "export", "load_capture", "load_fit", "plain_autograd", "register_network",
 ]  # fmt: skip
 
 _COMMANDS = "evaluate", "export"  #: functions that share their name with the module of a command
