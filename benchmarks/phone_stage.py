@@ -249,7 +249,7 @@ class Stage:
 
     def radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
-        flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, brightest=self.brightest)
+        flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, limit=self.brightest)
         if self.bare:
             return pixel_means(flashed, shot, shot.around(self.mesh.vertices), spp, seed)
         return self.pictured(flashed, shot, spp, seed)
@@ -268,7 +268,7 @@ class Stage:
         which no photograph has, and darker to all who ask for medians.
         """
         near = shot.around(self.mesh.vertices)
-        picture = pixel_means(trace, shot, shot.whole, spp, seed)
+        picture = pixel_means(trace, shot, (0, 0, *shot.camera.size), spp, seed)
         rounds = range(-(-FINE // spp))
         fine = np.mean([pixel_means(trace, shot, near, spp, seed + k * ROUND) for k in rounds], 0)
         left, top, right, bottom = near

@@ -1,7 +1,7 @@
 """Reconstruct many objects, on one machine or many: `python -m mi_ring.batch SCENES… --workers N -- FIT OPTIONS`."""
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -60,12 +60,6 @@ class BatchConfig:
         if not self.scenes:
             raise InputError("SCENE.xml: is missing; name one or more")
 
-    @property
-    def resources(self) -> Resources:
-        """Workers, and what each fit gets."""
-        cpus = self.cpus or max(1, cores() // self.workers)
-        return Resources(self.workers, cpus, self.gpus, self.memory, self.address)
-
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command. Returns its exit status: 1 if not all fits are done."""
@@ -90,9 +84,16 @@ def main(arguments: Sequence[str]) -> int:
     with locked(config.out / "batch"), tolerating_closed_output(), command.resumable():
         todo = unfinished(jobs, fit.masks)
         write_page(jobs, config.out, running=True)
-        with recording_interrupts(todo, jobs, config.out):
+        try:
             if todo:
                 fit_and_report(todo, jobs, config)
+        except BaseException:
+            with contextlib.suppress(InputError):  # the disk may be full
+                for job in todo:
+                    if job.record.state == "running":
+                        job.save(replace(job.record, state="interrupted"))
+                write_page(jobs, config.out, running=False)
+            raise
         write_page(jobs, config.out, running=False)
         left = [job.name for job in jobs if job.record.state != "done"]
         missing = f", not {', '.join(left)}" * bool(left)
@@ -101,10 +102,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """The jobs to fit, with their fingerprints. Writes the record of every job: waiting, done or failed.
-
-    `masks`: as for `load_capture`. A job whose capture is wrong fails here, before any long work.
-    """
+    """The jobs to fit, with their fingerprints. Writes all records; a job fails here if its capture is wrong."""
     todo: dict[Job, str] = {}
     done = 0
     for job in progress(jobs, "comparing", unit="scene"):
@@ -122,20 +120,6 @@ def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
     if done:
         print(f"{done} of {len(jobs)} are done already")
     return todo
-
-
-@contextlib.contextmanager
-def recording_interrupts(todo: Iterable[Job], jobs: Sequence[Job], out: Path) -> Iterator[None]:
-    """If anything ends the batch early, records and index.html say so, unless the disk is full."""
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(InputError):
-            for job in todo:
-                if job.record.state == "running":
-                    job.save(replace(job.record, state="interrupted"))
-            write_page(jobs, out, running=False)
-        raise
 
 
 def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
@@ -163,7 +147,9 @@ def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchCo
                 with contextlib.suppress(InputError):  # a disk that is full for a while ends no fit
                     write_page(jobs, config.out, running=True)
 
-        fit_all(todo, config.resources, config.retries, report)
+        cpus = config.cpus or max(1, cores() // config.workers)
+        resources = Resources(config.workers, cpus, config.gpus, config.memory, config.address)
+        fit_all(todo, resources, config.retries, report)
 
 
 def write_page(jobs: Sequence[Job], out: Path, running: bool) -> None:

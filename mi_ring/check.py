@@ -35,7 +35,7 @@ class CheckConfig:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if there is something to mend."""
+    """Run the command. Returns its exit status: 1 if there is something to mend."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
     capture = load_capture(config.scene, masks=config.masks)

@@ -16,7 +16,7 @@ from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
-ELSEWHERE = 0.3  #: silhouettes that overlap less are hardly of one object in one frame
+MISPLACED = 0.3  #: below this IoU of the silhouettes the true mesh is probably in another frame
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class EvaluateConfig:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
@@ -65,11 +65,11 @@ def main(arguments: Sequence[str]) -> None:
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
-    if totals["iou"] < ELSEWHERE:
-        print(f"{config.mesh}: hardly lies where the fit is: is it in the frame of the scene? That of mi-ring "
-              "synthesize is truth/mesh.ply of its folder", file=sys.stderr)  # fmt: skip
-    if config.novel and (untold := ambiguity_of(config.run)):
-        print(f"{untold} Novel views in a known light may be too bright, or of another colour", file=sys.stderr)
+    if totals["iou"] < MISPLACED:
+        print(f"{config.mesh}: is not where the fit is: is it in the frame of the scene? The true mesh of a capture by "
+              "mi-ring synthesize is its truth/mesh.ply", file=sys.stderr)  # fmt: skip
+    if config.novel and (ambiguity := ambiguity_of(config.run)):
+        print(f"{ambiguity} Novel views in a known light may be too bright or have another colour", file=sys.stderr)
     print(json.dumps(totals))
 
 

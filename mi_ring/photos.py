@@ -194,7 +194,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         print(f"Sheet: in {len(sheet.detections)} photographs, {moved.corners} corners, {moved.rms:.2g} mm off")
     else:
         print("Sheet: none seen, so that the scale is unknown")
-    known = SegmentationInput(plane, config.box, config.masks)
+    known = SegmentationInput(plane, config.box, config.masks, sheet is not None)
     found = find_object(pictures, sparse, known, work / "masks", progress)
     plane = found.plane
     print(masks_report(found, sparse, config.masks))

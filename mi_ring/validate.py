@@ -64,7 +64,7 @@ class ValidateConfig:
 
 
 def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:
-    """Indices of the photographs with these ids or image names, all if there are none. Raises InputError."""
+    """Indices of the photographs with these ids or image names, by default all. Raises InputError."""
     for name in names:
         if not any(name in (shot.name, shot.file_name) for shot in shots):
             raise InputError(f"--photographs: there is no {name}; the first is called {shots[0].name}")
@@ -72,7 +72,7 @@ def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command."""
+    """Run the command. Returns its exit status: 1 if the direct light of the renderers differs."""
     config = command.parse(ValidateConfig, arguments, "mi_ring.validate")
     path, out = config.scene, Path("out/validate") / command.scene_name(config.scene)
     if path.is_dir():

@@ -47,7 +47,7 @@ def imported(module: str) -> set[str]:
             assert node.level == 0, f"{module}: relative imports hide which room is meant"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("need", "LazyPackage"):  # may be missing
-            found.add(ast.literal_eval(node.args[0]))
+            found |= {name.value for name in node.args[:1] if isinstance(name, ast.Constant)}
     return found
 
 

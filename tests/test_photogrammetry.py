@@ -251,7 +251,6 @@ def test_a_table_that_the_flash_lights_is_no_object(bare):
         automatic_masks.VoxelGrid.seen_by(views),
         np.zeros((0, 3)),
         SegmentationInput(plane),
-        False,
         lambda things, *_: things,
     )
     if bare:

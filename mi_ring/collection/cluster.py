@@ -33,10 +33,8 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"address": resources.address, "log_to_driver": False, "logging_level": "ERROR"}
     if resources.address is None:
-        options |= {
-            "address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE,
-        }  # fmt: skip
+        options |= {"address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
+                    "object_store_memory": OBJECT_STORE}  # fmt: skip
     try:
         with keeping_handlers():
             ray.init(**options)

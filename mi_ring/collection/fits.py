@@ -51,10 +51,7 @@ def fit_to_the_end(
 
 
 def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = None) -> tuple[int, str]:
-    """Run a fit and copy its output to `job.output`. Returns its exit status and the last line that it printed.
-
-    Its process ends with this one. `on_line` gets each line.
-    """
+    """Run a fit, which ends with this process, and write its output. Returns its exit status and its last line."""
     cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     options |= {"encoding": "utf-8", "errors": "replace", **die_with_parent()}

@@ -114,10 +114,7 @@ def modified(path: Path) -> int:
 
 
 def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene.
-
-    Raises InputError if a scene is no file, if two have the same name, or if results would overwrite a scene.
-    """
+    """A job for each scene. Raises InputError for a missing file, equal names, and results that overwrite a scene."""
     jobs: dict[str, Job] = {}
     for scene in scenes:
         require_file(scene, "the XML file of a scene")

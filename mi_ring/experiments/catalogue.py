@@ -154,12 +154,9 @@ NETWORKS: dict[Any, dict[str, Any]] = {
     "ring, hull": {"domain": "hull"},
 }
 ENCODINGS: dict[Any, dict[str, Any]] = {
-    "linear, 16": {},
-    "linear, 5": {"frequencies": 5},
-    "octaves, 5": {"encoding": "octaves", "frequencies": 5},
-    "octaves, 10": {"encoding": "octaves", "frequencies": 10},
-    "none": {"encoding": "none"},
-}
+    "linear, 16": {}, "linear, 5": {"frequencies": 5}, "octaves, 5": {"encoding": "octaves", "frequencies": 5},
+    "octaves, 10": {"encoding": "octaves", "frequencies": 10}, "none": {"encoding": "none"},
+}  # fmt: skip
 STEPS: dict[Any, dict[str, Any]] = {t: {"steps": t} for t in (1, 2, 3, 5, 10, 20, 40)}
 
 EXPERIMENTS = {
@@ -167,67 +164,53 @@ EXPERIMENTS = {
         "The paper's table 1: accuracy on captures with measured materials.", each_dataset(), ACCURACY,
         plots.bars(NORMAL_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"),
                    ("psnr_novel", "novel [dB]")),
-        published=published.TABLE1,
-    ),
+        published=published.TABLE1),
     "table2": Experiment(
         "DiLiGenT-MV. Errors of normals and depth where a pixel sees both surfaces. Chamfer distance: mean distance of "
         "points of one surface from the other surface, mean of both directions, only of parts that a photograph shows.",
         table2, {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
         plots.bars(NORMAL_ERROR, ("depth_mm", "error of depth, mean [mm]")), "the folder of DiLiGenT-MV",
-        published.TABLE2, mean_over="object",
-    ),
+        published.TABLE2, mean_over="object"),
     "table3": Experiment(
         "The paper's table 3: poses wrong by 0.5° and 0.5 % of the distance, and refined; after rigid alignment.",
         table3, {**NORMALS, **DEPTH, **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
-        plots.bars(NORMAL_ERROR, ("turned", "rotation error of the cameras [°]")), published=published.TABLE3,
-    ),
+        plots.bars(NORMAL_ERROR, ("turned", "rotation error of the cameras [°]")), published=published.TABLE3),
     "specularity": Experiment(
         "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
-        specularity, {**ACCURACY, **MATERIAL}, plots.slices, "one mesh",
-    ),
+        specularity, {**ACCURACY, **MATERIAL}, plots.slices, "one mesh"),
     "stripes": Experiment(
         "Two materials in stripes: normals, and whether each place has the right one.", stripes,
-        {**ACCURACY, **MATERIAL, "right_material": Column("right material %", 1)}, plots.pictures, "one mesh",
-    ),
+        {**ACCURACY, **MATERIAL, "right_material": Column("right material %", 1)}, plots.pictures, "one mesh"),
     "views": Experiment(
-        "Accuracy by the number of photographs.", views, ACCURACY, plots.curves(("views", "photographs"), NORMAL_ERROR),
-    ),
+        "Accuracy by number of photographs.", views, ACCURACY, plots.curves(("views", "photographs"), NORMAL_ERROR)),
     "ablation": Experiment(
         "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.",
         each_setting("network", NETWORKS, quick=list(NETWORKS)[:2]), SHAPE,
-        plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), NORMAL_ERROR),
-    ),
+        plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), NORMAL_ERROR)),
     "encoding": Experiment(
         "Positional encodings: linear frequencies, powers of two, none.",
         each_setting("encoding", ENCODINGS, quick=("linear, 16", "octaves, 5", "none")), {**ACCURACY, **FLAWS},
-        plots.bars(NORMAL_ERROR, ("psnr_novel", "novel [dB]")),
-    ),
+        plots.bars(NORMAL_ERROR, ("psnr_novel", "novel [dB]"))),
     "steps": Experiment(
         "Steps of the flow, the paper's T.", each_setting("T", STEPS, quick=(1, 3, 10)), {**ACCURACY, **FLAWS},
-        plots.curves(("T", "T"), NORMAL_ERROR, logarithmic=True),
-    ),
+        plots.curves(("T", "T"), NORMAL_ERROR, logarithmic=True)),
     "genus": Experiment(
         "An object with a handle, from a sphere and from the masks' visual hull.",
         each_setting("start", {name: {"domain": name} for name in ("sphere", "hull")}),
-        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures,
-    ),
+        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures),
     "swap": Experiment(
         "Materials exchanged between fits from one domain, the sphere.", swap, ACCURACY, plots.swapped,
-        f"two or more {Experiment.data}", one_seed=True,
-    ),
+        f"two or more {Experiment.data}", one_seed=True),
     "resolution": Experiment(
         "One fit, sampled at several levels: the networks are functions.", each_dataset(measure=measures.by_level),
         {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
-        plots.curves(("vertices", "vertices"), NORMAL_ERROR, logarithmic=True), one_seed=True,
-    ),
+        plots.curves(("vertices", "vertices"), NORMAL_ERROR, logarithmic=True), one_seed=True),
     "timing": Experiment(
         "The error of normals during a fit.", each_dataset(measure=measures.course, watched=True),
         {"iteration": Column("iteration", 0), **TIME, **NORMALS, **DEPTH},
-        plots.curves(("seconds", "fit [s]"), NORMAL_ERROR), one_seed=True,
-    ),
+        plots.curves(("seconds", "fit [s]"), NORMAL_ERROR), one_seed=True),
     "single": Experiment(
         "DiLiGenT's photographs from one side: errors of normals, 90° where the camera misses the surface.", single,
         {**NORMALS, "missed": Column("missed %"), **TIME}, plots.pictures,
-        ".npz files of DiLiGenT's photographs from one side",
-    ),
+        ".npz files of DiLiGenT's photographs from one side"),
 }  # fmt: skip

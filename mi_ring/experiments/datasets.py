@@ -1,11 +1,9 @@
 """Datasets of experiments: captures with ground truth, given by the user, path traced, converted or derived."""
 
-import hashlib
 import json
-import os
 import shutil
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,13 +16,12 @@ from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 from mi_ring.importers.conversion import write_scene
 from mi_ring.importers.diligent_mv import DiligentMV
-from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
 from mi_ring.synthesis.options import SynthesizeConfig, require_options
 from mi_ring.synthesis.path_traced_capture import SETTINGS, claim, write_capture
 from mi_ring.system.command import scene_name
-from mi_ring.system.files import locked, partial_path, read_json, whole_folder, write_file
+from mi_ring.system.files import locked, read_json, whole_folder, write_file
 
 POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: in a checkout of the repository
 ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made from
@@ -56,10 +53,7 @@ class Dataset:
 
 
 def given(path: Path) -> Dataset:
-    """The user's capture: its folder or its scene file. Raises InputError if scene file or truth are missing.
-
-    The truth is in truth/ beside the scene file, or in NAME/truth/ beside NAME.xml.
-    """
+    """The user's capture, by its folder or scene file. Raises InputError if scene file or truth are missing."""
     scene = path / "scene.xml" if path.is_dir() else path
     require_file(scene, WANTED)
     folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
@@ -126,14 +120,6 @@ class Synthetic(Dataset):
     config: SynthesizeConfig
     of_pot: bool  #: of the example's pot, whose mesh is written, too
 
-    @staticmethod
-    def of(name: str, config: SynthesizeConfig, mesh: Path | None, captures: Path) -> "Synthetic":
-        """A capture of a mesh, or of the example's pot. Its folder is named after all settings, too."""
-        settings = repr((config, mesh and mesh.resolve()))
-        folder = captures / f"{name}-{hashlib.blake2b(settings.encode(), digest_size=3).hexdigest()}"
-        config = replace(config, mesh=(mesh or captures / "pot.ply").resolve(), out=folder)
-        return Synthetic(name, folder / "scene.xml", folder / "truth", config, mesh is None)
-
     @property
     def photographs(self) -> int:
         return self.config.views
@@ -144,10 +130,7 @@ class Synthetic(Dataset):
             require_options(config)
             if self.of_pot and not config.mesh.is_file():
                 config.mesh.parent.mkdir(parents=True, exist_ok=True)
-                vertices, faces, _ = pot()
-                growing = partial_path(config.mesh)
-                mesh_of(vertices, faces, normals=False).write_ply(str(growing))
-                os.replace(growing, config.mesh)
+                write_file(config.mesh, pot().ply())
             try:
                 claim(config.out, config)
             except InputError:  # the folder is named after the settings, so the content of a file has changed

@@ -47,10 +47,10 @@ def run_experiment(
         wanted = not only or run.name in only
         if wanted:
             print(f"{k + 1} of {len(runs)}: {run.name}", flush=True)
-        outcomes[k] = try_run(run, options, out, wanted)
-        if outcomes[k].failed not in ("", NOT_RUN):
-            print(f"{run.name}: failed: {outcomes[k].failed}", flush=True)
-        if (wanted and not outcomes[k].old) or k == len(runs) - 1:
+        outcome = outcomes[k] = try_run(run, options, out, wanted)
+        if outcome.failed not in ("", NOT_RUN):
+            print(f"{run.name}: failed: {outcome.failed}", flush=True)
+        if (wanted and not outcome.old) or k == len(runs) - 1:
             write_table_and_figure(experiment, outcomes, out, command_line)
     return sum(outcome.failed not in ("", NOT_RUN) for outcome in outcomes)
 

@@ -129,10 +129,10 @@ class Experiment:
 
 def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
     """Each run with each seed, unless it sets its own. Names do not depend on which other seeds there are."""
-
-    def with_seed(run: Run, seed: int) -> Run:
-        labels = {**run.labels, **({"seed": seed} if len(seeds) > 1 else {})}
-        name = f"{run.name}-{seed}" if seed else run.name
-        return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
-
-    return [r for run in runs for r in ([run] if "seed" in run.changes else [with_seed(run, s) for s in seeds])]
+    result = []
+    for run in runs:
+        for seed in [None] if "seed" in run.changes else seeds:
+            changes = run.changes if seed is None else {**run.changes, "seed": seed}
+            labels = {**run.labels, "seed": seed} if seed is not None and len(seeds) > 1 else run.labels
+            result.append(replace(run, name=f"{run.name}-{seed}" if seed else run.name, labels=labels, changes=changes))
+    return result

@@ -32,9 +32,7 @@ BLACK = 1e-3  #: least BRDF [1/sr] that errors are relative to
 SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 
 
-def evaluated(
-    run: Run, folder: Path, options: ExperimentOptions, align: str | None = None, seen: bool = False
-) -> list[Row]:
+def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str = "", seen: bool = False) -> list[Row]:
     """The numbers of `mi-ring evaluate`, crossing and inverted triangles in % of all, and the time of the fit [s]."""
     truth, novel = run.dataset.truth / "mesh.ply", run.dataset.truth / "scene.xml"
     numbers = evaluate_fit(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
@@ -111,10 +109,7 @@ def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> l
 
 
 def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the normals of a `SingleView` (H, W) [°], and the pixels (H, W) that miss the surface.
-
-    NaN where the data set has no normal, as along the cat's outline.
-    """
+    """Normal errors (H, W) [°] of a `SingleView`, NaN where no truth is known; which pixels (H, W) miss the surface."""
     assert isinstance(run.dataset, SingleView)
     data = run.dataset.read()
     shape = data["mask"].shape

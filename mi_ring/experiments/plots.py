@@ -57,9 +57,8 @@ def bars(*columns: tuple[str, str]) -> Plot:
                     axes.text(0, place, f" {value}".replace("nan", "NaN"), va="center")
                 else:
                     axes.barh(place, value, color="steelblue")
-            axes.set(xlabel=heading, ylim=(len(outcomes) - 0.5, -0.5))
+            axes.set(xlabel=heading, xlim=(0, None), ylim=(len(outcomes) - 0.5, -0.5))
             axes.set_yticks(range(len(outcomes)), [title_of(outcome) for outcome in outcomes])
-            axes.set_xlim(left=0)
         return figure
 
     return plot
@@ -103,8 +102,22 @@ def slices(outcomes: list[Outcome]) -> Figure:
 @of_finished
 def pictures(outcomes: list[Outcome]) -> Figure:
     """For each run its first photograph, the prediction of the fit, and the error of its normals."""
-    heads = "photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"
-    return grid([(title_of(outcome), three_pictures(outcome)) for outcome in outcomes], heads)
+    rows = []
+    for outcome in outcomes:
+        folder, dataset = outcome.folder, outcome.run.dataset
+        picture, scale = predicted(outcome, load_fit(folder))
+        capture = load_capture(dataset.scene)
+        observed = linear_to_srgb(capture.observe([0], scale).rgb[0].numpy()).clip(0, 1)
+        if isinstance(dataset, SingleView):
+            error = normal_errors(outcome.run, folder)[0]
+        else:
+            photograph = capture.photograph(0, scale)
+            found, true = (hits(load_true_mesh(place / "mesh.ply")[1], photograph) for place in (folder, dataset.truth))
+            error = np.degrees(np.arccos(np.clip((found[2] * true[2]).sum(1), -1, 1)))
+            error = np.where(found[0] & true[0], error, np.where(found[0] ^ true[0], 90.0, np.nan))
+            error = error.reshape(observed.shape[:2])
+        rows.append((title_of(outcome), [observed, picture, error]))
+    return grid(rows, ["photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"])
 
 
 @of_finished
@@ -133,21 +146,6 @@ def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> 
     for axes, head in zip(figure.axes, heads):
         axes.set_title(head, fontsize=8)
     return figure
-
-
-def three_pictures(outcome: Outcome) -> list[np.ndarray]:
-    """A row of `pictures`."""
-    folder, dataset = outcome.folder, outcome.run.dataset
-    picture, scale = predicted(outcome, load_fit(folder))
-    capture = load_capture(dataset.scene)
-    observed = linear_to_srgb(capture.observe([0], scale).rgb[0].numpy())
-    if isinstance(dataset, SingleView):
-        return [observed.clip(0, 1), picture, normal_errors(outcome.run, folder)[0]]
-    photograph = capture.photograph(0, scale)
-    found, true = (hits(load_true_mesh(place / "mesh.ply")[1], photograph) for place in (folder, dataset.truth))
-    error = np.degrees(np.arccos(np.clip((found[2] * true[2]).sum(1), -1, 1)))
-    error = np.where(found[0] & true[0], error, np.where(found[0] ^ true[0], 90.0, np.nan))
-    return [observed.clip(0, 1), picture, error.reshape(observed.shape[:2])]
 
 
 def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:

@@ -21,10 +21,8 @@ TABLE1 = [
 #: Table 2, DiLiGenT-MV: normals [°] and depth [mm].
 TABLE2 = [
     {"object": name, "by": PAPER, "normal_mean": normal, "depth_mm": depth}
-    for name, normal, depth in (
-        ("bear", 4.42, 0.75), ("buddha", 12.08, 0.67), ("cow", 4.21, 0.77), ("pot2", 6.63, 0.58),
-        ("reading", 7.61, 0.58),
-    )
+    for name, normal, depth in (("bear", 4.42, 0.75), ("buddha", 12.08, 0.67), ("cow", 4.21, 0.77),
+                                ("pot2", 6.63, 0.58), ("reading", 7.61, 0.58))
 ]  # fmt: skip
 
 #: Table 3: the bunny with a poor calibration. The paper does not say of which photographs the PSNR is.

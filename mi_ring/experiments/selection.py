@@ -1,5 +1,7 @@
 """The datasets that the arguments DATA and --materials of `mi-ring paper` select."""
 
+import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ from mi_ring.synthesis.materials import COLOURS, load_material
 from mi_ring.synthesis.options import SynthesizeConfig
 
 MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
-#: Options of path-traced captures. The full size is the paper's: 50 photographs of 512² px. Fast fits see no more.
+#: Options of path-traced captures. Full: 50 photographs of 512² px, as in the paper. Fast fits use no more than 256².
 SIZES: dict[str, dict[str, Any]] = {
     "full": {},
     "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
@@ -42,13 +44,14 @@ def datasets(options: ExperimentOptions) -> list[Dataset]:
 def path_traced(
     options: ExperimentOptions, mesh: Path | None, material: str | None, name: str = "", **more: Any
 ) -> Synthetic:
-    """A mesh, or the example's pot, photographed as in the paper, with `more` options of `mi-ring synthesize`.
-
-    50 photographs, 60° wide, flash at the camera, 8 bits, highlights clipped.
-    """
+    """A mesh, or the example's pot, photographed as in the paper. `more`: other options of `mi-ring synthesize`."""
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
     config = SynthesizeConfig(Path(), Path(), material, **settings)
-    return Synthetic.of(name or (mesh.stem if mesh else "pot"), config, mesh, options.captures)
+    name = name or (mesh.stem if mesh else "pot")
+    key = repr((config, mesh and mesh.resolve())).encode()  # two meshes or materials may have the same name
+    folder = options.captures / f"{name}-{hashlib.blake2b(key, digest_size=3).hexdigest()}"
+    config = replace(config, mesh=(mesh or options.captures / "pot.ply").resolve(), out=folder)
+    return Synthetic(name, folder / "scene.xml", folder / "truth", config, mesh is None)
 
 
 def require_no_materials(options: ExperimentOptions) -> None:

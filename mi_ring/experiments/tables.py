@@ -13,10 +13,7 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """The rows: ours, the means of ours, and the published ones, each below those of ours with the same labels.
-
-    `by` says whose a row is. A run without numbers has a row, too; its `state` says why.
-    """
+    """Our rows, their means, and published rows below ours of the same labels. `state`: why a run has no numbers."""
     rows: list[Row] = []
     for outcome in outcomes:
         state = f"failed: {outcome.failed}" if outcome.failed not in ("", NOT_RUN) else outcome.failed
@@ -30,10 +27,7 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Rows of means over runs that differ only in their seed, and over runs that differ in seed and `mean_over`.
-
-    A mean is over the runs that are done. A number that some of them lack has no mean.
-    """
+    """Means over seeds, and over seeds and `mean_over`: over the runs that are done, of the numbers that all have."""
     result = []
     for over in dict.fromkeys(("seed", experiment.mean_over)):
         groups = dict[tuple, list[Outcome]]()
@@ -59,13 +53,6 @@ def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence
     return {**own, "by": "by", **numbers, **({"state": "state"} if any(row["state"] for row in rows) else {})}
 
 
-def cell(experiment: Experiment, name: str, value: Any) -> str:
-    """A cell of the Markdown table: numbers with the digits of their column."""
-    if isinstance(value, float) and name in experiment.columns:
-        return f"{value:.{experiment.columns[name].digits}f}"
-    return str(value).replace("|", "/")
-
-
 def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
     """The table as CSV with all digits. `names`: from `headings`."""
     box = io.StringIO()
@@ -77,7 +64,13 @@ def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
 
 def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Row], command_line: str) -> str:
     """The table as Markdown, with its subject above, and command line, computer and date below."""
+
+    def cell(name: str, value: Any) -> str:
+        if isinstance(value, float) and name in experiment.columns:
+            return f"{value:.{experiment.columns[name].digits}f}"
+        return str(value).replace("|", "/")
+
     lines = [list(names.values()), ["---"] * len(names)]
-    lines += [[cell(experiment, name, row.get(name, "")) for name in names] for row in rows]
+    lines += [[cell(name, row.get(name, "")) for name in names] for row in rows]
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"{experiment.about}\n\n{table}\n\n{command_line}; {computer()}; {datetime.date.today()}\n"

@@ -96,10 +96,7 @@ def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Calibration matrix (3, 3) and camera-to-world pose (4, 4) of a projection matrix K [R | t] (3, 4) of any scale.
-
-    Raises InputError, about `what`, if the matrix is singular.
-    """
+    """Calibration matrix (3, 3) and pose (4, 4) of a projection matrix (3, 4). Raises InputError if it is singular."""
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])

@@ -12,10 +12,7 @@ from mi_ring.system.progress import progress
 
 
 def write_scene(source: Source) -> list[Frame]:
-    """Write the scene file of a source and the images that change, all or nothing. Returns the frames.
-
-    Raises InputError if something cannot be read or written, or if the scene file exists.
-    """
+    """Write a source's scene file and changed images, all or nothing, or raise InputError. Returns the frames."""
     frames = frames_of(source)
     if source.without_pose and not frames:
         raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")

@@ -66,10 +66,7 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """The numbers in a child, row by row in this shape, or the default if there is no such child.
-
-    Raises InputError if they are invalid, or missing without a default.
-    """
+    """The numbers in a child, row by row, or a default. Raises InputError if they are invalid or missing."""
     text = parent.findtext(name)
     if text is None and default is not None:
         return default

@@ -49,10 +49,7 @@ class Photogrammetry(Source):
         return list_images(self.folder)
 
     def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, with any suffix; None if it is not among the wanted `photographs`.
-
-        Raises InputError, about `what`, if `folder` has no such file.
-        """
+        """The photograph of this name, with any suffix; None if unwanted. Raises InputError if `folder` lacks it."""
         if self.photographs is not None:
             return find_by_name(name, self.photographs)
         if file := find_by_name(name, self.image_files):
@@ -81,10 +78,7 @@ class Photogrammetry(Source):
 
 
 def exif_exposure(path: Path) -> float | None:
-    """Exposure time · ISO / aperture², to which recorded radiance is proportional; None if EXIF data lack one of them.
-
-    Raises InputError if the file cannot be read or a value is not a positive number.
-    """
+    """Exposure time · ISO / aperture² by EXIF; None if one is missing. Raises InputError if one is not positive."""
     if path.suffix.lower() == ".exr":
         return None
     with reading(path, "image"), open_image(existing(path, "image")) as image:

@@ -28,10 +28,7 @@ class Window(NamedTuple):
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Where the photograph shows each pixel of the undistorted window: (2, H, W) rows and columns [px].
-
-    As in `scipy.ndimage`, the first pixel's centre is 0.
-    """
+    """Rows and columns (2, H, W) [px] of the window's pixels in the photograph; the first pixel's centre is 0."""
     (fx, fy), (cx, cy) = lens.focal, lens.centre
     left, top, width, height, scale = window
     x = (left + (np.arange(width) + 0.5) * scale - cx) / fx

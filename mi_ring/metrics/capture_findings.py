@@ -34,10 +34,7 @@ def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """`moved_far` and `odd_powers` of these photographs, from the calibration.json beside a fit's scene file.
-
-    Empty strings if there is no such file, or if it is not by `mi-ring fit`.
-    """
+    """`moved_far` and `odd_powers` of these photographs by a fit's calibration.json beside the scene file, if any."""
     record = read_json(scene.parent / "calibration.json")
     try:
         known = {name: entry for name, entry in record["photographs"].items() if name in names}
@@ -114,12 +111,11 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
         return None
     away = np.linalg.norm(cameras[point] - center, axis=1)
-
-    def beside(scale: float) -> float:  # distance from light to camera, in units of that from camera to object
-        return float(np.median(np.linalg.norm(scale * lights[point] - cameras[point], axis=1) / away))
-
-    scale = min((0.001, 0.01, 0.1, 1, 10, 100, 1000), key=beside)
-    if scale != 1 and beside(1) > 0.8 and beside(scale) < 0.5:
+    # By scale of the lights the median distance from light to camera, in units of that from camera to object.
+    beside = {scale: float(np.median(np.linalg.norm(scale * lights[point] - cameras[point], axis=1) / away))
+              for scale in (0.001, 0.01, 0.1, 1, 10, 100, 1000)}  # fmt: skip
+    scale = min(beside, key=beside.__getitem__)
+    if scale != 1 and beside[1] > 0.8 and beside[scale] < 0.5:
         return (f"lights are in other units than cameras: multiply their positions by {scale:g} "
                 f"and their intensities by {scale**2:g}")  # fmt: skip
     return None
@@ -174,13 +170,10 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
         if not typical / 4 < row.brightness < 4 * typical:
             times = f"{row.brightness / typical:.2g} times as bright as the others"
             found.append(f"{row.name}: is {times}, for the light it gets: its exposure or its light is wrong")
-    for name, limit, text in (
-        ("clipped", CLIPPED, "of the object is over-exposed; expose less"),
-        ("dark", DARK, "of the object is black: under-exposed, or unlit"),
-    ):
-        share = np.median([getattr(row, name) for row in rows])
-        if share > limit:
-            found.append(f"{share:.0%} {text}")
+    if (share := np.median([row.clipped for row in rows])) > CLIPPED:
+        found.append(f"{share:.0%} of the object is over-exposed; expose less")
+    if (share := np.median([row.dark for row in rows])) > DARK:
+        found.append(f"{share:.0%} of the object is black: under-exposed, or unlit")
     if not any(capture.masks.given) and dark_threshold(capture) is None:
         found.append("no masks, and the background is not dark, as a fit would assume: give masks, or have them found "
                      "by mi-ring photos")  # fmt: skip
@@ -188,8 +181,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if share > AMBIENT:
         found.append(f"{share:.0%} of the light on the object is the room's: the object hardly gets darker where the "
                      "flash is farther; darken the room, or go nearer")  # fmt: skip
-    views = len({shot.camera.to_world.tobytes() for shot in capture.shots})
-    if views < 8:
+    if (views := len({shot.camera.to_world.tobytes() for shot in capture.shots})) < 8:
         found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")
     return found
 

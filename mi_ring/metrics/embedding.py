@@ -30,15 +30,11 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles that cross, overlap or touch another, by the exact arithmetic of CGAL.
-
-    It is the reference for `mi_ring.scene.self_intersections`. Raises InputError if the package libigl, the extra
-    `exact`, is not installed.
-    """
+    """(F,) bool: triangles that cross, overlap or touch another, exactly, by CGAL. Raises InputError without libigl."""
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections
 
-    # The result holds remeshed vertices and faces, pairs of intersecting faces, and two index arrays.
+    # Item 2 of the result: pairs of intersecting faces.
     pairs = remesh_self_intersections(np.asarray(vertices, float), np.asarray(faces, np.int64), detect_only=True)[2]
     crossing = np.zeros(len(faces), bool)
     crossing[np.asarray(pairs, int).ravel()] = True

@@ -29,7 +29,6 @@ def compare_photographs(
     squares = []
     views: list[dict] = []
     for k in range(len(capture)) if index is None else index:
-        name = capture.names[k]
         rgb, _ = prediction.draw(
             surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect
         )
@@ -37,22 +36,18 @@ def compare_photographs(
         seen = capture.observe([k])
         observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.shots[k]))
         compared = comparable(capture, seen)
-        if not compared.any():
-            views.append({"name": name})
-            continue
-        predicted = np.where(compared[..., None], predicted, observed)
-        squares.append(np.mean((predicted - observed)[compared] ** 2))
-        views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed, compared)})
+        views.append({"name": capture.names[k]})
+        if compared.any():
+            predicted = np.where(compared[..., None], predicted, observed)
+            squares.append(np.mean((predicted - observed)[compared] ** 2))
+            views[-1] |= {**decibels(squares[-1]), **ssim(predicted, observed, compared)}
     similar = [view["ssim"] for view in views if "ssim" in view]
     totals = decibels(np.mean(squares)) if squares else {}
     return totals | ({"ssim": float(np.mean(similar))} if similar else {}), views
 
 
 def comparable(capture: Capture, seen: Observation) -> np.ndarray:
-    """(H, W) bool: pixels of the first photograph that a prediction can match.
-
-    The valid ones. If a background is visible, only those of the object, by the mask: the rest is not predicted.
-    """
+    """(H, W) bool: valid pixels of the first photograph. If a background is visible, only those inside the mask."""
     valid = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
     return valid & (seen.mask[0].numpy() > 0.99) if seen.masked[0] and capture.lit_room else valid
 

@@ -14,10 +14,7 @@ CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """By file of each mask the share that the other masks agree with; and findings that concern all masks.
-
-    One wrong mask spoils the visual hull for all. Then a hull that tolerates some wrong masks finds it.
-    """
+    """By file of each mask the share that the other masks agree with; and findings that concern all masks."""
     if not capture.hull:
         return {}, []
     silhouettes = capture.silhouettes()
@@ -29,7 +26,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     agree, why = shares(capture.hull), None
     if capture.whole and agree.min() < CONFORMS:
         why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
-        if not why:
+        if not why:  # one wrong mask spoils the hull for all; a hull that tolerates some may find it
             tolerant = copy.copy(capture.hull)
             tolerant.outliers = max(0.1, 1.01 / len(tolerant.silhouettes))
             robust = shares(tolerant)
@@ -97,10 +94,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """A finding if all principal points are off by half a pixel: the masks' outlines then miss the hull a little.
-
-    Photographs that were shrunk for the hull do not show it; for them it matters little.
-    """
+    """A finding if all principal points are off by half a pixel: the masks' outlines then miss the hull a little."""
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

@@ -40,31 +40,25 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(shots)
-        return with_flash(without_rooms(split_tables(scene)[0])), photographs_in(scene)
+        return with_flash(split_tables(scene)[0]), photographs_in(scene)
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def without_rooms(scene: mi.Scene) -> mi.Scene:
-    """The scene without `room` emitters: both renderers path trace their light (`render_indirect`)."""
-    emitters = top_level_emitters(scene)
-    if not any(map(is_room, emitters)):
-        return scene
-    return assembled(scene.shapes(), [emitter for emitter in emitters if not is_room(emitter)])
-
-
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with one `flash` emitter, by which stock integrators see the light of a photograph.
+    """The scene with one `flash` emitter, by which stock integrators see the light of a photograph, and without rooms.
 
-    A `shapenet` includes one; to other scenes it is added. Raises SceneError if there are several.
+    A `shapenet` has a `flash`. The light of a `room` is path traced by both renderers. Raises SceneError for several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
         raise SceneError(f"flash: found {count} of them, so that the light would count {count} times; "
                          'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
-    if count == 1:
+    emitters = top_level_emitters(scene)
+    others = [emitter for emitter in emitters if not is_room(emitter)]
+    if count == 1 and len(others) == len(emitters):
         return scene
-    return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *top_level_emitters(scene)])
+    return assembled(scene.shapes(), others if count else [mi.load_dict({"type": "flash"}), *others])
 
 
 def render_both(

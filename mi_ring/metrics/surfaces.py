@@ -59,10 +59,7 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """At the pixel centres of a photograph: is the surface seen? Its distance [scene units], its normal, is it a back?
-
-    Arrays (P,), (P,), (P, 3), (P,).
-    """
+    """At the pixel centres of a photograph: hit (P,), distance (P,), normal (P, 3), and is it a face's back (P,)?"""
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
     to_world, focal, centre, distortion = photograph.camera(mi.UInt32(0))
@@ -135,10 +132,7 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (POINTS,) of points of one surface from another; with `views` only of points that one of them shows.
-
-    `middle` (3,) is subtracted from both first, for precision.
-    """
+    """Distances (n,) of points of a surface, or of those that `views` show, from another. `middle` (3,): near both."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]

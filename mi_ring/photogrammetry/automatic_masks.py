@@ -17,11 +17,10 @@ from skimage.filters import threshold_otsu
 
 from mi_ring.capture.grabcut import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
-from mi_ring.photogrammetry.reduced_photographs import ReducedView
+from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
-Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, 1 the object
 MIN_VISIBLE = 0.25  #: share of the photographs that must show a voxel of the object
 MIN_AGREEMENT = 0.9  #: share of those that must have the voxel in their mask
 RESOLUTION = 96  #: voxels along an edge of the grid
@@ -74,7 +73,7 @@ class VoxelObject:
 class VoxelGrid:
     """A cube of voxels, `half_size` from `center` (3,) to each side, and the views that see it."""
 
-    def __init__(self, views: Sequence[ReducedView], center: np.ndarray, half_size: float) -> None:
+    def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
         self.axis = np.linspace(-half_size, half_size, RESOLUTION)
         points = np.stack(np.meshgrid(*[self.axis] * 3, indexing="ij"), -1).reshape(-1, 3) + center
@@ -87,7 +86,7 @@ class VoxelGrid:
         return float(np.median([np.linalg.norm(view.camera.position - self.center) for view in self.views]))
 
     @classmethod
-    def seen_by(cls, views: Sequence[ReducedView]) -> "VoxelGrid":
+    def seen_by(cls, views: Views) -> "VoxelGrid":
         """A grid around the point that the cameras look at, as large as the median photograph shows."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
@@ -96,16 +95,13 @@ class VoxelGrid:
         return cls(views, center, 1.2 * float(np.median(np.linalg.norm(origins - center, axis=1)) * half))
 
     @classmethod
-    def around(cls, views: Sequence[ReducedView], found: VoxelObject) -> "VoxelGrid":
+    def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
         """A grid that is somewhat larger than an object."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """The largest connected piece of voxels in this share of the masks (H, W), or in those of some `voters`.
-
-        None if it is too small.
-        """
+        """The largest piece of voxels in this share of the masks, or of the `voters`; None if it is too small."""
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 
         def look(view: ReducedView, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -125,7 +121,7 @@ class VoxelGrid:
         return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
 
 
-def empty_masks(views: Sequence[ReducedView]) -> list[np.ndarray]:
+def empty_masks(views: Views) -> list[np.ndarray]:
     """A mask (H, W) uint8 of zeros for each view."""
     return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
@@ -136,7 +132,7 @@ def bright_mask(view: ReducedView) -> np.ndarray:
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
-def are_complete(views: Sequence[ReducedView], masks: Masks, silhouettes: Masks) -> list[bool]:
+def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
     """Which masks miss about as much of the common silhouette (H, W each) as the others? Lamps make them miss more."""
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
@@ -156,10 +152,7 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Masks from first guesses (H, W), by votes and GrabCut in turn; None if the guesses have no object in common.
-
-    `backgrounds` (H, W): above 0 where the object certainly is not.
-    """
+    """Masks outside `backgrounds`, from guesses, by votes and GrabCut in turn; None if the guesses disagree."""
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
         return grabcut(view.rgb, silhouette, ~view.valid | (background > 0), settings.band)

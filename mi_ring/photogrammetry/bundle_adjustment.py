@@ -1,36 +1,28 @@
-"""Bundle adjustment of cameras, points and lenses, with the corners of the printed sheet where it is seen.
+"""Bundle adjustment of a model, a `pycolmap.Reconstruction`, with the corners of the printed sheet where it is seen."""
 
-A `model` is a `pycolmap.Reconstruction` throughout.
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.marker_sheet import SheetDetection, triangulate
+from mi_ring.photogrammetry.marker_sheet import Detections, triangulate
 from mi_ring.photogrammetry.matching import grey_file
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
 pycolmap = LazyPackage("pycolmap", "structure from motion")
 ROBUST = 0.5  #: residual beyond which an observation counts less [px]: highlights and shadows move with the flash
-DETERMINED = 1e-3  #: standard deviation of a principal point, as a share of the picture's longer side, to accept it
+DETERMINED = 1e-3  #: largest standard deviation of a principal point [picture's longer side]: long lenses leave it open
 CORNER_WEIGHT = 12  #: a corner of the sheet counts like so many features, because it is found more precisely
 MAX_WORSE = 1.1  #: factor by which corners may increase the features' reprojection error
 CONVERGED = 1e-5  #: relative decrease of the error at which an adjustment ends
 ITERATIONS = 10  #: of the solver per call: pycolmap cannot be interrupted in a call
 
 
-def adjust(
-    model: Any, pictures: Sequence[Picture], detections: Mapping[str, SheetDetection], progress: Progress
-) -> Any:
-    """The model after bundle adjustment with the sheet's corners, or without if features contradict them.
-
-    They do if the object was moved on the sheet.
-    """
+def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
+    """The model after bundle adjustment. The sheet's corners take part unless the object was moved on the sheet."""
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
@@ -46,11 +38,8 @@ def adjust(
     return held if worse < MAX_WORSE * min(1.0, fewer) else refine_principal_points(model, progress)
 
 
-def add_corners(model: Any, pictures: Sequence[Picture], detections: Mapping[str, SheetDetection]) -> list[int]:
-    """Add the sheet's corners to the points of a model, `CORNER_WEIGHT` times each. Returns the ids of the new points.
-
-    Where the sheet is seen at a low angle, features are few and many are wrong.
-    """
+def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections) -> list[int]:
+    """Add the sheet's corners to the points of a model, `CORNER_WEIGHT` times each. Returns the new points' ids."""
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
         if detection := detections.get(picture.name):
@@ -68,11 +57,7 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Mapping[str
 
 
 def robust_adjustment(model: Any) -> Iterator[None]:
-    """Adjust a model with a robust loss, and remove points that do not fit; yields before each call of the solver.
-
-    Features on highlights and on the flash's shadows move with the camera. They match but are wrong, and plain least
-    squares would bend all cameras after them.
-    """
+    """Adjust a model with a robust loss, and remove points that do not fit; yields before each call of the solver."""
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
@@ -103,10 +88,7 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """The model with refined principal points, where the photographs determine them; other lenses keep theirs.
-
-    A long lens hardly determines it, because a shift of the picture resembles a turn of the camera.
-    """
+    """The model with refined principal points, where the photographs determine them; other lenses keep theirs."""
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -126,7 +108,7 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
 
 def is_determined(camera: Any, covariance: Any) -> bool:
-    """Does a `pycolmap.BACovariance`, or None, say that the principal point of a camera is accurate?"""
+    """Is a camera's principal point accurate, by a `pycolmap.BACovariance` or None?"""
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
         return False

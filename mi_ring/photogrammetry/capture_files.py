@@ -90,10 +90,7 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
 def write_table(
     writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: FlashCalibration
 ) -> list[Element]:
-    """Write the picture of the table's albedo around the object at `center` (3,). Returns the `table` element.
-
-    The table is in the scene because it reflects light onto the object. Returns no element if no photograph shows it.
-    """
+    """Write the table's albedo around `center` (3,). Returns its element of the scene file; none if it is not seen."""
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
         view = reduce_photograph(posed.picture, posed.lens, posed.pose, Window.whole(posed.lens, TABLE_PIXELS))

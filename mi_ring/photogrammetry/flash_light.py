@@ -33,14 +33,11 @@ class ObjectSphere(NamedTuple):
     radius: float
 
     def reflected(self, points: np.ndarray, lights: np.ndarray) -> np.ndarray:
-        """Irradiance (n,) of `points` (n, 3) of the sheet by the sphere, if white and lit by `lights` (n, 3) of 1 W/sr.
-
-        By the phase function of a distant Lambertian sphere (Lambert 1760).
-        """
+        """Irradiance (n,) of `points` (n, 3) of the sheet by a white sphere under `lights` (n, 3) of intensity 1."""
         up, to_light = self.center - points, lights - self.center
         distance = np.linalg.norm(to_light, axis=1)
         phase = np.arccos(np.clip(-(up * to_light).sum(1) / (np.linalg.norm(up, axis=1) * distance), -1, 1))
-        lit = (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
+        lit = (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi  # of a distant Lambertian sphere (Lambert 1760)
         return 2 / 3 * lit * self.form_factor(points) / distance**2
 
     def form_factor(self, points: np.ndarray) -> np.ndarray:
@@ -112,9 +109,8 @@ def calibrate_flash(
 ) -> FlashCalibration | None:  # fmt: skip
     """The flash that explains the brightness of white paper; None if no photograph shows the paper.
 
-    By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), from the axes of most photographs to its own;
-    relative `exposures`, NaN if unknown. `offset` (3,): guess of the flash's position. `sphere`: the object. `curved`:
-    may the response be other than linear?
+    By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), from those of most photographs to its own;
+    relative `exposures`, NaN if unknown. `offset` (3,): the flash, roughly; `curved`: may the response be non-linear?
 
     By robust least squares of log brightness with the priors above, for the `FlashParameters` and each photograph's
     intensity. The margin is used only if it is as bright as the squares, the response only if it is far from linear.
@@ -131,7 +127,6 @@ def calibrate_flash(
     squares = [Observations(*(part[~seen.in_margin] for part in seen)) for seen in whole]
     known = np.array([exposures[name] for name in names])
     prior = np.log(np.where(np.isfinite(known), known, 1.0)), np.where(np.isfinite(known), EXIF, NO_EXIF)
-
     seen, parameters = squares, fit_parameters(squares, prior, offset, sphere, curved)
     intensities = fit_intensities(squares, prior, parameters, sphere)
     margin = np.concatenate([(parameters.intensities(own, sphere) - intensity)[own.in_margin]

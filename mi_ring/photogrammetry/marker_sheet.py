@@ -47,6 +47,10 @@ class SheetDetection(NamedTuple):
     pixels: np.ndarray  #: (n, 2) [px]; the first pixel's centre is (0.5, 0.5)
 
 
+Detections = Mapping[str, SheetDetection]  #: by the photograph's name
+Cameras = Mapping[str, tuple[Lens, Pose]]  #: by the photograph's name
+
+
 class Similarity(NamedTuple):
     """x ↦ scale · rotation x + shift, from the cameras' frame to the sheet's [mm], and its quality."""
 
@@ -129,9 +133,7 @@ def are_collinear(points: np.ndarray) -> bool:
     return bool(values[1] <= 0.01 * values[0])
 
 
-def calibrate(
-    detections: Mapping[str, SheetDetection], size: tuple[int, int]
-) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
+def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
     """The lens of photographs of one size (width, height), their poses [mm] and rms errors [px], by the sheet alone.
 
     Lens: SIMPLE_RADIAL, with the principal point in the middle. Photographs that do not fit are left out. Raises
@@ -161,11 +163,8 @@ def calibrate(
                      "more: photograph it, flat, from all around")  # fmt: skip
 
 
-def align(detections: Mapping[str, SheetDetection], cameras: Mapping[str, tuple[Lens, Pose]]) -> Similarity:
-    """The similarity from the cameras' frame to the sheet's, by the corners that two photographs show; robust.
-
-    Raises InputError if fewer than six corners are left or if they do not form the sheet.
-    """
+def align(detections: Detections, cameras: Cameras) -> Similarity:
+    """The similarity from the cameras' frame to the sheet's. Raises InputError if too few corners fit the sheet."""
     seen = np.array([pair for _, *pair in triangulate(detections, cameras)]).reshape(-1, 2, 3)
     found, true = seen[:, 0], seen[:, 1]
     if len(found) < MIN_CORNERS or are_collinear(true):
@@ -185,9 +184,7 @@ def align(detections: Mapping[str, SheetDetection], cameras: Mapping[str, tuple[
     return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3], rms, int(keep.sum()))
 
 
-def triangulate(
-    detections: Mapping[str, SheetDetection], cameras: Mapping[str, tuple[Lens, Pose]]
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """The corners that two photographs agree on: id, point (3,) in the cameras' frame, and point (3,) of the sheet."""
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0

@@ -75,10 +75,7 @@ def pairs_to_match(count: int) -> list[tuple[int, int]]:
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Match pairs of photographs, except those in the database already.
-
-    Raises InputError after the first batch if all photographs are from one viewpoint.
-    """
+    """Match pairs that the database lacks. Raises InputError after the first batch if all are from one viewpoint."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0  # else it depends on the thread

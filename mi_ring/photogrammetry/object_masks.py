@@ -21,7 +21,7 @@ from mi_ring.photogrammetry import automatic_masks
 from mi_ring.photogrammetry.automatic_masks import RefinementSettings, Segmentation, VoxelGrid, VoxelObject
 from mi_ring.photogrammetry.capture_files import OBJECT, UNKNOWN, reduction
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.reduced_photographs import ReducedView, paste_mask, read_windows, reduce_mask, window_around
+from mi_ring.photogrammetry.reduced_photographs import Views, paste_mask, read_windows, reduce_mask, window_around
 from mi_ring.photogrammetry.shading_trial import initial_sphere, shading_silhouettes
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import FLATNESS, Plane, TableAppearance, TexelGrid, bare_table, find_plane
@@ -50,6 +50,7 @@ class SegmentationInput(NamedTuple):
     plane: Plane | None = None  #: the table
     box: tuple[float, ...] | None = None  #: lowest and highest x, y and z of the object, one after another
     masks: str | Path = "auto"  #: "auto": find them; else as `Picture.mask` has it
+    sheet: bool = False  #: is the plane that of the printed sheet?
 
     def digest(self) -> str:
         """A text that changes with the source of the masks, and with the files in a folder of masks."""
@@ -59,10 +60,7 @@ class SegmentationInput(NamedTuple):
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """(N,) bool: may points (N, 3) belong to the object? They must be in the box and above the table.
-
-        `flatness`: height of the table's relief, in units of the distance from the cameras.
-        """
+        """(N,) bool: are points (N, 3) in the box and above the table's relief, `flatness` · `camera_distance`?"""
         allowed = np.ones(len(points), bool)
         if self.plane:
             allowed &= self.plane.height(points) > flatness * camera_distance
@@ -97,8 +95,7 @@ def find_object(
     grid, positions = VoxelGrid.seen_by(views), np.stack([view.camera.position for view in views])
     plane = known.plane or find_plane(sparse.points, positions, grid.center, grid.half_size)
     if known.masks == "auto":
-        sheet = known.plane is not None
-        found, masks = find_masks(placed, sparse, grid, known._replace(plane=plane), sheet, progress)
+        found, masks = find_masks(placed, sparse, grid, known._replace(plane=plane), progress)
     else:
         found, masks = given_masks(placed, sparse, grid, known, progress)
     for name, mask in masks.items():
@@ -115,10 +112,7 @@ def find_object(
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """The masks in a folder as `SegmentedObject` has them; other grey values are rounded.
-
-    Raises InputError if there are no masks, or if the size of one is no whole fraction of its photograph's.
-    """
+    """The masks in a folder as `SegmentedObject` has them. Raises InputError if there are none or a size is wrong."""
     found = {}
     for picture in pictures:
         file = folder / f"{picture.name}.png"
@@ -138,10 +132,7 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """The object in the user's masks, and these masks as `SegmentedObject` has them.
-
-    Raises InputError if too few photographs have a mask, or if the masks have no object in common.
-    """
+    """The object, and the user's masks. Raises InputError if these are too few or have no object in common."""
     masks = {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(known.masks)
@@ -181,15 +172,11 @@ def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
 
 
 def find_masks(
-    pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, sheet: bool,
-    progress: Progress,
-) -> tuple[VoxelObject, dict[str, np.ndarray]]:  # fmt: skip
-    """The object, located in whole photographs, and its masks where it is clear, refined in windows around it.
-
-    `sheet`: is the plane that of the printed sheet? Raises InputError if no object is found or too few masks agree.
-    """
+    pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
+) -> tuple[VoxelObject, dict[str, np.ndarray]]:
+    """The object, and masks where it is clear. Raises InputError if no object is found or too few masks agree."""
     folder = pictures[0].path.parent
-    found = locate_object(grid, sparse.points, known, sheet, progress)
+    found = locate_object(grid, sparse.points, known, progress)
     silhouettes = [found.silhouette(view) for view in grid.views] if found else []
     showing = [(picture, silhouette) for picture, silhouette in zip(pictures, silhouettes) if silhouette.any()]
     if found is None or len(showing) < len(pictures) / 2:
@@ -218,8 +205,8 @@ def find_masks(
 
 
 def refine_object(
-    views: Sequence[ReducedView], found: VoxelObject, whole: VoxelGrid, known: SegmentationInput,
-    settings: RefinementSettings, progress: Progress,
+    views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
+    progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
     """Refined masks in views of the object, which is `found` so far. `whole`: the grid with the whole photographs."""
     grid = VoxelGrid.around(views, found)
@@ -238,11 +225,11 @@ def refine_object(
 
 
 def locate_object(
-    grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, sheet: bool, progress: Progress
+    grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, progress: Progress
 ) -> VoxelObject | None:
     """The object by its difference from the table, else by its brightness, else by a short fit; None if all fail.
 
-    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used on a `sheet`, as paper is bright,
+    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used on the sheet, as paper is bright,
     nor on pixels with the table's pattern, as the flash lights the middle of the table.
     """
     grid.allowed = known.allows(grid.points, grid.camera_distance)
@@ -252,7 +239,7 @@ def locate_object(
     def guesses() -> Iterator[list[np.ndarray]]:
         if table:
             yield table.foreign_masks()
-        if not sheet:
+        if not known.sheet:
             yield [automatic_masks.bright_mask(view) & (1 - mask) for view, mask in zip(grid.views, backgrounds)]
         sphere = initial_sphere(points[known.allows(points, grid.camera_distance)], grid.center, grid.half_size)
         with contextlib.suppress(InputError):  # the fit diverged

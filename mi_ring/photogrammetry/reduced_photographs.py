@@ -41,6 +41,10 @@ class ReducedView(NamedTuple):
         return row, column, inside & self.valid[row, column]
 
 
+Views = Sequence[ReducedView]
+Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 where they hold
+
+
 def straighten(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
     """The window (h, w, …) of a photograph's image (H, W, …) uint8: reduced by area, then undistorted."""
     height, width = (side // window.scale for side in image.shape[:2])

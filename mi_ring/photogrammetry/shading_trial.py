@@ -1,13 +1,11 @@
 """Finds the object by its shading alone: a short fit without masks, which starts from a sphere of sparse points."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.photogrammetry.reduced_photographs import ReducedView
+from mi_ring.photogrammetry.reduced_photographs import Views
 from mi_ring.rendering import prediction
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
@@ -22,10 +20,7 @@ SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128
 
 
 def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
-    """Centre (3,) and radius of a sphere that holds most of the points (N, 3) near `center`.
-
-    None if there are too few points: there may be no object.
-    """
+    """Centre (3,) and radius of a sphere around most of the points (N, 3) near `center`; None if these are too few."""
     near = points[np.linalg.norm(points - center, axis=1) < half_size]
     if len(near) < MIN_POINTS:
         return None
@@ -34,13 +29,8 @@ def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> 
     return middle, float(np.clip(radius, MIN_RADIUS * half_size, MAX_RADIUS * half_size))
 
 
-def shading_silhouettes(
-    views: Sequence[ReducedView], center: np.ndarray, radius: float, progress: Progress
-) -> list[np.ndarray]:
-    """(H, W) uint8 of each view: 1 where it shows the fitted surface, which starts as a sphere.
-
-    The flash is taken to be at the lens. Raises InputError if the fit diverges.
-    """
+def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
+    """(H, W) uint8 of each view: 1 on a surface that is fitted from a sphere. Raises InputError if the fit diverges."""
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.valid].mean() for view in views]))
     intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)

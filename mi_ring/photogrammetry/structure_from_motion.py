@@ -1,10 +1,7 @@
-"""Structure from motion: cameras and points from photographs alone, by COLMAP's library.
-
-A `model` is a `pycolmap.Reconstruction` throughout.
-"""
+"""Structure from motion, cameras and points from photographs, by COLMAP. A `model` is a `pycolmap.Reconstruction`."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +17,7 @@ from mi_ring.images import read_image
 from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.bundle_adjustment import adjust, model_cameras, registered
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.photogrammetry.marker_sheet import SheetDetection
+from mi_ring.photogrammetry.marker_sheet import Detections
 from mi_ring.photogrammetry.matching import MIN_MATCHES, find_features, grey_file, match_features, read_matches
 from mi_ring.system.machine import interruptible
 from mi_ring.system.optional import LazyPackage
@@ -59,20 +56,14 @@ class SparseModel:
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
         """The model in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
-        cameras = {
-            name: (lens, moved_pose(pose, scale, rotation, shift)) for name, (lens, pose) in self.cameras.items()
-        }
+        cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
 
 def structure_from_motion(
-    pictures: Sequence[Picture], detections: Mapping[str, SheetDetection], folder: Path, progress: Progress
+    pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Cameras of the photographs, with one lens for each size. Intermediate results in `folder` are used again.
-
-    `detections`: of the printed sheet, by the photograph's name. Raises InputError, with the reason, if less than half
-    of the photographs get a camera.
-    """
+    """Cameras of photographs, one lens for each size. Raises InputError, with the reason, if less than half get one."""
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
     if sparse.is_dir():

@@ -13,7 +13,7 @@ from trimesh.points import plane_fit
 from mi_ring.capture.grabcut import disk, grown
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.flash_light import FlashCalibration, irradiance
-from mi_ring.photogrammetry.reduced_photographs import ReducedView
+from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
 from mi_ring.scene.lights import Light
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
@@ -54,10 +54,7 @@ class Plane(NamedTuple):
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """The plane of most points (N, 3) within twice `half_size` of `center` (3,), by RANSAC; None if there is none.
-
-    All cameras (K, 3) and most other points must be above it.
-    """
+    """The plane of most points (N, 3) around `center` (3,), below other points and cameras (K, 3); None without one."""
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
         return None
@@ -122,9 +119,8 @@ class TexelGrid:
 
 
 def estimate_albedo(
-    views: Sequence[ReducedView], lights: Sequence[Light], hidden: Sequence[np.ndarray], grid: TexelGrid,
-    flash: FlashCalibration,
-) -> np.ndarray | None:  # fmt: skip
+    views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
+) -> np.ndarray | None:
     """Diffuse albedo (texels, texels, 3) of the table, median over views; None if no view shows the table.
 
     `lights`: one for each view; `flash`: their cone, room's light and response; `hidden` (H, W): above 0 where the
@@ -153,10 +149,7 @@ class TableAppearance:
     `hidden` (H, W): above 0 where something may hide the table; by default nowhere.
     """
 
-    def __init__(
-        self, views: Sequence[ReducedView], grid: TexelGrid, progress: Progress,
-        hidden: Sequence[np.ndarray] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, views: Views, grid: TexelGrid, progress: Progress, hidden: Masks | None = None) -> None:
         self.views, self.grid, self.progress, self.hidden = views, grid, progress, hidden
         x, y = 2 * grid.u, 2 * grid.v
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1).astype(np.float32)  #: (texels², 6)
@@ -212,9 +205,8 @@ class TableAppearance:
 
 
 def bare_table(
-    views: Sequence[ReducedView], silhouettes: Sequence[np.ndarray], tables: Sequence[TableAppearance],
-    progress: Progress,
-) -> list[np.ndarray] | None:  # fmt: skip
+    views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
+) -> list[np.ndarray] | None:
     """(H, W) uint8 of each view: 1 where it shows the bare table. None if the object itself looks like the table.
 
     Darker pixels count, too, as shadows; if the object then looks like the table, they do not. The first of the tables

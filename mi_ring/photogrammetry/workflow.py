@@ -76,10 +76,7 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """The sheet with squares of this size [mm]; None if fewer than three photographs show it.
-
-    Raises InputError, which names them, if photographs cannot be read.
-    """
+    """The sheet with squares of this size [mm]; None if few photographs show it. InputError if one is damaged."""
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
 
@@ -111,10 +108,7 @@ def find_sheet(
 
 
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
-    """The cameras beside the photographs in the format of another tool; None if there are none.
-
-    Raises InputError if they are invalid, of another size, or missing for most photographs.
-    """
+    """The cameras of another tool beside the photographs, if any. Raises InputError if invalid, or missing for most."""
     source = detect(pictures[0].path.parent)
     if source is None:
         return None
@@ -177,10 +171,7 @@ def find_cameras(
 
 
 def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
-    """Cameras from the sheet alone, in its frame [mm]: for objects without texture, and for turntables.
-
-    Raises InputError if less than half of the photographs get a camera.
-    """
+    """Cameras from the sheet alone, in its frame [mm]. Raises InputError if less than half of all get one."""
     cameras: dict[str, tuple[Lens, np.ndarray]] = {}
     errors: list[float] = []
     for size in dict.fromkeys(picture.size for picture in pictures):
@@ -222,8 +213,8 @@ def posed_pictures(
 ) -> list[PosedPicture]:  # fmt: skip
     """The photographs that have a camera, with their calibration.
 
-    `offset` (3,): of the flash from the lens [scene units], used if there is no calibrated flash. The intensity is then
-    unknown, and is set so low that fits notice.
+    `offset` (3,): of the flash from the lens [scene units], if it is not calibrated. Its intensity is then set so low
+    that fits notice that it is unknown.
     """
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}

@@ -17,11 +17,8 @@ HALF_LIMIT = 6e4  #: radiance is clipped here before it is written as half float
 
 
 def noisy(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
-    """Linear values with sensor noise. `electrons`: at full scale; 0: no shot noise.
-
-    `read`: standard deviation of the read noise [electrons; of 10,000 at full scale if `electrons` is 0].
-    """
-    full = electrons or 10_000.0
+    """Linear values with shot noise, by `electrons` at full scale (0: none), and `read` noise [electrons]."""
+    full = electrons or 10_000.0  # the unit of read noise where there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
     if electrons:
         value = random.poisson(value).astype(float)

@@ -1,7 +1,7 @@
 """The example capture: flash photographs of a pot, path traced by stock Mitsuba."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import mitsuba as mi
 import numpy as np
@@ -39,6 +39,10 @@ class ColouredMesh(NamedTuple):
     vertices: np.ndarray  #: (V, 3) [mm]
     faces: np.ndarray  #: (F, 3)
     colours: np.ndarray  #: (V, 3)
+
+    def ply(self) -> bytes:
+        """The mesh as a PLY file without colours."""
+        return cast(bytes, trimesh.Trimesh(self.vertices, self.faces, process=False).export(file_type="ply"))
 
 
 def pot(level: int = 6) -> ColouredMesh:

@@ -2,7 +2,6 @@
 
 from typing import Literal
 
-import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera
@@ -66,10 +65,7 @@ def near(position: np.ndarray, spread: float, random: np.random.Generator) -> np
 
 
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Radiance (BASIS, 3) of a room as `mi_ring.rendering.spherical_harmonics` has it. Its mean is about 1.
-
-    `in_camera`: the room is fixed to the camera, as beside a turntable, and not to the object.
-    """
+    """Spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera."""
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
     room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)
@@ -79,8 +75,3 @@ def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) ->
         first = PER_FRAME if in_camera else 1
         room[first : first + LOW_ORDERS - 1] = waves * min(1.0, (1 - DARKEST) / -darkest)
     return room
-
-
-def environment_map(radiance: np.ndarray) -> mi.Emitter:
-    """An `envmap` of radiances (H, W, 3) by latitude and longitude, y up."""
-    return mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance.astype(np.float32))})

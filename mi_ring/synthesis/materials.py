@@ -4,7 +4,7 @@ import re
 import shlex
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -58,20 +58,25 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """The BSDF that a text describes in one of the `FORMS`. Raises InputError, which names the `field`, if none.
-
-    `coloured`: has the mesh file colours?
-    """
+    """The BSDF that a text in one of the `FORMS` describes. `coloured`: has the mesh colours? Raises InputError."""
+    file, _, name = text.partition(".npz:")
+    path = Path(f"{file}.npz" if name else text)
+    found: Any = None
     try:
         if text.lower().endswith(".xml"):
-            return load_snippet(Path(text), field)
-        if ".npz" in text.lower() or text.lower().endswith(".binary"):
-            file, _, material = text.partition(".npz:")
-            path = Path(f"{file}.npz" if material else text)
             require_file(path, FORMS, field)
-            values = {"material": material} if material else {}
-            return mi.load_dict({"type": "merl", "filename": str(path.resolve()), **values})
-        found = mi.load_dict(parse_plugin(text, field, coloured))
+            with reading(f"{path}: {field}", "XML"):
+                root = ElementTree.fromstring(path.read_bytes())
+            if root.tag != "bsdf":
+                raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
+            move_names(root, path.resolve().parent, Path.cwd())  # they are relative to the file
+            found = load_element(root)
+        elif ".npz" in text.lower() or text.lower().endswith(".binary"):
+            require_file(path, FORMS, field)
+            material = {"material": name} if name else {}
+            found = mi.load_dict({"type": "merl", "filename": str(path.resolve()), **material})
+        else:
+            found = mi.load_dict(parse_plugin(text, field, coloured))
     except RuntimeError as error:
         raise InputError(f"{field}: {text}: {explained(str(error))}") from error
     if not isinstance(found, mi.BSDF):
@@ -89,17 +94,6 @@ def explained(message: str) -> str:
         wanted = "a number or a colour R,G,B" if "color" in wrong[2] else wrong[2].replace("float", "a number")
         return f"{wrong[1]} is a {wrong[3]}, must be {wanted}"
     return re.sub(r"^.*? plugin of type \"\w*\": (\[.*?\] )?", "", reason(RuntimeError(message)))
-
-
-def load_snippet(path: Path, field: str) -> mi.BSDF:
-    """The <bsdf> of an XML file. File names in it are relative to the file."""
-    require_file(path, FORMS, field)
-    with reading(f"{path}: {field}", "XML"):
-        root = ElementTree.fromstring(path.read_bytes())
-    if root.tag != "bsdf":
-        raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
-    move_names(root, path.resolve().parent, Path.cwd())
-    return cast(mi.BSDF, load_element(root))
 
 
 def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:

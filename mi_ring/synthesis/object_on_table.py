@@ -49,9 +49,9 @@ class ObjectOnTable:
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
             falloff = np.square(light.vector - middle).sum() if light.kind == "point" else 1.0
             white = light.rgb.max() / (np.pi * falloff)  # radiance of a white surface in the middle of the object
-            trace = partial(clamped_radiance_along, depth=depth, brightest=BRIGHTEST * white)
+            trace = partial(clamped_radiance_along, depth=depth, limit=BRIGHTEST * white)
             light = load_element(emitter_element(light))
-        window = view.around(self.vertices) if hidden and not self.tables else view.whole
+        window = view.around(self.vertices) if hidden and not self.tables else (0, 0, *view.camera.size)
         return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
 
     def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
@@ -108,10 +108,7 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, p
 
 
 def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
-    """Scene elements of a table at the point `ground` (3,) and, if asked for, of the printed sheet on it [mm].
-
-    Writes their textures into the `folder`. `up` (3,): normal of the table; `radius`: of the object.
-    """
+    """XML of a table at `ground` (3,) with normal `up` (3,), and of the sheet on it. Writes textures to the folder."""
     right = np.roll(up, 1)
     pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}
     if sheet:

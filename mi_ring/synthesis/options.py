@@ -174,12 +174,9 @@ def require_options(config: SynthesizeConfig) -> None:
     if config.pattern != "stripes" and not config.second:
         raise InputError(f"--pattern: is {config.pattern}, for which a second material is missing; give --second")
     if config.light in ("distant", "lamp") and config.wrong_light:
-        raise InputError(
-            f"--wrong-light: is of places in the cameras' axes, which {config.light} has none of; leave it out"
-        )
+        raise InputError(f"--wrong-light: is for point lights near cameras, not for {config.light}; leave it out")
     if config.lamps > 1 and (config.light != "lamp" or config.environment or config.pairs):
-        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp, which must be given, without "
-                         "--environment and without --pairs")  # fmt: skip
+        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp without --environment and --pairs")
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
@@ -193,7 +190,6 @@ def require_options(config: SynthesizeConfig) -> None:
             raise InputError("--environment: is instead of the photographs' lights and the room; leave out --light, "
                              "--offset, --room, --wrong-light and --wrong-power")  # fmt: skip
     if config.pairs and (config.room == 0 or config.wrong_room):
-        raise InputError("--pairs: need a room whose light fits subtract; give --room, for instance 0.2, and leave out "
-                         "--wrong-room")  # fmt: skip
+        raise InputError("--pairs: need a room; give --room, for instance 0.2, and leave out --wrong-room")
     if not config.environment and config.room == 0 and config.lamps == 1 and config.wrong_room:
         raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, --environment or --lamps")

@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +21,7 @@ from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
+from mi_ring.rendering.spherical_harmonics import room_envmap
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
@@ -129,10 +131,7 @@ class Studio:
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
     def radiance(self, scene: ObjectOnTable, photograph: PlannedPhotograph, spp: int, scale: int = 1) -> tuple:
-        """Linear radiance (H, W, 3) by the photograph's light of 1 W/m² and further lamps; and by the room, or 0.
-
-        The pictures are `scale` times smaller than the photograph.
-        """
+        """Linear radiance (H, W, 3), `scale` times smaller: by lamps, the first of 1 W/m²; and by the room, or 0."""
         config, view = self.config, LensCamera(photograph.camera.shrunk(scale))
         light = photograph.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, photograph.seed, config.depth, hidden=self.environment is None)
@@ -141,8 +140,8 @@ class Studio:
         if not config.room:
             return picture, 0.0
         # In a picture of its own: paths that choose between two lights are much noisier.
-        room = self.room_level * light_sources.room_envmap(self.room, photograph.camera.to_world)
-        light = light_sources.environment_map(room)
+        room = self.room_level * room_envmap(self.room, photograph.camera.to_world)
+        light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(room.astype(np.float32))})
         return picture, scene.radiance(view, light, spp, photograph.seed + 1, config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
@@ -165,10 +164,7 @@ class Studio:
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write a capture into its folder, or the missing part of it. The scene file comes last.
-
-    Raises InputError if a file cannot be read or if the folder holds anything else.
-    """
+    """Write a capture or its missing part, the scene file last. Raises InputError, as `Studio` and `claim` do."""
     out, studio = config.out, Studio(config)
     claim(out, config)
     for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):

@@ -1,7 +1,4 @@
-"""Pictures by Mitsuba's stock path tracer along our own camera rays: with lens distortion and motion blur.
-
-With the renderer of a fit it shares only the class `Camera`, so that its pictures are an independent test.
-"""
+"""Pictures by Mitsuba's stock path tracer along our own rays. They are independent of the renderer of a fit."""
 
 import functools
 from collections.abc import Callable
@@ -24,13 +21,10 @@ Trace = Callable[[mi.RayDifferential3f, int], list]  #: (rays, seed) ↦ channel
 
 @dataclass(frozen=True)
 class LensCamera:
-    """A camera with lens distortion and motion blur.
-
-    `distortion` (k1, k2): a pinhole's x / z and y / z times 1 + k1 r² + k2 r⁴ are those of the lens.
-    """
+    """A camera with lens distortion and motion blur."""
 
     camera: Camera
-    distortion: tuple[float, float] = (0.0, 0.0)
+    distortion: tuple[float, float] = (0.0, 0.0)  #: k1, k2: x / z and y / z become 1 + k1 r² + k2 r⁴ times as large
     motion: tuple[float, float] = (0.0, 0.0)  #: of the picture during the exposure [px]
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -40,11 +34,6 @@ class LensCamera:
         r2 = (tangents**2).sum(1, keepdims=True)
         k1, k2 = self.distortion
         return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
-
-    @property
-    def whole(self) -> Window:
-        """The whole picture."""
-        return 0, 0, *self.camera.size
 
     def around(self, points: np.ndarray) -> Window:
         """The part of the picture that shows points (n, 3) in front of the camera, with a margin."""
@@ -88,17 +77,12 @@ def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth
     return list(path.sample(scene, sampler, rays)[0])
 
 
-def clamped_radiance_along(
-    rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, brightest: float
-) -> list:
-    """As `radiance_along`, but the indirect light of each path is at most `brightest`.
-
-    Rare paths that meet a small light by reflection at a highlight would leave white dots.
-    """
+def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, limit: float) -> list:
+    """As `radiance_along`, but indirect light of a path is at most `limit`: rare bright paths leave white dots."""
     direct = radiance_along(rays, seed, scene, 2)
     if depth == 2:
         return direct
-    return [d + dr.clip(a - d, 0, brightest) for a, d in zip(radiance_along(rays, seed, scene, depth), direct)]
+    return [d + dr.clip(a - d, 0, limit) for a, d in zip(radiance_along(rays, seed, scene, depth), direct)]
 
 
 def hits_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, shape: mi.Shape) -> list:
