@@ -31,7 +31,7 @@ def imports(module: str) -> set[str]:
             names = [alias.name for alias in node.names]
             found |= {f"mi_ring.{name}" for name in names} if node.module == "mi_ring" else {node.module}
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("need", "LazyPackage"):  # may be missing
-            found.add(ast.literal_eval(node.args[0]))
+            found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
     return {".".join(name.split(".")[: 2 if name.startswith("mi_ring.") else 1]) for name in found}
 
 
