@@ -1,11 +1,12 @@
-"""What a browser draws of a fit's GLB beside what we render of the fit, photograph by photograph.
+"""How near a browser's picture of an exported GLB comes to ours.
 
     python benchmarks/browser.py out/pot2 [--picture docs/glb.png]
 
-The viewer of the run's report.html draws every photograph of the fit in headless Chromium; `photometric` renders the
-same from the networks. The viewer has neither shadows nor interreflection, so that ours is first without them. Prints a
-Markdown table with machine and date: mean absolute difference of sRGB values, in % of full scale, over all pixels and
-over those that show the object, and PSNR.
+The viewer of the run's report.html draws every photograph of the fit in headless Chromium. `photometric` renders the
+same photographs from the networks. The viewer has neither shadows nor interreflection, so our first row has none.
+
+Prints a Markdown table with machine and date: mean absolute difference of sRGB values in % of full scale, over all
+pixels and over the pixels of the object, and PSNR. --picture writes three photographs side by side.
 """
 
 import argparse
@@ -24,14 +25,14 @@ from playwright.sync_api import sync_playwright
 from mi_ring.capture import loading
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
-from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 
-def photograph(sensor) -> dict:
+def photograph(shot) -> dict:
     """A photograph as the viewer's `draw` takes it. Raises ValueError if its light is no point."""
-    matrix, (fx, fy), (cx, cy), (width, height), _ = sensor.camera
-    light = Lights.of([sensor])[0]
+    matrix, (fx, fy), (cx, cy), (width, height), _ = shot.camera
+    light = shot.own_light
     if light.kind == "directional":
         raise ValueError("the viewer has a point light, this photograph a distant one")
     return {
@@ -40,7 +41,7 @@ def photograph(sensor) -> dict:
     }  # fmt: skip
 
 
-def drawn(page_file: Path, sensors) -> list[np.ndarray]:
+def drawn(page_file: Path, shots) -> list[np.ndarray]:
     """The photographs (H, W, 3) that the viewer of a report draws, sRGB in [0, 1]."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
@@ -51,8 +52,8 @@ def drawn(page_file: Path, sensors) -> list[np.ndarray]:
         page.goto(page_file.resolve().as_uri())
         page.wait_for_function("window.viewer !== undefined")
         pictures = []
-        for sensor in sensors:
-            url = page.evaluate("photograph => window.viewer.draw(photograph)", photograph(sensor))
+        for shot in shots:
+            url = page.evaluate("photograph => window.viewer.draw(photograph)", photograph(shot))
             pictures.append(imageio.imread(io.BytesIO(base64.b64decode(url.split(",")[1])))[..., :3] / 255)
         browser.close()
     return pictures
@@ -65,8 +66,8 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="file for a picture of three photographs")
     arguments = parser.parse_args()
     scene, ring = loading.load_capture(arguments.run / "scene.xml", images=False), load_fit(arguments.run)
-    theirs = drawn(arguments.run / "report.html", scene.sensors)
-    surface = bridge.Surface(scene.scene, scene.shape, ring)
+    theirs = drawn(arguments.run / "report.html", scene.shots)
+    surface = Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     print(f"{processor()}; {datetime.date.today()}; {arguments.run.name}, {len(theirs)} photographs\n")
     print("| ours | all pixels, % | the object's, % | PSNR, dB |\n| --- | --- | --- | --- |")
@@ -75,7 +76,9 @@ def main() -> None:
         "direct light, no shadows": {"shadows": False},
         "all light": {"shadows": True, "indirect": True},
     }.items():
-        ours, covered = zip(*(bridge.draw(surface, scene.photograph(k), spp=64, **options) for k in range(len(scene))))
+        ours, covered = zip(
+            *(prediction.draw(surface, scene.photograph(k), spp=64, **options) for k in range(len(scene)))
+        )
         ours = [linear_to_srgb(picture[0].numpy()) for picture in ours]
         plain = plain or ours
         difference = [np.abs(a - b) for a, b in zip(ours, theirs)]

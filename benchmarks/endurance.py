@@ -1,9 +1,11 @@
-"""Does the renderer keep memory or compile anew? What a fit does with it, 500 times, as a Markdown table.
+"""Does the renderer keep memory, or compile kernels again, in a long fit?
 
     python benchmarks/endurance.py [--iterations 500]
 
-Every iteration turns the domain at random, writes 10,242 vertices and their material, renders eight photographs of 128²
-pixels under lamps off the camera, with shadows and interreflection, and takes the gradient with respect to all of it.
+Each iteration rotates the domain at random, writes 10,242 vertices and their material, renders eight photographs of
+128² pixels under lamps beside the camera with shadows and interreflection, and takes all gradients.
+
+Prints a Markdown table with machine and date: memory and number of compiled kernels after some iterations.
 """
 
 import argparse
@@ -12,7 +14,9 @@ import os
 from pathlib import Path
 
 from mi_ring.geometry.domain import Sphere
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
+from mi_ring.rendering.surface import Surface
 
 # isort: split
 import drjit as dr
@@ -34,7 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     print(f"{processor()}; {datetime.date.today()}\n")
     scene = Scene(METHODS["`photometric`"])
-    surface = bridge.Surface(scene.scene, next(s for s in scene.scene.shapes() if s.is_mesh()))
+    surface = Surface(scene.scene, next(s for s in scene.scene.shapes() if s.is_mesh()))
     domain, random = Sphere(), torch.Generator().manual_seed(0)
     weights = torch.from_numpy(scene.weights).permute(0, 2, 3, 1)
     surface.set_faces(domain.sample(5)[1])
@@ -47,10 +51,10 @@ def main() -> None:
         material = {"diffuse": 0.3 + 0.1 * s, "specular": 0.05 + 0.01 * y, "roughness": 0.35 + 0.1 * z}
         tensors = [t.requires_grad_() for t in (s * radius[:, None], *material.values())]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            rgb, coverage = bridge.render(
+            rgb, coverage = prediction.render(
                 surface, scene.photographs, tensors[0], dict(zip(material, tensors[1:])), 1, iteration
             )
-            rgb = rgb + bridge.surroundings(surface, scene.photographs, coverage, iteration).interreflection
+            rgb = rgb + GlobalIllumination.of(surface, scene.photographs, coverage, iteration).interreflection
             ((rgb * weights).sum() + coverage.sum()).backward()
             compiled += sum(not kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
         if iteration in (1, 10) or iteration % 50 == 0:

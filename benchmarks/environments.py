@@ -1,16 +1,16 @@
-"""How well is an object found whose light is unknown? As Markdown: normals, light and relit pictures by environment.
+"""How accurate is a fit under an unknown environment?
 
     python benchmarks/environments.py MESH … [--views 50] [--width 512] [--spp 64] [--maps overcast indoor sun]
         [--out out/environments] [-- OPTIONS OF FIT]
 
-Each mesh, of plastic, is path traced (`mi-ring synthesize`) in three environments of this script's own making: an
-overcast sky (its radiance 1 at the horizon and 3 at the zenith, as the CIE has it), a room with a window and two lamps,
-and a clear sky with the sun. The scene says nothing of them; `--light environment` finds shape, material and light.
-Then the object is lit by the next of the three, where it has never been seen, and compared with the truth (PSNR after
-one factor for each colour, over the object's pixels). The light's direction: how far the brightest place of the map
-that was found is from that of the true map, both as harmonics of order 4, which says little where none is bright; and
-how far the directions are from which the light comes on the whole, the sums of all by their radiance. With `--flash` a
-flash capture of the same views stands beside them.
+`mi-ring synthesize` path traces each mesh, of plastic, in three environments that this script makes: an overcast sky
+(CIE: radiance 1 at the horizon, 3 at the zenith), a room with a window and two lamps, and a clear sky with the sun. The
+scene file does not mention them. `--light environment` finds shape, material and light. The object is then lit by the
+next of the three environments. --flash adds a flash capture of the same views.
+
+Prints a Markdown table: errors of normals and depth; the angle between the brightest directions of the true and of the
+found map, both as harmonics of order 4; the angle between the radiance-weighted mean directions; PSNR of the relit
+object, after one factor per colour.
 """
 
 import argparse
@@ -28,7 +28,7 @@ import torch
 from accuracy import processor, product_speed, table
 
 from mi_ring.images import read_image, write_image
-from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, directions_of, harmonics_in, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME, envmap_directions, room_envmap, world_harmonics
 
 ROWS = 128  #: of a map
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
@@ -39,7 +39,7 @@ RELIT, SMOOTH = 4, 512
 
 def directions(rows: int = ROWS) -> np.ndarray:
     """(rows, 2 rows, 3) of a map by latitude and longitude as Mitsuba's `envmap` has it, y up."""
-    return directions_of(rows)[0].reshape(rows, 2 * rows, 3)
+    return envmap_directions(rows)[0].reshape(rows, 2 * rows, 3)
 
 
 def window(away: np.ndarray, azimuth: float, elevation: float, size: tuple[float, float], rgb: tuple) -> np.ndarray:
@@ -66,22 +66,22 @@ def maps() -> dict[str, np.ndarray]:
 
 def as_harmonics(radiance: np.ndarray) -> np.ndarray:
     """(BASIS, 3) of a map, by a sum over its pixels."""
-    away, weight = directions_of(len(radiance))
+    away, weight = envmap_directions(len(radiance))
     room = np.zeros((BASIS, 3))
-    room[:COUNT] = harmonics_in(away) * weight @ radiance.reshape(-1, 3)
+    room[:PER_FRAME] = world_harmonics(away) * weight @ radiance.reshape(-1, 3)
     return room
 
 
 def whole(room: np.ndarray) -> np.ndarray:
     """(3,) the direction from which the light of harmonics comes on the whole."""
-    away, weight = directions_of(ROWS)
-    total = weight * (room[:COUNT].mean(1) @ harmonics_in(away)) @ away
+    away, weight = envmap_directions(ROWS)
+    total = weight * (room[:PER_FRAME].mean(1) @ world_harmonics(away)) @ away
     return total / np.linalg.norm(total)
 
 
 def brightest(room: np.ndarray) -> np.ndarray:
     """(3,) the direction in which harmonics are brightest."""
-    grey = seen_from_within(room, np.eye(4)).mean(-1)
+    grey = room_envmap(room, np.eye(4)).mean(-1)
     return directions(len(grey)).reshape(-1, 3)[grey.argmax()]
 
 

@@ -1,11 +1,11 @@
-"""A standing figure with its arms held out, as a mesh to path trace: thin limbs, no side like the other.
+"""Make a standing figure with its arms held out, as a mesh with thin limbs and no symmetry.
 
     python benchmarks/figure.py out/figure.ply
     mi-ring synthesize out/figure.ply out/figure --novel 4
     python benchmarks/accuracy.py out/figure --preset fast --seeds 0 1 2
 
-Limbs are segments whose radius changes along them, joined by a smooth minimum of their distances; marching cubes make
-the surface, one closed piece without handles [metres].
+Limbs are segments of varying radius, joined by a smooth minimum of their distances. Marching cubes make one closed
+surface without handles [metres]. Prints nothing.
 """
 
 import argparse

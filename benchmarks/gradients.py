@@ -1,10 +1,10 @@
-"""Compare the gradients of `photometric` with finite differences and print the deviations as Markdown tables.
+"""Compare gradients of `photometric` with finite differences.
 
     python benchmarks/gradients.py [--seeds 4] [--spp 256] > table.md
 
-Each cell is the derivative of a weighted sum of the pixels of one picture, by `dr.backward` through plain `mi.render`
-and by central differences of `mi.render` with the same seeds on both sides: deviation ± standard error of the two
-together, in % of the finite difference.
+Prints Markdown tables with machine and date. Each cell is the derivative of a weighted sum of the pixels of one
+picture, by `dr.backward` through `mi.render`, against the central difference of `mi.render` with the same seeds on both
+sides: deviation ± standard error of the two together, in % of the finite difference. It takes half an hour.
 """
 
 import argparse

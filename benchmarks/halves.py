@@ -1,10 +1,10 @@
-"""How precise a fit of real photographs is: fit every other one, then the others, and compare.
+"""How precise is a fit of real photographs? Fit every other photograph, then the others, and compare.
 
-    python benchmarks/halves.py SCENE.xml [--out out/halves] [OPTIONS OF mi_ring.fit]
+    python benchmarks/halves.py SCENE.xml [--out out/halves] [OPTIONS OF mi-ring fit]
 
-Printed, as Markdown: how far apart the flashes are that both have found, as an angle seen from the object, and the
-surfaces where photographs show them, after a rigid alignment: mean distance of points of each to the other, in % of
-the diagonal. It goes on where it stopped.
+Prints a Markdown table with machine and date: the angle between the two flashes, seen from the object, and the distance
+of the two surfaces where photographs show them, after a rigid alignment, in % of the diagonal. The same command
+continues after an interruption.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def main() -> None:
     capture = mi_ring.load_capture(arguments.scene)
     (one, _), (other, _) = (load_true_mesh(out / "mesh.ply") for out in outs)
     center = other.bounds.mean(0)
-    distance = np.median([np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors])
+    distance = np.median([np.linalg.norm(shot.camera.position - center) for shot in capture.shots])
     flashes = [np.array(record["unknowns"]["light"]["after"]) for record in found]
     apart = np.degrees(np.linalg.norm((flashes[1] - flashes[0])[:2]) / distance)
     above = [np.degrees(np.arctan2(flash[1], distance)) for flash in flashes]

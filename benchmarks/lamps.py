@@ -1,13 +1,14 @@
-"""How well is an object found whose lamps nobody has measured? As Markdown: normals, how many are found, where.
+"""How accurate is a fit under unknown lamps?
 
     python benchmarks/lamps.py MESH … [--lamps 1 2 3] [--views 32] [--width 256] [--spp 16] [--out out/lamps]
         [-- OPTIONS OF FIT]
 
-Each mesh, of plastic, is path traced (`mi-ring synthesize`) under lamps that stand still, as far away as the cameras.
-The scene says nothing right of them: of the first no place is taken, of the others there is no word. `--light lamps`
-finds how many there are, where, and how strong; beside it stand a fit by `--light environment` and one to which the
-lamps are known exactly: what they do not light, no fit can see well. How far off lamps are: by their distance from the
-object, the worst of all; how strong, by the first.
+`mi-ring synthesize` path traces each mesh, of plastic, under fixed lamps as far away as the cameras. The scene file has
+no useful place for the first lamp and does not mention the others. `--light lamps` finds number, places and strengths.
+Two fits are compared with it: one by `--light environment`, and one that knows the lamps exactly.
+
+Prints a Markdown table with machine and date: errors of normals; the number of lamps that was found; the largest error
+of a place, relative to its distance from the object; the largest error of a strength, relative to the first lamp.
 """
 
 import argparse

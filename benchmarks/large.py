@@ -1,10 +1,12 @@
-"""Open, check and fit a capture of very many photographs, or export a very fine mesh: what it costs in time and memory.
+"""What very many photographs, or a very fine mesh, cost in time and memory (Linux).
 
     python benchmarks/large.py CAPTURE.xml [--count 2000] [--size 3464] [--out out/large]
     python benchmarks/large.py RUN [--level 9] [--out out/large]
 
-The photographs are those of the capture, in another size and written as JPEG, the same few again and again under other
-names. RUN is the results folder of a fit, whose surface and material are written as PLY. Linux.
+The first opens, checks and fits a capture: its photographs are scaled to --size, written as JPEG, and used again and
+again under other names. The second exports surface and material of a finished fit as PLY.
+
+Prints processor time and peak memory of each step, with machine and date.
 """
 
 import argparse

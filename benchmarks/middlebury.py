@@ -1,11 +1,13 @@
-"""Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw what is found.
+"""Fit a set of Middlebury's multi-view photographs, whose light is unknown, and draw the result.
 
     python benchmarks/middlebury.py FOLDER [--light lamps] [--halves] [--out out/middlebury] [-- OPTIONS OF FIT]
 
-FOLDER is the data set as it is unpacked, of a bright object before a dark background. Masks are what is brighter than a
-tenth of full scale, closed and filled: shadows on the object belong to it. Every eighth photograph is kept out; printed
-is the PSNR of these over the object's pixels, as sRGB. The picture shows some photographs as predicted, and normals.
-With `--halves` two fits instead, of every second photograph each: how far their surfaces are apart is their precision.
+FOLDER is the unpacked data set: a bright object before a dark background. A mask is what is brighter than a tenth of
+full scale, closed and filled. Every eighth photograph is kept out.
+
+Prints the PSNR of these over the pixels of the object, as sRGB, with machine and date. Writes a picture with some
+predictions and normals. --halves fits every second photograph, then the others, and prints how far apart the two
+surfaces are.
 """
 
 import argparse
@@ -26,7 +28,8 @@ from accuracy import processor, product_speed
 from scipy import ndimage
 
 from mi_ring.images import linear_to_srgb, read_image, to_bytes, write_image
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 DARK, CLOSED = 24, 3  #: brightness (of 255) of what is background; how far gaps are closed [px]
 SHOWN = 1, 4, 8, 12  #: photographs of the picture
@@ -58,19 +61,19 @@ def masked_scene(folder: Path, out: Path) -> Path:
 def draw(run: Path, picture: Path) -> list[float]:
     """Write the picture; returns the PSNR of the photographs that were kept out [dB]."""
     capture, ring = mi_ring.load_capture(run / "scene.xml"), mi_ring.load_fit(run)
-    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     columns, found = [], []
     for k in range(len(capture)):
         photograph, seen = capture.photograph(k), capture.observe([k])
-        rgb, coverage = bridge.draw(surface, photograph, 8, indirect=ring.indirect)
+        rgb, coverage = prediction.draw(surface, photograph, 8, indirect=ring.indirect)
         inside, shown = seen.mask[0].numpy() > 0.5, linear_to_srgb(rgb[0].numpy().clip(0, 1))
         if k % 8 == 4:
             error = (shown - linear_to_srgb(seen.rgb[0].numpy().clip(0, 1)))[inside]
             found.append(float(-10 * np.log10(np.mean(error**2))))
         if k in SHOWN:
             alpha = coverage[0].numpy()[..., None]
-            normals = bridge.maps(surface, photograph)["normal"][0] / 2 + 0.5
+            normals = prediction.maps(surface, photograph)["normal"][0] / 2 + 0.5
             columns.append(np.concatenate([part * alpha + 1 - alpha for part in (shown, normals)]))
     image = to_bytes(np.concatenate(columns, 1))
     small = cv2.resize(image, None, fx=0.45, fy=0.45, interpolation=cv2.INTER_AREA)

@@ -1,26 +1,25 @@
-"""Simulated phone captures with their truth: an object on a printed sheet, photographed by hand with the flash on.
+"""Make a simulated phone capture with its truth: an object on the printed sheet, photographed by hand with the flash.
 
     python benchmarks/phone.py OUT [--object NAME|MESH] [--disturbances all|none|NAME,NAME…] [--ambient 0.03]
         [--views 40] [--size 1440x1080] [--seed 0] [--sheet board|random|white|none] [--turntable] [--spp N]
         [--no-exact]
 
-Writes, in the world of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
+Writes, in the frame of the sheet (mm, origin in its middle, x right, y up the page, z out of the paper):
 
-    OUT/photos/                  the photographs, as the phone wrote them
+    OUT/photos/                  the photographs as the phone writes them
     OUT/truth/mesh.ply           the object
-    OUT/truth/masks/             what each photograph shows of it, as photographed: with the lens' distortion
-    OUT/truth/transforms.json    cameras, lens, flash (pl_pos [mm], pl_intensity with exposure and white balance) and
-                                 masks, for `mi_ring.convert transforms`: the photographs with exact calibration
-    OUT/truth/settings.json      the settings, which photographs failed, exposure and white balance of each
-    OUT/exact/scene.xml          the same views without any disturbance (but the principal point), exactly calibrated,
-                                 cropped as by `mi_ring.photos`
+    OUT/truth/masks/             true masks, with the distortion of the lens
+    OUT/truth/transforms.json    cameras, lens, masks and flash (pl_pos [mm], pl_intensity with exposure and white
+                                 balance), for `mi-ring convert transforms`: exact calibration
+    OUT/truth/settings.json      settings, failed photographs, exposure and white balance
+    OUT/exact/scene.xml          the same views without disturbances (but with the principal point), exactly
+                                 calibrated, cropped as by `mi-ring photos`
 
-Disturbances, each a switch: sheet (and table, which reflect light onto the object), ambient (light of the room),
-offset (the flash is beside the lens), cone (and does not shine alike in all directions), lens (distortion), principal
-(point, off the middle), exposure (and white balance: EXIF tells exposure, nothing the balance), jpeg, noise, blur,
-failures (of 40 photographs one is blurred and one shows something else). Without them: black room, object
-alone, flash in the lens, 8-bit PNG. With --turntable object and sheet turn, camera and light
-stand. Deterministic by seed.
+Disturbances: sheet (sheet and table reflect light onto the object), ambient (room light), offset (the flash is beside
+the lens), cone (the flash is weaker to the sides), lens (distortion), principal (point off the middle), exposure (and
+white balance; EXIF has only the exposure), jpeg, noise, blur, failures (of 40 photographs one is blurred and one shows
+something else). Without them: black room, flash in the lens, 8-bit PNG, object alone. With --turntable object and sheet
+turn. The same seed gives the same files.
 """
 
 import argparse
@@ -32,7 +31,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import phone_stage
-from phone_stage import Shot, Stage
+from phone_stage import LensCamera, Stage
 
 # isort: split
 import mitsuba as mi
@@ -47,6 +46,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.photogrammetry.capture_files import crop_windows
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
 
 DISTURBANCES = (
     "sheet", "ambient", "offset", "cone", "lens", "principal", "exposure", "jpeg", "noise", "blur", "failures"
@@ -123,7 +123,7 @@ def poses(settings: Settings, height: float) -> Iterator[tuple[np.ndarray, float
         yield to_world, azimuth if settings.turntable else 0.0
 
 
-def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> Shot:
+def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> LensCamera:
     """Photograph `k`: its camera, lens and motion."""
     width, height = settings.size
     focal = width / 2 / np.tan(np.radians(VIEW_ANGLE / 2))
@@ -131,7 +131,7 @@ def shot_of(settings: Settings, k: int, to_world: np.ndarray) -> Shot:
     length = BLUR if settings.has("blur") else 0.0
     length = SHAKEN * width if settings.failed.get(k) == "blurred" else length
     angle = settings.rng(3, k).uniform(0, 2 * np.pi)
-    return Shot(Camera(to_world, np.full(2, focal), centre, settings.size),
+    return LensCamera(Camera(to_world, np.full(2, focal), centre, settings.size),
                 DISTORTION if settings.has("lens") else (0.0, 0.0),
                 (length * np.cos(angle), length * np.sin(angle)))  # fmt: skip
 
@@ -153,7 +153,7 @@ def flash_at(settings: Settings, camera: Camera) -> np.ndarray:
     return camera.position + (camera.to_world[:3, :3] @ FLASH if settings.has("offset") else 0)
 
 
-def photograph(stage: Stage, settings: Settings, shot: Shot, k: int) -> np.ndarray:
+def photograph(stage: Stage, settings: Settings, shot: LensCamera, k: int) -> np.ndarray:
     """What the sensor sees of photograph `k`: linear (H, W, 3), 1 = full scale, noise and all."""
     camera = shot.camera
     power = CONE if settings.has("cone") else 0.0
@@ -236,7 +236,7 @@ def make_capture(out: Path, settings: Settings) -> None:
             stage.turn(angle)
         exposure, balance = gains(settings, k)
         write_photograph(photos / (name + suffix), photograph(stage, settings, shot, k), exposure)
-        write_mask(truth / "masks" / f"{name}.png", stage.coverage(Shot(shot.camera, shot.distortion)))
+        write_mask(truth / "masks" / f"{name}.png", stage.coverage(LensCamera(shot.camera, shot.distortion)))
         taken[name + suffix] = {"exposure": exposure, "balance": balance.tolist(), "failed": settings.failed.get(k)}
         if k in settings.failed:
             continue
@@ -248,14 +248,14 @@ def make_capture(out: Path, settings: Settings) -> None:
         })  # fmt: skip
         if not settings.exact:
             continue
-        pinhole = Shot(camera)
+        pinhole = LensCamera(camera)
         alone.flash.aim(camera.position, camera.forward, intensity(), 0.0)
         linear = alone.radiance(pinhole, max(settings.spp, 9), settings.seed * 10_000 + 2 * k + 1)
         write_photograph(exact / "images" / f"{name}.png", linear, 1.0)
         write_mask(exact / "masks" / f"{name}.png", alone.coverage(pinhole))
         light = Light("point", camera.position, np.full(3, intensity()))
-        elements.append(photograph_element(name, f"images/{name}.png", camera, light, f"masks/{name}.png",
-                                           calibrated=True))  # fmt: skip
+        files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
+        elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
     if settings.exact:
         (exact / "truth").symlink_to("../truth")
         (exact / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))

@@ -1,12 +1,12 @@
-"""What simulated phone captures show and how it is lit: objects, sheet, table, room and flash; path traced by Mitsuba.
+"""Objects, sheet, table, room and flash of simulated phone captures, path traced by Mitsuba. Used by `phone.py`.
 
-Used by `phone.py`. World: that of the sheet [mm], origin in its middle, x right, y up the page, z out of the paper.
-Rays and paths are those of `mi_ring.synthesis.tracing`. Nothing in here shares code or model with what reconstructs it,
-but for the layout of a camera.
+World: the sheet's [mm], origin in its middle, x right, y up the page, z out of the paper. Rays and paths are those of
+`mi_ring.synthesis.tracing`. It shares no code and no model with the reconstruction, except the layout of a camera.
 """
 
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "scenes"))
@@ -23,16 +23,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 
 from mi_ring.scene.plain_mesh import mesh_of
-from mi_ring.synthesis.tracing import (
-    Shot,
-    Traced,
-    Window,
-    averaged,
-    covered,
-    flashed_along,
-    radiance_along,
-    rays_of,
-)
+from mi_ring.synthesis.tracing import LensCamera, Trace, clamped_radiance_along, hits_along, pixel_means, radiance_along
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -256,46 +247,35 @@ class Stage:
         self.flashed = mi.load_dict({"type": "scene", **shapes, "flash": self.flash})
         self.lit = mi.load_dict({"type": "scene", **shapes, "room": room})
 
-    def radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
+    def radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the flash as it is aimed."""
-
-        def flashed(window: Window, spp: int, seed: int) -> list:
-            return flashed_along(rays_of(shot, window, spp, seed), self.flashed, seed, 4, self.brightest)
-
+        flashed = partial(clamped_radiance_along, scene=self.flashed, depth=4, limit=self.brightest)
         if self.bare:
-            window = shot.around(self.mesh.vertices)
-            return averaged(flashed, shot, window, spp, seed)
+            return pixel_means(flashed, shot, shot.around(self.mesh.vertices), spp, seed)
         return self.pictured(flashed, shot, spp, seed)
 
-    def room_radiance(self, shot: Shot, spp: int, seed: int) -> np.ndarray:
+    def room_radiance(self, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
         """Linear radiance (H, W, 3) by the room, whose mean radiance is 1.
 
         Apart, for an integrator that chooses between two lights is much noisier.
         """
+        return self.pictured(partial(radiance_along, scene=self.lit, depth=3), shot, spp, seed)
 
-        def lit(window: Window, spp: int, seed: int) -> list:
-            return radiance_along(rays_of(shot, window, spp, seed), self.lit, seed, 3)
-
-        return self.pictured(lit, shot, spp, seed)
-
-    def pictured(self, traced: Traced, shot: Shot, spp: int, seed: int) -> np.ndarray:
-        """Radiance (H, W, 3) of paths `traced`(window, spp, seed), many more where the object is.
+    def pictured(self, trace: Trace, shot: LensCamera, spp: int, seed: int) -> np.ndarray:
+        """Radiance (H, W, 3) of paths by `trace`, many more where the object is.
 
         What sheet and table send to it comes by few bright paths: with few of them it would be dark with bright specks,
         which no photograph has, and darker to all who ask for medians.
         """
         near = shot.around(self.mesh.vertices)
-        picture = averaged(traced, shot, shot.whole, spp, seed)
+        picture = pixel_means(trace, shot, (0, 0, *shot.camera.size), spp, seed)
         rounds = range(-(-FINE // spp))
-        fine = np.mean([averaged(traced, shot, near, spp, seed + k * ROUND) for k in rounds], 0)
+        fine = np.mean([pixel_means(trace, shot, near, spp, seed + k * ROUND) for k in rounds], 0)
         left, top, right, bottom = near
         picture[top:bottom, left:right] = fine[top:bottom, left:right]
         return picture
 
-    def coverage(self, shot: Shot, spp: int = 16) -> np.ndarray:
+    def coverage(self, shot: LensCamera, spp: int = 16) -> np.ndarray:
         """How much of each pixel shows the object (H, W)."""
-
-        def traced(window: Window, spp: int, seed: int) -> list:
-            return [covered(rays_of(shot, window, spp, seed), self.flashed, self.object)]
-
-        return averaged(traced, shot, shot.around(self.mesh.vertices), spp, 0)[..., 0]
+        trace = partial(hits_along, scene=self.flashed, shape=self.object)
+        return pixel_means(trace, shot, shot.around(self.mesh.vertices), spp, 0)[..., 0]

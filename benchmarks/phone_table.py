@@ -1,14 +1,16 @@
-"""What each disturbance of a simulated phone capture costs, and all of them at once, by `phone.py`.
+"""What the disturbances of a simulated phone capture cost, all together or one at a time (`phone.py`).
 
     python benchmarks/phone_table.py OUT [--rows all|alone] [--objects pot2 bunny spot] [--views 24] [--size 1440x1080]
-        [--paths 36] [options of mi_ring.fit]
+        [--paths 36] [OPTIONS OF mi-ring fit]
 
-all: every disturbance at once, at two strengths of the room's light, with calibration and masks that
-`mi_ring.photos` finds, and the exact capture of the same views. alone: a row without any disturbance, one of all that
-exact calibration undoes, and one for each other, with exact calibration and masks: what it costs where nothing models
-it. All are cropped to the object. In each cell: mean error of the normals and of the depth where both surfaces are
-seen, after a similarity, how often that of the exact capture the former is, and how much larger the object is than it
-should be. By the preset `fast` errors of masks are hidden by those of the preset. It goes on where it stopped.
+--rows all: every disturbance, with room light of two strengths, calibration and masks by `mi-ring photos`, and the
+exact capture of the same views. --rows alone: no disturbance, all that exact calibration undoes, and each of the
+others, with exact calibration and masks. All captures are cropped to the object. The preset `fast` hides errors of
+masks.
+
+Prints a Markdown table with machine and date. Each cell has the mean error of normals and depth where both surfaces are
+seen, after a similarity; the ratio of the first to that of the exact capture; and the error of the scale. The same
+command continues after an interruption.
 """
 
 import argparse

@@ -1,12 +1,14 @@
-"""Fit small captures with and without each prior and print, as Markdown with machine and date, where it pays.
+"""What the priors are worth: small captures, fitted with and without each.
 
     python benchmarks/priors.py [--only NAME] [--weights 0 0.03] [--seeds 0 1] [--iterations 150] [--level 4]
                                 [--width 96] [--batch 8] [--out out/priors]
 
-Each capture is made for its prior: `normal_variation` a faceted body, `material_variation` a body of two materials,
-`material_rank` one whose gloss goes with its colour. All are path traced with `cooktorrance` from few sides, and
-photographed with much noise: what the photographs leave open is where a prior can help. Errors are those of the whole
-surface: of normals in degrees, of colour, gloss and roughness as shares of the truth's mean, at the nearest points.
+Each prior has its capture: a faceted body for `normal_variation`, and a body whose gloss follows its colour for
+`material_rank`. They are path traced with `cooktorrance` from few sides, with much noise, so that the photographs leave
+something open.
+
+Prints a Markdown table with machine and date. Errors are those of the whole surface: normals in degrees; colour, gloss
+and roughness as shares of the true mean, at the nearest points.
 """
 
 import argparse
@@ -22,14 +24,15 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.geometry.domain import carried, gpytoolbox
+from mi_ring.geometry.domain import gpytoolbox, transfer_points
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis import example_pot
-from mi_ring.synthesis.stage import Stage
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.object_on_table import ObjectOnTable
+from mi_ring.synthesis.tracing import LensCamera
 
 # isort: split
 import mitsuba as mi
@@ -37,9 +40,7 @@ import torch
 
 EVERY = 3  #: of the example's cameras, so many are one here
 NOISE = 0.05  #: standard deviation of the linear radiance, 1 is white
-WEIGHTS = {
-    "normal_variation": (0.0, 0.01, 0.03), "material_variation": (0.0, 1e-4, 3e-4), "material_rank": (0.0, 0.005, 0.01),
-}  # fmt: skip
+WEIGHTS = {"normal_variation": (0.0, 0.01, 0.03), "material_rank": (0.0, 0.005, 0.01)}
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
@@ -52,8 +53,7 @@ def body(name: str) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
         share = np.zeros(len(x))
     else:
         mesh = trimesh.Trimesh(ball.vertices * (1.0, 0.8, 1.2), ball.faces, process=False)
-        wave = np.sin(3 * x + 2 * y) + np.sin(4 * z - x)
-        share = (wave > 0).astype(float) if name == "material_variation" else 0.5 + 0.25 * wave
+        share = 0.5 + 0.25 * (np.sin(3 * x + 2 * y) + np.sin(4 * z - x))
     mesh.apply_scale(32)
     mesh.apply_translation(example_pot.CENTER)
     one, other = np.array([0.45, 0.12, 0.06]), np.array([0.1, 0.25, 0.4])
@@ -73,16 +73,16 @@ def write_capture(name: str, folder: Path) -> None:
     mesh.set_bsdf(mi.load_dict({"type": "cooktorrance", **textures}))
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
-    stage, random, elements = Stage(mesh, truth.vertices), np.random.default_rng(0), []
+    scene, random, elements = ObjectOnTable(mesh, truth.vertices), np.random.default_rng(0), []
     for k, camera in enumerate(example_pot.cameras()[::EVERY]):
         position = camera.position + camera.to_world[:3, :3] @ example_pot.FLASH
         light = Light("point", position, np.full(3, 2 * example_pot.DISTANCE**2))
-        picture = stage.radiance(Shot(camera), light, 36, k, 2)
+        picture = scene.radiance(LensCamera(camera), light, 36, k, 2)
         noisy = picture + random.normal(0, NOISE, picture.shape)
-        files = f"images/{k:03}.png", f"masks/{k:03}.png"
-        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files[0])
-        write_image(to_bytes(stage.coverage(Shot(camera))[..., None] >= 0.5), folder / files[1])
-        elements.append(photograph_element(f"{k:03}", files[0], camera, light, files[1], calibrated=True))
+        files = Files(Path(f"images/{k:03}.png"), Path(f"masks/{k:03}.png"))
+        write_image(to_bytes(linear_to_srgb(noisy.clip(0, 1))), folder / files.filename)
+        write_image(to_bytes(scene.coverage(LensCamera(camera))[..., None] >= 0.5), folder / files.mask)
+        elements.append(photograph_element(Shot(f"{k:03}", camera, light, files=files, calibrated=True)))
     truth.export(folder / "truth.ply")
     np.savez(folder / "truth.npz", **material)
     (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
@@ -101,7 +101,7 @@ def errors(fit: Fit, folder: Path) -> list[float]:
     result = [float(np.degrees(np.arccos(cosines.clip(-1, 1))).mean())]
     for name in ("diffuse", "specular", "roughness"):
         values = material[name].reshape(len(truth.vertices), -1)
-        wanted = carried(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
+        wanted = transfer_points(guess.vertices, truth.vertices, truth.faces, np.broadcast_to(values, (len(values), 3)))
         given = found[name].numpy().reshape(len(s), -1)
         result.append(float(np.abs(given - wanted).mean() / values.mean()))
     return result

@@ -1,17 +1,17 @@
-"""Print, as Markdown, what an iteration costs where 1, 2 and 4 processes share it, and when that pays.
+"""What an iteration costs if 1, 2 or 4 processes share it, and when this pays.
 
     python benchmarks/processes.py [SCENE.xml] [--levels 5] [--widths 256] [--counts 1 2 4]
 
-Time is that of the processor, on one thread, so that it can be measured where several processes share few cores. An
-iteration with 2 and with 8 photographs tells what each photograph takes, one with 8 by two processes what they share
-out besides, the points; the rest (the optimisers, the regulariser, the renderer's preparations) all repeat. The model
-of an iteration on N machines like this one is
+Prints a Markdown table with machine and date: processor time on one thread, which is meaningful also if processes share
+few cores, and a model. Iterations with 2 and 8 photographs give the time per photograph. An iteration of two processes
+gives the time of the points, which are shared. The rest (optimisers, regulariser, preparations of the renderer) is
+repeated in every process. The model for N machines is
 
     fixed + photographs of the slowest · seconds of each + points / N · seconds of each
           + sums · 2 (N - 1) latency + 2 (N - 1) / N · bytes / bandwidth
 
-as sums go around a ring ("Optimization of Collective Communication Operations in MPICH", Thakur, Rabenseifner and Gropp
-2005). Its first line is checked by what the first of 4 processes takes; its second needs machines.
+because sums go around a ring ("Optimization of Collective Communication Operations in MPICH", Thakur, Rabenseifner and
+Gropp 2005). Its first line is checked by the first of 4 processes. Its second line is not measured.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def measured(scene: Path, level: int, width: int, batch: int, repeated: int = RE
 
     with joined() as processes, threads_of(1):
         fit = Fit(load_capture(scene), Config(levels=(level,), widths=(width,), shares=(1.0,), batch=batch))
-        fit.iteration = fit.iterations // 2
+        fit.course.iteration = fit.iterations // 2
         seconds, exchanged, exchanges = [], [], []
         for _ in range(1 + repeated):
             before, count = processes.exchanged, processes.exchanges

@@ -1,16 +1,16 @@
-"""CPU time and noise of one gradient of eight photographs: `photometric` beside Mitsuba's own integrators, in one run.
+"""Time and noise of one gradient of eight photographs: `photometric` against Mitsuba's own integrators.
 
     python benchmarks/render.py [--rounds 5] [--seeds 48]
 
 A bumpy sphere of 10,242 vertices, eight cameras with a lamp beside each, 128² pixels, 4 samples per pixel. One gradient
-is: write the vertices, render, and differentiate a fixed weighted sum of all pixels with respect to positions and
-material. `photometric` renders all photographs in one launch; the others take one `mi.render` per photograph, through
-stock `perspective` sensors and a stock point light. `direct_projective` is measured as it is and with `sppi` = 0,
-which it recommends itself here. Of these only `photometric` has the edges of shadows that the bumps cast. CPU time is
-process time, summed over threads; methods take turns.
+means: write the vertices, render, and differentiate a fixed weighted sum of all pixels with respect to positions and
+material. `photometric` renders all photographs in one launch. The others need one `mi.render` per photograph, with
+stock `perspective` sensors and a stock point light. `direct_projective` is measured as it is and with `sppi` = 0, as it
+recommends here. Only `photometric` has the edges of the shadows of the bumps.
 
-Signal to noise is that of the gradient at a vertex from one such gradient: |mean| / standard deviation over seeds, the
-median over the vertices that have a gradient; and of all vertices together, root mean square over root mean variance.
+Prints a Markdown table with machine and date: processor time, summed over threads, methods in turn; and signal to
+noise, |mean| / standard deviation over seeds: the median over vertices with a gradient, and the root mean square over
+the root mean variance of all vertices.
 """
 
 import argparse
@@ -82,7 +82,8 @@ class Scene:
         v, u = np.mgrid[:SIZE, :SIZE]
         waves = [np.sin(0.05 * u + 0.04 * v + k + 1.3 * c) for k in range(VIEWS) for c in range(3)]
         self.weights = np.stack(waves).reshape(VIEWS, 3, SIZE, SIZE).astype(np.float32)
-        self.photographs = Photographs.of(self.scene.sensors()) if integrator["type"] == "photometric" else None
+        ours = integrator["type"] == "photometric"
+        self.photographs = Photographs.of([sensor.shot for sensor in self.scene.sensors()]) if ours else None
         self.edges = None
 
     def gradient(self, seed):

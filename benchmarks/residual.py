@@ -1,10 +1,12 @@
-"""What the difference between rendered pictures and real photographs consists of: a table in Markdown, and pictures.
+"""What the difference between predictions and real photographs consists of.
 
     python benchmarks/residual.py PHOTOS MASKS RENDERED [--pictures FOLDER]
 
-Three folders of files with the same names, whatever their suffixes: 8-bit sRGB photographs, masks of what is
-judged (255), and renderings, which may be smaller. Each row gives the pictures the freedom that an explanation would
-have, and says how near they then get: what a freedom does not help is not its part. All values are as encoded.
+Three folders with files of the same names, whatever their suffixes: 8-bit sRGB photographs, masks of the judged pixels
+(255), and predictions, which may be smaller. Values are compared as encoded.
+
+Prints a Markdown table. Each row gives the predictions one freedom that a possible cause would explain, and the PSNR
+that results. A freedom that does not help is not a cause.
 """
 
 import argparse

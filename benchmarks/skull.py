@@ -1,10 +1,13 @@
-"""Real photographs: cameras, masks and a fit of the flash skull, judged on photographs that the fit has not seen.
+"""Fit real photographs, the skull, and judge it on photographs that the fit has not seen.
 
     python benchmarks/skull.py PHOTOS OUT [--preset default] [--flash-offset X Y Z] [--fit OPTIONS]
 
-PHOTOS is the folder of the 66 JPEGs. Every eighth photograph from the fifth is held out of the fit, though not of the
-search for cameras and masks. If `../shared` is there, cameras are compared with COLMAP's of the full-size photographs,
-masks and predictions with the judge's.
+PHOTOS is the folder of all 66 JPEG files. Every eighth photograph, from the fifth on, is kept out of the fit, but not
+out of the search for cameras and masks. OUT gets the capture, the fit and predictions of the held-out photographs, from
+which `docs/make_skull.py` makes pictures.
+
+If the folder `shared` is beside the checkout, it prints the errors of the cameras against COLMAP with the full-size
+photographs, the overlap of the masks, and PSNR of the held-out photographs.
 """
 
 import argparse

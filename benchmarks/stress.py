@@ -1,14 +1,14 @@
-"""Does a fit that is killed again and again come to the same result? As a Markdown table.
+"""Does a fit that is killed again and again give the same result?
 
     python benchmarks/stress.py [SCENE.xml] [--kills 100] [--seed 0] [-- OPTIONS OF FIT]
 
-A deterministic fit runs once undisturbed. Then it is begun anew and killed (SIGKILL) at N random moments, resumed after
-each; moments are spread over the processor time that the undisturbed one took, start, checkpoints, results and report
-included, so that it matters little what else the machine has to do. It needs psutil.
-After each kill all result files must be readable: those that are there, whole. At the end all of them must be
-bit for bit those of the undisturbed fit, but for what says how long it took or where it was (in log, report, config and
-checkpoint, of which the rest is compared) and for the checkpoint before the last, which is of any moment.
-Options of a quick trial: -- --iterations 6 --levels 2 --widths 32 --shares 1 --batch 2 --subdivisions 2
+A deterministic fit runs once undisturbed. Then it is started again, killed (SIGKILL) at N random moments and resumed.
+The moments are spread over the processor time of the undisturbed fit, from start to report, so other load hardly
+matters. It needs psutil. After each kill every result file that exists must be readable. At the end all files must
+equal those of the undisturbed fit bit for bit, except times and paths, and except the checkpoint before the last.
+
+Prints a Markdown table with machine and date. Options of a quick trial:
+-- --iterations 6 --levels 2 --widths 32 --shares 1 --batch 2 --subdivisions 2
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Sphinx's settings: `make docs`. What is said elsewhere is taken from there: docstrings, `--help`, the README."""
+"""Sphinx's settings: `make docs`. Docstrings, `--help` and CONTRIBUTING.md are shown from where they are written."""
 
 import contextlib
 import dataclasses
@@ -50,7 +50,7 @@ python_maximum_signature_line_length = 100
 #: Where the names of the public API come from.
 PUBLIC = {name: f"mi_ring.{module}.{name}" for name, module in mi_ring._API.items()}
 
-#: Classes by the names of the plugins, whose pages are plugins/<name>.rst.
+#: Classes by the names of the plugins, whose pages are reference/plugins/<name>.rst.
 PLUGINS = {
     "photograph": "mi_ring.plugins.photograph.Photograph",
     "flash": "mi_ring.plugins.flash.Flash",
@@ -109,17 +109,17 @@ class Modules(SphinxDirective):
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
-class Room(SphinxDirective):
-    """`.. room:: nets`: what a room is, by its docstring, and all its modules."""
-
-    required_arguments = 1
+class Rooms(SphinxDirective):
+    """`.. rooms::`: of each room what it is, by its docstring, and all its modules."""
 
     def run(self) -> list[nodes.Node]:
-        name = self.arguments[0]
-        room = importlib.import_module(f"mi_ring.{name}")
-        self.env.note_dependency(inspect.getsourcefile(room))
         self.env.note_reread()  # a module may have come
-        text = f"{inspect.getdoc(room).split('May import')[0]}\n\n.. modules:: {' '.join(modules_of(room))}\n"
+        text = ""
+        for name in sorted(module.name for module in pkgutil.iter_modules(mi_ring.__path__) if module.ispkg):
+            room = importlib.import_module(f"mi_ring.{name}")
+            self.env.note_dependency(inspect.getsourcefile(room))
+            about = inspect.getdoc(room).split("May import")[0]
+            text += f"{title(f'``mi_ring.{name}``', '-')}{about}\n\n.. modules:: {' '.join(modules_of(room))}\n\n"
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
@@ -140,10 +140,11 @@ def literal(text: str) -> str:
 
 
 def help_of(command: str, *arguments: str) -> str:
-    """What a command prints when it is asked for help, in lines of at most 100 characters."""
+    """What a command prints when it is asked for all its help, in lines of at most 100 characters."""
+    asked = "--help-all" if command == "fit" else "--help"
     page = io.StringIO()
     with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
-        importlib.import_module(f"mi_ring.{command}").main([*arguments, "--help"])
+        importlib.import_module(f"mi_ring.{command}").main([*arguments, asked])
     lines = (textwrap.wrap(line, 100) or [""] if line[:1].isalpha() else [line] for line in page.getvalue().split("\n"))
     return "\n".join(line for wrapped in lines for line in wrapped).strip()
 
@@ -182,11 +183,11 @@ def clean(app, what, name, documented, options, lines):
 def link(app, env, node, content):
     """The name of a plugin, in single backticks, is a link to its page; one of the public API to what is said there."""
     here, target = node["refdoc"], node["reftarget"]
-    if node["reftype"] == "obj" and target in PLUGINS and here != f"plugins/{target}":
-        return make_refnode(app.builder, here, f"plugins/{target}", None, content)
+    if node["reftype"] == "obj" and target in PLUGINS and here != f"reference/plugins/{target}":
+        return make_refnode(app.builder, here, f"reference/plugins/{target}", None, content)
     name = target.rpartition(".")[2]
     if target in (name, PUBLIC.get(name)) and name in PUBLIC:
-        return make_refnode(app.builder, here, "api", f"mi_ring.{name}", content)
+        return make_refnode(app.builder, here, "reference/api", f"mi_ring.{name}", content)
     module = sys.modules.get(target.rpartition(".")[0])
     return content if isinstance(getattr(module, name, None), TypeVar) else None  # which are described nowhere
 
@@ -202,7 +203,7 @@ def setup(app):
     app.add_directive("plugin", Plugin)
     app.add_directive("commands", Commands)
     app.add_directive("modules", Modules)
-    app.add_directive("room", Room)
+    app.add_directive("rooms", Rooms)
     app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-skip-member", skip)
     app.connect("autodoc-process-docstring", clean)

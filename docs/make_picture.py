@@ -1,4 +1,4 @@
-"""The README's picture: how a sphere becomes the object, and what a fit with the default settings finds.
+"""The picture of the pot: how a sphere becomes the object, and what a fit with the default settings finds.
 
 python -m mi_ring.fit scenes/pot2.xml
 python -m mi_ring.fit scenes/pot2.xml --domain sphere --out out/pot2_sphere
@@ -14,16 +14,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 import mi_ring
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 TIMES = {"0": 0.0, "¼": 0.25, "½": 0.5, "¾": 0.75, "1": 1.0}  #: of the flow
 LABEL, SIZE = 30, 18  #: height of the labels above the pictures, and of their letters [px]
 
 
-def opened(run: Path) -> tuple[mi_ring.Capture, mi_ring.FittedObject, bridge.Surface]:
+def opened(run: Path) -> tuple[mi_ring.Capture, mi_ring.FittedObject, Surface]:
     """A fit: its photographs, its object, and that in the scene of the photographs."""
     capture, ring = mi_ring.load_capture(run / "scene.xml"), mi_ring.load_fit(run)
-    return capture, ring, bridge.Surface(capture.scene, capture.shape, ring)
+    return capture, ring, Surface(capture.scene, capture.shape, ring)
 
 
 def flow(run: Path, k: int) -> dict[str, np.ndarray]:
@@ -33,7 +34,7 @@ def flow(run: Path, k: int) -> dict[str, np.ndarray]:
     found = {}
     for name, time in TIMES.items():
         surface.show(ring, s, faces, time)
-        rgb, _ = bridge.draw(surface, capture.photograph(k), spp=64, indirect=ring.indirect)
+        rgb, _ = prediction.draw(surface, capture.photograph(k), spp=64, indirect=ring.indirect)
         found[f"time {name}"] = linear_to_srgb(rgb[0].numpy())
     return found
 
@@ -42,7 +43,7 @@ def result(run: Path, k: int) -> dict[str, np.ndarray]:
     """Photograph `k` and what it sees of the fitted surface; grey is from 0 to about the highest value."""
     capture, ring, surface = opened(run)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
-    maps = {name: values[0] for name, values in bridge.maps(surface, capture.photograph(k)).items()}
+    maps = {name: values[0] for name, values in prediction.maps(surface, capture.photograph(k)).items()}
     seen = (maps["normal"] != 0).any(-1)
 
     def relative(name):

@@ -1,4 +1,4 @@
-"""The pictures of docs/skull.md, of what `python benchmarks/skull.py PHOTOS OUT` left in OUT.
+"""The pictures of docs/tutorial/own-photographs.md, from the OUT of `benchmarks/skull.py PHOTOS OUT`.
 
 python docs/make_skull.py PHOTOS OUT docs/skull
 """
@@ -14,7 +14,7 @@ from make_picture import labelled, opened
 from PIL import Image
 
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 
 SHOWN = "01", "09", "17", "25", "33", "42", "50", "58"  #: photographs that show each step
 HELD_OUT = "05", "29", "53"  #: photographs that the fit has not seen, beside what it predicts
@@ -76,11 +76,11 @@ def results(out: Path) -> np.ndarray:
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     rows = []
     for name in HELD_OUT:
-        k = next(k for k, sensor in enumerate(capture.sensors) if sensor.id() == name)
-        scale = -(-capture.sensors[k].size[0] // WIDTH)
-        shot = capture.photograph(k, scale)
-        maps = {what: values[0] for what, values in bridge.maps(surface, shot).items()}
-        rgb, coverage = bridge.draw(surface, shot, spp=64, indirect=ring.indirect)
+        k = next(k for k, shot in enumerate(capture.shots) if shot.name == name)
+        scale = -(-capture.shots[k].size[0] // WIDTH)
+        photograph = capture.photograph(k, scale)
+        maps = {what: values[0] for what, values in prediction.maps(surface, photograph).items()}
+        rgb, coverage = prediction.draw(surface, photograph, spp=64, indirect=ring.indirect)
         seen = coverage[0].numpy()[..., None] > 0.5
         diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
         observed = linear_to_srgb(capture.observe([k], scale).rgb[0].numpy())

@@ -1,6 +1,6 @@
 """The picture of `cooktorrance`: GGX above, Beckmann below, roughness 0.1, 0.2, 0.4 and 0.8.
 
-python docs/make_spheres.py docs/plugins/cooktorrance.png
+python docs/make_spheres.py docs/reference/plugins/cooktorrance.png
 """
 
 import sys

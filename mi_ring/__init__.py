@@ -33,12 +33,15 @@ if TYPE_CHECKING:
     from mi_ring.fitting.fit import Fit
     from mi_ring.fitting.iteration import Iteration
     from mi_ring.fitting.terms import Term, default_terms
+    from mi_ring.geometry.camera import Camera
     from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
     from mi_ring.nets.mlp import plain_autograd
     from mi_ring.nets.registry import register_network
     from mi_ring.nets.shape_net import Flow, ShapeNet
     from mi_ring.objects.fitted_object import FittedObject
     from mi_ring.objects.ring_file import load_fit
+    from mi_ring.scene.lights import Light
+    from mi_ring.scene.shot import Response, Shot
 
 #: The Python API: names and the modules that they are read from.
 _API = {
@@ -47,10 +50,13 @@ _API = {
     "ShapeNet": "nets.shape_net", "Flow": "nets.shape_net", "BRDFNet": "nets.brdf_net", "MaterialNet": "nets.brdf_net",
     "register_network": "nets.registry", "plain_autograd": "nets.mlp",
     "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
+    "Lighting": "fitting.lighting", "choose_lighting": "fitting.light_selection",
+    "Camera": "geometry.camera", "Light": "scene.lights", "Response": "scene.shot", "Shot": "scene.shot",
 }  # fmt: skip
 
 __all__ = [
     "BRDFNet",
+    "Camera",
     "Capture",
     "Config",
     "Fit",
@@ -58,8 +64,11 @@ __all__ = [
     "Flow",
     "InputError",
     "Iteration",
+    "Light",
     "MaterialNet",
+    "Response",
     "ShapeNet",
+    "Shot",
     "Term",
     "__version__",
     "default_terms",
@@ -69,8 +78,13 @@ __all__ = [
     "register_network",
 ]  # fmt: skip
 
+#: Names up to version 0.2, with the present ones.
+_RENAMED = {"Ring": "FittedObject", "ReflectanceMap": "MaterialNet"}
+
 
 def __getattr__(name: str) -> object:
+    if name in _RENAMED:
+        raise AttributeError(f"mi_ring.{name} is now mi_ring.{_RENAMED[name]}")
     if name not in _API:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_API[name]}"), name)

@@ -13,7 +13,7 @@ from mi_ring.system import llvm
 from mi_ring.system.command import run
 from mi_ring.version import __version__
 
-#: Modules of the package; the first line of each says what the command does and ends in how it is called.
+#: Modules of the package. The first line of each says what the command does and ends in how to call it.
 COMMANDS = (
     "example", "synthesize", "board", "photos", "convert", "check", "fit", "batch", "render", "export", "evaluate",
     "paper", "validate", "doctor",
@@ -21,26 +21,24 @@ COMMANDS = (
 
 
 def summary(name: str) -> tuple[str, str]:
-    """How a command is called, and what it does, by the first line of its module, which is not imported."""
+    """How to call a command and what it does, from the first line of its module, without importing that."""
     source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
-    docstring = ast.get_docstring(ast.parse(source)) or ""
-    sentence, _, call = docstring.split("\n")[0].partition("`python -m mi_ring.")
+    sentence, _, call = (ast.get_docstring(ast.parse(source)) or "").split("\n")[0].partition("`python -m mi_ring.")
     return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")
 
 
 def overview() -> str:
-    """The help of `mi-ring`: every command in two lines."""
-    lines = ["usage: mi-ring COMMAND …", ""]
-    for usage, sentence in map(summary, COMMANDS):
-        lines += [f"  {usage}", f"      {sentence}"]
+    """The help of `mi-ring`: two lines for each command."""
+    lines = [f"  {usage}\n      {sentence}" for usage, sentence in map(summary, COMMANDS)]
     return "\n".join([
-        *lines, "", "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same.",
+        "usage: mi-ring COMMAND …", "", *lines, "",
+        "mi-ring COMMAND --help tells more; `python -m mi_ring.COMMAND …` is the same.",
         "mi-ring COMMAND … --traceback shows where an error comes from; mi-ring --version the version.",
     ])  # fmt: skip
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int | None:
-    """Import a command and run it. Raises InputError where Mitsuba, which all but the doctor import, cannot be."""
+    """Import a command and run it. Raises InputError if Mitsuba cannot be imported; only `doctor` works without it."""
     if name != "doctor" and not llvm.has_atomic():
         raise InputError(str(llvm.missing()))
     return importlib.import_module(f"mi_ring.{name}").main(arguments)
@@ -50,8 +48,7 @@ def main() -> None:
     """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name in ("-h", "--help", "--version"):
-        print(__version__ if name == "--version" else overview())
-        sys.exit(0)
+        run("mi-ring", lambda _: print(__version__ if name == "--version" else overview()), [])
     if name not in COMMANDS:
         alike = "".join(f"; perhaps you meant {other}" for other in difflib.get_close_matches(name, COMMANDS, 1))
         what = f"is {name}{alike}; must be one of {', '.join(COMMANDS)}" if name else "is missing"

@@ -1,6 +1,5 @@
-"""Write a sheet of markers, to be printed and put under the object: `python -m mi_ring.board FILE`."""
+"""Write a sheet of markers to print and put under the object: `python -m mi_ring.board FILE`."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
+from mi_ring.images import encoded_picture
 from mi_ring.photogrammetry.marker_sheet import DOTS, page
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
@@ -16,10 +16,10 @@ from mi_ring.system.files import require_place, write_file
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Write a sheet of markers, to be printed and put under the object: it tells scale, cameras and white."""
+    """Write a sheet of markers to print and put under the object. In photographs it shows scale, cameras and white."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write, .pdf or .png."""
+    """File to write: .pdf or .png."""
     paper: Literal["a4", "letter"] = "a4"
     """Size of the paper."""
 
@@ -31,13 +31,9 @@ def main(arguments: Sequence[str]) -> None:
     if kind not in (".pdf", ".png"):
         raise InputError(f"{file}: FILE: ends in {kind or 'nothing'}; must end in .pdf or .png")
     require_place(file)
-    buffer, dpi = io.BytesIO(), 25.4 * DOTS
-    sheet = page(config.paper)
-    if kind == ".pdf":
-        sheet.save(buffer, "PDF", resolution=dpi, title="mi_ring board")
-    else:
-        sheet.save(buffer, "PNG", dpi=(dpi, dpi))
-    write_file(file, buffer.getvalue())
+    dpi = 25.4 * DOTS
+    options = {"resolution": dpi, "title": "mi_ring board"} if kind == ".pdf" else {"dpi": (dpi, dpi)}
+    write_file(file, encoded_picture(page(config.paper), kind[1:], **options))
     print(f'{file}\nPrint it at 100 % ("actual size") and measure: five squares must be 100 mm long.')
 
 

@@ -15,32 +15,33 @@ from mi_ring.system import command, files
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Say whether a capture is usable, and what is wrong with it: a table, findings and a contact sheet.
+    """Say whether a capture is usable and what is wrong with it: a table, findings and a contact sheet.
 
-    The table: distance of the camera and of the light from the object, in its radii; angle between the two [deg]; share
-    of the photograph that is object; shares of the object that are clipped, and dark; brightness of the background, in
-    that of the object; brightness for the light it gets, in that of the others; share of the mask that the other masks
-    agree to. The contact sheet: masks outlined in red, what says nothing in yellow, the visual hull in green. The exit
-    status is 1 if there is something to mend.
+    The table has a line for each photograph: distance of camera and light from the object, in radii of the object;
+    angle between the two [deg]; share of the photograph that is object; shares of the object that are clipped and dark;
+    brightness of the background, relative to the object; brightness for the light it gets, relative to the other
+    photographs; share of the mask that the other masks confirm. The contact sheet has masks outlined in red, invalid
+    pixels in yellow and the visual hull in green. The exit status is 1 if there is something to correct.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
-    """Picture to write. Default: out/check/<name>.png."""
+    """Picture to write, .png. Without it: out/check/NAME.png."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """given: those of the scene, if any; auto: the same, but if it has none the object is what is brighter than a dark
-    room; none: as if it had none."""
+    """Which masks are used.
+    given: those of the scene, if it has any. auto: the same, otherwise what is brighter than a dark room.
+    none: the scene's masks are ignored, the object is what is brighter than a dark room."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if there is something to mend."""
+    """Run the command. Returns its exit status: 1 if there is something to mend."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
     capture = load_capture(config.scene, masks=config.masks)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")
-    if out.resolve() in {file for sensor in capture.sensors for file in sensor.files}:
+    if out.resolve() in {file.resolve() for shot in capture.shots for file in shot.files if file}:
         raise InputError(f"{out}: --out: is one of the scene's own pictures; choose another file")
     files.require_place(out, "--out")
     inspection = inspect(capture)

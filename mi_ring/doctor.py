@@ -11,38 +11,37 @@ from typing import NamedTuple
 from mi_ring.system import command, llvm
 from mi_ring.version import __version__
 
-#: Packages that not every machine has ready-made, and what they are needed for.
+#: Packages that are not available for every machine, and what needs them.
 OPTIONAL = {
     "gpytoolbox": "starts from the visual hull or a mesh, and mi_ring.evaluate",
     "pycolmap": "mi_ring.photos, COLMAP's models, and lens distortion in mi_ring.convert",
     "rawpy": "raw photographs in mi_ring.photos",
     "ray": "mi_ring.batch",
-    "torchdiffeq": "--solver dopri5 of mi_ring.fit",
     "xatlas": "GLB and OBJ, and the object in the report",
 }
 
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Say what this machine lacks for mi_ring, and how to get it. The exit status is 1 if a fit cannot run."""
+    """Say what mi_ring lacks on this machine and how to get it. The exit status is 1 if a fit cannot run."""
 
 
 class Finding(NamedTuple):
-    """A line of what the doctor says."""
+    """A line of the output."""
 
-    mark: str  #: ok, MISSING (a fit cannot run) or without (something else cannot)
+    mark: str  #: ok; MISSING: a fit cannot run; without: something else cannot run
     what: str
     text: str
 
 
 def findings() -> Iterator[Finding]:
-    """What there is and what there is not."""
+    """What is installed on this machine and what is missing."""
     yield Finding("ok", "mi_ring", __version__)
     yield Finding("ok", "Python", f"{platform.python_version()} on {platform.platform()}")
     for package in ("torch", "drjit", "mitsuba"):
-        there = importlib.util.find_spec(package)
-        text = importlib.metadata.version(package) if there else f"pip install {package}"
-        yield Finding("ok" if there else "MISSING", package, text)
+        found = importlib.util.find_spec(package)
+        text = importlib.metadata.version(package) if found else f"pip install {package}"
+        yield Finding("ok" if found else "MISSING", package, text)
     problem = llvm.missing()
     if not llvm.has_atomic():
         yield Finding("MISSING", "libatomic", str(problem))
@@ -53,12 +52,12 @@ def findings() -> Iterator[Finding]:
             yield Finding("ok", package, importlib.metadata.version(package))
         else:
             yield Finding("without", package, f"for {use}: pip install {package}, where it is ready-made")
-    if llvm.has_atomic() and importlib.util.find_spec("torch"):  # else Dr.Jit or torch cannot be imported
+    if llvm.has_atomic() and importlib.util.find_spec("torch"):  # otherwise Dr.Jit or torch cannot be imported
         yield from computing()
 
 
 def computing() -> Iterator[Finding]:
-    """What the machine computes with."""
+    """The processor and the GPU."""
     import drjit as dr
     import torch
 

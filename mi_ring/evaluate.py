@@ -16,41 +16,41 @@ from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
-ELSEWHERE = 0.3  #: silhouettes that overlap less are hardly of one object in one frame
+MISPLACED = 0.3  #: below this IoU of the silhouettes the true mesh is probably in another frame
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Compare a finished fit with the truth: a table on standard error, one line of JSON on standard output.
 
-    In it: errors of normals [deg] and depths [% of the diagonal of the true bounding box] where both surfaces are seen;
-    overlap of silhouettes; share of what is seen whose faces point away from the camera; Chamfer distance [% of the
-    diagonal] and F-score of whole surfaces, unseen parts included unless --seen; genus; triangles that cross another,
-    and those that Shape-Net turned inside out; PSNR [dB] and SSIM of the photographs that mi_ring.render predicts, over
-    all pixels, or where a background is seen the object's alone, of photographs that have masks. A file has the same
-    for every photograph.
+    Where both surfaces are seen: errors of normals [deg] and depths [% of the diagonal of the true bounding box];
+    overlap of the silhouettes; share of the seen faces that point away from the camera. Of the whole surfaces, or of
+    their seen parts with --seen: Chamfer distance [% of the diagonal] and F-score. Of the fitted mesh: genus, triangles
+    that cross another, and triangles that Shape-Net turned inside out. Of the photographs that mi_ring.render predicts:
+    PSNR [dB] and SSIM, over all pixels, or over the object alone if there is a background and a mask. A file has the
+    same for every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit."""
     mesh: Path
-    """True surface in the units and frame of the scene: PLY, OBJ or GLB."""
+    """True surface in the units and the frame of the scene: PLY, OBJ or GLB."""
     novel: Path | None = None
-    """Scene of photographs that the fit has not seen."""
+    """Scene file of photographs that the fit has not seen."""
     seen: bool = False
-    """Leave out of Chamfer distance and F-score what no photograph of the fit shows, of both surfaces."""
+    """Leave out of Chamfer distance and F-score the parts of both surfaces that no photograph of the fit shows."""
     align: Literal["rigid", "similarity"] | None = None
-    """Move the true surface, and photographs of --novel, onto the fitted one first, rigidly or scaled as well: refined
-    cameras do not say where the object as a whole is. All figures but those of the fit's own photographs are
-    then after alignment."""
+    """Move the true surface and the photographs of --novel onto the fit before comparing.
+    rigid: turn and shift it. similarity: scale it, too. Numbers of the fit's own photographs do not change.
+    Use it after --refine cameras, which lets the object as a whole drift."""
     spp: int = SPP
-    """Samples per pixel of the predicted photographs."""
+    """Samples per pixel of the predicted photographs. More give less noise."""
     out: Path | None = None
-    """JSON file to write. Default: evaluation.json in the results folder."""
+    """JSON file to write. Without it: evaluation.json in the results folder."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
     if config.spp < 1:
         raise InputError(f"--spp: is {config.spp}, must be at least 1")
@@ -65,11 +65,11 @@ def main(arguments: Sequence[str]) -> None:
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
-    if totals["iou"] < ELSEWHERE:
-        print(f"{config.mesh}: hardly lies where the fit is: is it in the frame of the scene? That of mi-ring "
-              "synthesize is truth/mesh.ply of its folder", file=sys.stderr)  # fmt: skip
-    if config.novel and (untold := ambiguity_of(config.run)):
-        print(f"{untold} Novel views in a known light may be too bright, or of another colour", file=sys.stderr)
+    if totals["iou"] < MISPLACED:
+        print(f"{config.mesh}: is not where the fit is: is it in the frame of the scene? The true mesh of a capture by "
+              "mi-ring synthesize is its truth/mesh.ply", file=sys.stderr)  # fmt: skip
+    if config.novel and (ambiguity := ambiguity_of(config.run)):
+        print(f"{ambiguity} Novel views in a known light may be too bright or have another colour", file=sys.stderr)
     print(json.dumps(totals))
 
 

@@ -10,8 +10,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_views
-from mi_ring.errors import InputError
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.errors import InputError, require_range
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import gltf
 from mi_ring.output.ambiguity import ambiguity_of
@@ -19,72 +19,68 @@ from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import first_photograph, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import command
 from mi_ring.system.files import require_place, write_file
 
 KINDS = (".ply", ".obj", ".glb", ".xml")
-GLB_LEVEL = 5  #: of its mesh; the normal map has what is finer
-FINEST, FINEST_PLY = 8, 10  #: level of a mesh with textures, and of one that has none
+GLB_LEVEL = 5  #: of the mesh in a GLB; finer details are in the normal map
+MAX_LEVEL, MAX_PLY_LEVEL = 8, 10  #: of a mesh with textures, and of one without
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(MaterialOptions):
-    """Write the object of a finished fit for other programs. The file's name says as what.
+    """Write the object of a finished fit for other programs. The suffix of the file chooses the format.
 
-    .ply: the mesh with the parameters of its BSDF as vertex attributes, and whether any photograph shows the vertex.
-    .glb: with a normal map and the material as glTF's metallic-roughness. .obj: the same as OBJ, MTL and PNG files.
-    .xml: a scene for Mitsuba, with bitmap textures and a stock BSDF, that needs no mi_ring. Positions are in the
-    scene's units and frame; a GLB has a node that makes metres of the units and puts the object upright, as far as the
-    capture says them.
+    .ply: the mesh; vertex attributes are the parameters of its BSDF, and whether any photograph shows the vertex.
+    .glb: the mesh with a normal map and glTF's metallic-roughness material. .obj: the same as OBJ, MTL and PNG files.
+    .xml: a Mitsuba scene with bitmap textures and a stock BSDF, which needs no mi_ring.
+
+    Positions are in the units and the frame of the scene. A GLB has a node that converts to metres and puts the object
+    upright, if the capture says how.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write; OBJ and XML bring others of the same name along."""
+    """File to write. OBJ and XML files come with further files of the same name."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices, up to 10 for .ply, 8 for others. Default: that of the fit; for
-    .glb 5, it has a normal map."""
+    """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
+    Without it: that of the fit, and 5 for .glb, whose normal map has the finer detail."""
     resolution: int = 2048
-    """Texels across the textures."""
+    """Width and height of the textures [texels]."""
     time: float = 1.0
-    """Of the flow: 0 is where it starts, 1 the object."""
+    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
     metres: float | None = None
-    """Length of a scene unit, which scales the GLB to glTF's metres. Default: as the capture says; one with the printed
-    sheet is in millimetres."""
+    """Length of a scene unit [m], for .glb, whose unit is the metre.
+    Without it: as the capture says; captures with the printed sheet are in millimetres."""
 
 
 def require_options(config: ExportConfig) -> None:
     """Raise InputError for options out of range, and for a file that cannot be written."""
-    if config.file.suffix.lower() not in KINDS:
+    kind = config.file.suffix.lower()
+    if kind not in KINDS:
         raise InputError(f"{config.file}: must end in {', '.join(KINDS)}")
-    finest = FINEST_PLY if config.file.suffix.lower() == ".ply" else FINEST
+    finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
     if config.subdivisions is not None and not 0 <= config.subdivisions <= finest:
-        raise InputError(
-            f"--subdivisions: is {config.subdivisions}, must be 0 to {finest}"
-            + f"; textures have what is finer, and .ply takes up to {FINEST_PLY}" * (finest == FINEST)
-        )
-    if not 64 <= config.resolution <= 4096:
-        raise InputError(f"--resolution: is {config.resolution}, must be 64 to 4096")
-    if not 0 <= config.time <= 1:
-        raise InputError(f"--time: is {config.time}, must be 0 to 1")
+        more = f"; textures have what is finer, and .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
+        raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to {finest}{more}")
+    require_range(config, "resolution", 64, 4096)
+    require_range(config, "time", 0, 1)
     if config.metres is not None and not 0 < config.metres < math.inf:
         raise InputError(f"--metres: is {config.metres}, must be a positive number")
-    if config.metres is not None and config.file.suffix.lower() != ".glb":
+    if config.metres is not None and kind != ".glb":
         raise InputError(f"--metres: is for .glb alone; {config.file.name} keeps the scene's units")
     if config.file.is_dir():
         raise InputError(f"{config.file}: is a folder; name the file to write")
     run = config.run if config.run.is_dir() else config.run.parent
-    photographs = config.file.suffix.lower() == ".xml" and config.file.is_file() and (
-        b'"photograph"' in config.file.read_bytes()
-    )  # fmt: skip
-    if photographs or config.file.resolve() == (run / "mesh.ply").resolve():
+    capture = kind == ".xml" and config.file.is_file() and b'"photograph"' in config.file.read_bytes()
+    if capture or config.file.resolve() == (run / "mesh.ply").resolve():
         raise InputError(f"{config.file}: is a file of the fit or of a capture; choose another name")
 
 
-def seen_from(run: Path) -> list[View] | None:
-    """What each photograph of a fit can show; None where that cannot be read."""
+def seen_from(run: Path) -> list[MaskedCamera] | None:
+    """The view of each photograph of a fit; None, with a warning, if they cannot be read."""
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
     except InputError as error:
@@ -97,25 +93,24 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)
-    dress(ring, config)
+    edit_material(ring, config)
     kind = config.file.suffix.lower()
     level = config.subdivisions
     if level is None:
         level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
     if kind in (".glb", ".obj"):
         gltf.require_expressible(ring)
-    photograph, room = first_photograph(config.run) if kind == ".xml" else (None, None)
+    photograph = first_photograph(config.run) if kind == ".xml" else None
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
     require_place(config.file)
+    files = [config.file]
     if kind != ".ply":
         print("Cutting the surface open and baking its material", flush=True)
     if kind == ".ply":
         write_mesh(ring, level, config.file, config.time, views)
-        files = [config.file]
     elif kind == ".glb":
         metres = config.metres or ring.metres
         write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, metres, views, ring.up))
-        files = [config.file]
         if metres is None:
             print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
                   file=sys.stderr)  # fmt: skip
@@ -123,12 +118,12 @@ def main(arguments: Sequence[str]) -> None:
         atlas = unwrap(ring, level, config.resolution, config.time)
         texels = rasterise(ring, atlas, config.resolution, config.time)
         values = reflectances(ring, texels.s)
-        if kind == ".obj":
-            files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+        if photograph:
+            files = write_scene(config.file, atlas, texels, ring.bsdf, values, *photograph)
         else:
-            files = write_scene(config.file, atlas, texels, ring.bsdf, values, photograph, room)
-    if untold := ambiguity_of(config.material or config.run):
-        print(untold, file=sys.stderr)
+            files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+    if unknown := ambiguity_of(config.material or config.run):
+        print(unknown, file=sys.stderr)
     print("\n".join(map(str, files)))
 
 

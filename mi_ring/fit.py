@@ -10,12 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture, require_scene
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, parse_options
 from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
 from mi_ring.fitting.checkpoint import read_checkpoint, resumed
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.light_selection import choose_lighting
 from mi_ring.fitting.processes import Processes, joined
 from mi_ring.fitting.session import run_session
 from mi_ring.output import results
@@ -36,11 +38,11 @@ def main(arguments: Sequence[str]) -> int:
 def run(arguments: Sequence[str], processes: Processes) -> int:
     """The command, in each of the processes that it is run by."""
     started = time.monotonic()
-    config, choice, state = processes.by_first(lambda: asked(arguments))
+    config, choice, state = processes.on_first(lambda: asked(arguments))
     folder = config.folder
-    processes.together(lambda: None if processes.rank == 0 else same_variant(config.variant))
+    processes.agreed(lambda: None if processes.rank == 0 else same_variant(config.variant))
     keep_memory()
-    capture = processes.together(lambda: load_capture(config.scene, masks=config.masks))
+    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks))
     if capture.shape.ring is not None:
         print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:
@@ -48,20 +50,33 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
     elif config.masks != "given" and not any(capture.masks.given):
         print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
     with threads_of(config.thread_count or processes.threads), contextlib.ExitStack() as held:
-        fit = processes.together(lambda: resumed(state, capture, config, folder) if state else Fit(capture, config))
-        processes.by_first(lambda: results.fitted_scene(fit, folder))  # refuses what cannot be written later
-        processes.by_first(lambda: held.enter_context(locked(folder)))
+        if state:
+            fit = processes.agreed(lambda: resumed(state, capture, config, folder))
+        else:
+            fit = started_fit(capture, config, processes)
+        processes.on_first(lambda: results.fitted_scene(capture, fit.ring, folder))  # refuses what cannot be written
+        processes.on_first(lambda: held.enter_context(locked(folder)))
         costs = None
         if config.minutes and not state:
             config, costs = planned(choice, fit, started)
             replan(fit, config)
         options = json.loads(json.dumps(dataclasses.asdict(config), default=str))
         prepare = partial(results.prepare_folder, folder, config.scene, options)
-        processes.by_first(lambda: prepare(config.resume))
+        processes.on_first(lambda: prepare(config.resume))
         interrupted = run_session(fit, folder, partial(prepare, resume=True), costs)
     if interrupted:
         print(f"Stopped at iteration {fit.iteration} of {fit.iterations}; go on with the same command and --resume")
     return 128 + interrupted if interrupted else 0
+
+
+def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fit:
+    """A new fit. Its time includes that of the coarse fits which find an unknown light."""
+    began = time.perf_counter()
+    lighting = processes.broadcast(processes.agreed(lambda: choose_lighting(capture, config)))
+    seconds = time.perf_counter() - began
+    fit = processes.agreed(lambda: Fit(capture, config, lighting=lighting))
+    fit.course.seconds = seconds
+    return fit
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
@@ -96,15 +111,16 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
     """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
-    minutes, spent = choice[0].minutes, fit.processes.told(time.monotonic() - started)
+    minutes, processes = choice[0].minutes, fit.problem.processes
+    spent = processes.broadcast(time.monotonic() - started)
     if spent > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, but the start alone has taken {spent:.0f} s; give more")
-    costs = measure(fit, all_stages(fit, choice))
-    spent = fit.processes.told(time.monotonic() - started)
-    if (needed := spent + fewest_seconds(choice, fit.stages_by, costs)) > 60 * minutes:
+    costs = processes.broadcast(measure(fit, all_stages(fit, choice)))
+    spent = processes.broadcast(time.monotonic() - started)
+    if (needed := spent + fewest_seconds(choice, fit.plan, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
                          f"{math.ceil(MARGIN * needed / 6) / 10:g} or more")  # fmt: skip
-    chosen = fitting_into(60 * minutes - spent, choice, fit.stages_by, costs)
+    chosen = fitting_into(60 * minutes - spent, choice, fit.plan, costs)
     print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
     return chosen, costs
 

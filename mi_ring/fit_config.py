@@ -1,21 +1,25 @@
 """The options of a fit: its settings, what it is of, where its results go and what computes it."""
 
 import argparse
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from mi_ring.errors import InputError
-from mi_ring.fitting.config import PRESETS, WEIGHTS, Config, as_typed
+from mi_ring.fitting.config import PRESETS, WEIGHTS, Ablation, Common, Config, Tuning, as_typed
 from mi_ring.output import results
 from mi_ring.system import command
 
 MOST_THREADS = 1024  #: of a fit
 MOST_MINUTES = 10_000  #: a week
+#: Groups of options that only --help-all shows, and how many options they have.
+GROUPS = {"tuning": Tuning, "ablation": Ablation}
+MORE = sum(len(dataclasses.fields(part)) for part in GROUPS.values()) - 1 + len(WEIGHTS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,19 +29,21 @@ class Task:
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
-    """Folder of the results. Default: out/<name>, the name of the scene file, or of its folder if it is scene.xml."""
+    """Folder for the results.
+    Without it: out/NAME, where NAME is that of the scene file, or of its folder if the file is called scene.xml."""
     resume: bool = False
-    """Go on from the folder's checkpoint.pt. Give the same settings as before."""
+    """Continue the fit in the results folder from its checkpoint. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Settings that go together; each can be overridden. paper: the paper's own, seven hours on two cores."""
+    """Options that go together. Options that you give override them. Times are for two processor cores.
+    fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
+    paper: the paper's own settings, seven hours."""
     minutes: float = 0
-    """About how long the command may take, results included: by what iterations take on this machine --iterations are
-    chosen, and --preset unless it is given. 0: as long as they take."""
+    """About how long the whole command may take [min]. 0: no limit.
+    It chooses --iterations, by the speed of this machine, and also --preset if you do not give one."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba, and with it of torch: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is
-    one."""
+    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
     threads: int = 0
-    """Processor threads of the fit; 0: all."""
+    """Number of processor threads. 0: all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,19 +65,60 @@ class FitConfig(Config, Task):
 
     @property
     def thread_count(self) -> int:
-        """Threads to compute with; 0: all."""
+        """Number of threads to compute with; 0: all."""
         return 1 if self.deterministic else self.threads
 
     @property
     def folder(self) -> Path:
-        """Where the results go."""
+        """The folder of the results."""
         return self.out or results.default_folder(self.scene)
 
 
 def parse_options(arguments: Sequence[str]) -> FitConfig:
-    """The configuration: the preset's settings under those given on the command line."""
+    """The configuration: the preset's settings, changed by those on the command line.
+
+    Raises InputError for an option that cannot be used, and SystemExit after printing the help: --help shows the first
+    group of options, --help-all all of them.
+    """
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     early.add_argument("--preset", nargs="?", default="default")
     preset = early.parse_known_args(arguments)[0].preset
-    default = FitConfig(scene=tyro.MISSING, **PRESETS.get(preset, {}))
-    return command.parse(FitConfig, arguments, "mi_ring.fit", default, needs_llvm=False)
+    preset_values = vars(FitConfig(scene=tyro.MISSING, **PRESETS.get(preset, {})))
+    brief = "--help-all" not in arguments and bool({"-h", "--help"} & {*arguments})
+    kind, parts = command_line(brief)
+    default = built(kind, preset_values | {name: built(part, preset_values) for name, part in parts.items()})
+    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
+    try:
+        parsed = command.parse(kind, arguments, "mi_ring.fit", default, FitConfig.__doc__, needs_llvm=False)
+    except SystemExit:
+        if brief:
+            print(f"{MORE} more options, for tuning and ablation: --help-all shows them")
+        raise
+    values = dict(vars(parsed))
+    for name in parts:
+        values |= vars(values.pop(name))
+    return FitConfig(**values)
+
+
+def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
+    """The dataclass that tyro parses, and its nested ones by field, one for each group of options.
+
+    The nested options keep their names: --levels, not --tuning.levels. `brief`: tyro leaves the groups out, of the help
+    and of what it parses.
+    """
+    parts, nested, hidden = {}, {}, Suppress
+    for name, group in GROUPS.items():
+        bare = {f.name: Annotated[f.type, arg(prefix_name=False)] for f in dataclasses.fields(group)}
+        parts[name] = part = dataclass_of(group.__name__, bare, group)
+        nested[name] = hidden[part] if brief else Annotated[part, arg(help=group.__doc__)]  # type: ignore[valid-type]
+    return dataclass_of("Options", nested, Common, Task), parts
+
+
+def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
+    """A frozen dataclass with these fields, by name, and those of its bases."""
+    return dataclasses.make_dataclass(name, fields.items(), bases=bases, frozen=True, kw_only=True)
+
+
+def built(kind: Any, values: dict[str, Any]) -> Any:
+    """A dataclass of this kind from the values of its fields, and of others."""
+    return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

@@ -1,4 +1,4 @@
-"""Files of others: read, or refused in one line whatever is in them, and with memory that their size bounds."""
+"""Files of other programs: damage is an InputError of one line, and memory is bounded by the file's size."""
 
 import contextlib
 import io
@@ -13,13 +13,13 @@ import numpy as np
 
 from mi_ring.errors import InputError
 
-#: Bytes that what is in a file may take in memory, and times the file's size: a PNG or a zip file may be 1032 times as
-#: small, what is much smaller than that and not small is made to fill memories.
-ROOM, EXPANSION = 2**28, 2**12
+#: A file may declare to hold this number of bytes, or this multiple of its size if that is more. PNG and zip compress
+#: 1032 times at most; a much larger ratio is an attack on the memory.
+SMALL, EXPANSION = 2**28, 2**12
 
-PATIENCE, SPEED = 30.0, 2e6  #: seconds, and bytes in each further second, that a native reader may take
-#: Begins what runs in a process of its own: its memory is bounded where the system can do that.
-BOUNDED = """
+READ_SECONDS, READ_SPEED = 30.0, 2e6  #: time limit of a native reader: seconds, plus one for this number of bytes
+#: Begins the script of a child process: limits its memory where the system can do that.
+LIMIT_MEMORY = """
 import sys
 try:
     import resource
@@ -31,31 +31,31 @@ except (ImportError, OSError, ValueError):
 
 @contextlib.contextmanager
 def reading(where: Path | str, what: str) -> Iterator[None]:
-    """Turns all that a reader of files raises into an InputError: `where` the file, `what` it should have been."""
+    """Turns every error of a reader into an InputError: `where` is the file, `what` its expected content."""
     try:
         yield
     except InputError:
         raise
-    except Exception as error:  # readers raise what they like for files that are damaged, or meant to
+    except Exception as error:  # readers raise errors of all kinds for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{where}: cannot be read as {what} ({reason})") from error
 
 
-def require_room(path: Path, size: int) -> None:
-    """Raise ValueError if what a file declares to hold takes more bytes than one of its size can mean."""
-    if size > max(ROOM, EXPANSION * path.stat().st_size):
+def require_plausible_size(path: Path, size: int) -> None:
+    """Raise ValueError if a file declares to hold more bytes than a file of its size can."""
+    if size > max(SMALL, EXPANSION * path.stat().st_size):
         raise ValueError(f"declares {size:,} bytes, in a file of {path.stat().st_size:,}")
 
 
-def require_survival(read: str, path: Path, size: int, what: str) -> None:
-    """Raise InputError for files that a native reader crashes of, is busy with for ever or takes all memory for.
+def require_readable(read: str, path: Path, size: int, what: str) -> None:
+    """Raise InputError if a native reader crashes, does not return or exhausts the memory on these files.
 
-    `read`: it in Python, with the path as sys.argv[1]; `size`: bytes of the files. Nothing ends such readers, not even
-    Ctrl-C; so another process tries first.
+    Nothing stops such a reader, not even Ctrl-C, so a child process tries it first. `read` is its call in Python, with
+    the path as sys.argv[1]; `size` is the number of bytes in the files; `what` is their expected content.
     """
     try:
-        trial = [sys.executable, "-c", BOUNDED + read, str(path), str(2**31 + 40 * size)]
-        done = subprocess.run(trial, capture_output=True, text=True, timeout=PATIENCE + size / SPEED)
+        trial = [sys.executable, "-c", LIMIT_MEMORY + read, str(path), str(2**31 + 40 * size)]
+        done = subprocess.run(trial, capture_output=True, text=True, timeout=READ_SECONDS + size / READ_SPEED)
         trouble = done.stderr.strip().splitlines()[-1:] or [f"its reader ended with status {done.returncode}"]
     except subprocess.TimeoutExpired as late:
         raise InputError(f"{path}: not {what}, or damaged (not read in {late.timeout:.0f} s)") from late
@@ -64,34 +64,31 @@ def require_survival(read: str, path: Path, size: int, what: str) -> None:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file. Raises InputError if it is none."""
+    """The arrays of a .npz file by name. Raises InputError if it cannot be read."""
     with reading(path, "arrays of NumPy's, .npz"), zipfile.ZipFile(path) as archive:
-        require_room(path, sum(member.file_size for member in archive.infolist()))
-        return {name.removesuffix(".npy"): array_of(archive.read(name)) for name in archive.namelist()}
+        require_plausible_size(path, sum(member.file_size for member in archive.infolist()))
+        return {name.removesuffix(".npy"): parse_npy(archive.read(name)) for name in archive.namelist()}
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """The array of a .npy file. Raises InputError if it is none."""
+    """The array of a .npy file. Raises InputError if it cannot be read."""
     with reading(path, "an array of NumPy's, .npy"):
-        return array_of(path.read_bytes())
+        return parse_npy(path.read_bytes())
 
 
-def array_of(content: bytes) -> np.ndarray:
-    """The array in the content of a .npy file. Raises ValueError if that lacks some of it, or is none."""
-    shape: tuple[int, ...] = ()
-    stream, kind = io.BytesIO(content), np.dtype(float)
+def parse_npy(content: bytes) -> np.ndarray:
+    """The array in the content of a .npy file. Raises ValueError if that is incomplete or something else."""
+    stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, _, kind = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, _, kind = np.lib.format.read_array_header_2_0(stream)
-    else:
+    headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in headers:
         raise ValueError(f"is of version {version[0]}.{version[1]}")
-    if math.prod(shape) * kind.itemsize > len(content):  # before as much is allocated
+    shape, _, kind = headers[version](stream)
+    if math.prod(shape) * kind.itemsize > len(content):  # checked before numpy allocates it
         raise ValueError(f"declares an array of shape {shape}, and is shorter")
     array = np.load(io.BytesIO(content))
     if kind.kind == "U" and array.nbytes:
         codes = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(array.dtype.byteorder))
-        if codes.max() > sys.maxunicode:  # which Python stumbles over whenever it looks at one
+        if codes.max() > sys.maxunicode:  # Python would fail at each access
             raise ValueError("has characters that are none")
     return array

@@ -10,8 +10,8 @@ from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
 from mi_ring.experiments.catalogue import EXPERIMENTS
-from mi_ring.experiments.engine import perform
-from mi_ring.experiments.experiment import Asked
+from mi_ring.experiments.engine import run_experiment
+from mi_ring.experiments.experiment import ExperimentOptions
 from mi_ring.fit_config import MOST_THREADS
 from mi_ring.fitting.config import as_typed
 from mi_ring.system import command
@@ -25,68 +25,76 @@ Name: Any = Literal[tuple(EXPERIMENTS)]
 class PaperConfig:
     """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
 
-    Each run is a fit whose results are in OUT/NAME/runs/, by another preset than default in OUT/NAME-PRESET/runs/;
-    table.csv, table.md and figure.png beside it are there after each. The same command again goes on where it stopped.
-    A run that fails is shown as such and does not stop the others; the exit status is then 1.
+    Each run is a fit with its results in OUT/NAME/runs/, or in OUT/NAME-PRESET/runs/ for another preset than default.
+    table.csv, table.md and figure.png are written after each run. The same command again continues where it stopped. A
+    run that fails is shown as failed, and the others continue; the exit status is then 1.
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
-    """table1: accuracy; table2: DiLiGenT-MV; table3: poses that are refined; specularity: materials of rising gloss;
-    stripes: two materials; views: 5 to 50 photographs; ablation: the ring against plain ResNets; encoding; steps: the
-    paper's T; genus: from a sphere and from a hull; swap: materials exchanged; resolution: one fit at several levels;
-    timing: errors in the course of a fit; single: DiLiGenT's photographs from one side."""
+    """The experiment.
+    table1: accuracy. table2: DiLiGenT-MV. table3: wrong camera poses, refined.
+    specularity: materials from dull to glossy. stripes: two materials on one object. swap: materials exchanged.
+    views: 5 to 50 photographs. genus: from a sphere and from the visual hull.
+    ablation: the flow against plain ResNets. encoding: positional encodings. steps: Euler steps, the paper's T.
+    resolution: one fit at several mesh levels. timing: errors in the course of a fit.
+    single: DiLiGenT's photographs from one side."""
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]] = ()
-    """Folders of captures (scene.xml, truth/mesh.ply) or meshes; one mesh for specularity and stripes; the folder of
-    DiLiGenT-MV for table2, .npz files for single. Default, but for these two: what is at hand, pot2 or the example's
-    pot."""
+    """Captures (folders with scene.xml and truth/mesh.ply) or meshes. specularity and stripes take one mesh.
+    table2 takes the folder of DiLiGenT-MV, single takes .npz files.
+    Without it, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
     materials: tuple[str, ...] = ()
-    """What meshes are made of, as mi-ring synthesize has them: in turn, all on the one mesh of specularity, two in
-    stripes."""
+    """Materials of the meshes, as mi-ring synthesize takes them.
+    Meshes get them in turn. specularity puts all of them on its one mesh, stripes needs two."""
     out: Path = Path("out/paper")
-    """Folder of the results of all experiments, each in a folder of its name and preset, and of the captures that they
-    make."""
+    """Folder for the results of all experiments and for the captures that they make.
+    Each experiment has a folder of its name and preset."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
-    """Of the fits, as mi-ring fit has them. Default: default, and fast with --quick, which goes with no other."""
+    """Preset of the fits, as in mi-ring fit.
+    Without it: default, or fast with --quick, which allows no other."""
     seeds: tuple[int, ...] = (0,)
-    """Random seeds: each run once with each, and the mean."""
+    """Random seeds. Each run is made once with each, and the table has the means."""
     only: tuple[str, ...] = ()
-    """Names of runs to make now, the others later. Default: all."""
+    """Names of the runs to make now. Without it: all."""
     quick: bool = False
-    """A small version of everything, in minutes: few runs, few iterations of small photographs. Its results are in
-    OUT/NAME-quick."""
+    """Make a small version in minutes: few runs, few iterations, small photographs.
+    Its results are in OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba: llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
+    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
     threads: int = 0
-    """Processor threads of each fit; 0: all."""
+    """Number of processor threads of each fit. 0: all."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if a run has failed."""
+    """Run the command. Returns its exit status: 1 if a run has failed."""
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
+    experiment = EXPERIMENTS[config.name]
     if not 0 <= config.threads <= MOST_THREADS:
         raise InputError(f"--threads: is {config.threads}, must be 0 to {MOST_THREADS}")
     if not config.seeds or len({*config.seeds}) < len(config.seeds):
         raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
+    if experiment.one_seed and len(config.seeds) > 1:
+        raise InputError(f"--seeds: are several; {config.name} takes one; give one")
     if missing := next((path for path in config.data if not path.exists()), None):
-        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {EXPERIMENTS[config.name].data}")
+        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {experiment.data}")
     if config.quick and config.preset not in (None, "fast"):
         raise InputError(f"--preset: is {config.preset}, but --quick is by fast; leave one of the two out")
     if not all(material.strip() for material in config.materials):
         raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
     preset = config.preset or ("fast" if config.quick else "default")
-    variant = set_variant(config.variant)
-    asked = Asked(config.data, config.materials, preset, config.seeds, config.quick, config.threads, variant)
+    options = ExperimentOptions(config.data, config.materials, preset, config.seeds, config.quick, config.threads,
+                                set_variant(config.variant), config.out)  # fmt: skip
     kind = "quick" if config.quick else preset
     out = config.out / (config.name if kind == "default" else f"{config.name}-{kind}")
-    settings = "--quick" if config.quick else f"--preset {preset}"
-    settings += f" --variant {variant}" * (variant != PaperConfig.variant)
-    what = [path.name or str(path.resolve().name) for path in config.data]
+    words = ["mi-ring paper", config.name, *(path.name or str(path.resolve().name) for path in config.data)]
     if config.materials:
-        what += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
-    seeds = f" --seeds {' '.join(map(str, config.seeds))}" * (config.seeds != (0,))
-    with command.going_on(), locked(out):
-        said = " ".join(["mi-ring paper", config.name, *what, settings]) + seeds
-        failed = perform(EXPERIMENTS[config.name], asked, out, config.only, said)
+        words += ["--materials", *(shlex.quote(Path(material).name) for material in config.materials)]
+    words.append("--quick" if config.quick else f"--preset {preset}")
+    if options.variant != PaperConfig.variant:
+        words.append(f"--variant {options.variant}")
+    if config.seeds != (0,):
+        words.append(f"--seeds {as_typed(config.seeds)}")
+    with command.resumable(), locked(out):
+        failed = run_experiment(experiment, options, out, config.only, " ".join(words))
     runs = f"; {failed} run{'s' * (failed > 1)} failed" * bool(failed)
     print(f"{out}/table.md{' and figure.png' * (out / 'figure.png').is_file()}{runs}")
     return int(failed > 0)

@@ -41,43 +41,48 @@ from mi_ring.photogrammetry.workflow import (
     require_parallax,
     require_same_photographs,
 )
-from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
-from mi_ring.system.files import locked, write_file
+from mi_ring.system.files import locked, read_json, write_file
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
-METRES = 1e-3  #: of a unit of the scene, if there is a sheet
+OPTIONS = "work/options.json"  #: the options of the command that made the capture
+METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
 
 
 @dataclass(frozen=True)
 class PhotosConfig:
     """Find the cameras of photographs, masks of the object and its place, and write a capture to fit.
 
-    The photographs: one object from all around that does not move, lit by a flash beside the lens in a dim room; JPEG,
-    HEIC, PNG, TIFF or raw. With a sheet of `mi-ring board` under the object, the capture is in millimetres and
-    upright. It can be interrupted: the same command goes on.
+    The photographs show one object from all around. It does not move. A flash beside the lens lights it in a dim room.
+    They are JPEG, HEIC, PNG, TIFF or raw files. With a sheet of `mi-ring board` under the object, the capture is in
+    millimetres and upright. After an interruption the same command continues.
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the photographs."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
-    """Folder to write: scene.xml, with what belongs to it; work/ holds what has been found so far."""
+    """Folder to write. It gets scene.xml and the files that this names.
+    work/ in it keeps what has been found so far; an interrupted command continues from there."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the flash from the lens, in the camera's axes (x right, y down, z forward) as most photographs are shown: of
-    those held otherwise it turns with the camera [mm with a sheet, which tells it more exactly; else the unit is the
-    median distance from the cameras to the object]."""
+    """Position of the flash relative to the lens: right, down and forward.
+    With a sheet the unit is mm, and the sheet refines it.
+    Without a sheet the unit is the median distance from the cameras to the object.
+    It is for photographs as most of them are held; for those held otherwise it turns with the camera."""
     turntable: bool = False
-    """Did the object turn, with the sheet under it, while camera and flash stood?"""
+    """Use it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
-    """auto: find masks; alpha: the photographs' alpha channels; rembg: by the package of that name, if it is installed;
-    else a folder of masks, each called like its photograph with .png added, or instead of its suffix."""
+    """Where the masks come from.
+    auto: they are found. alpha: the alpha channels of the photographs. rembg: the package rembg, if it is installed.
+    Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Lowest and highest x, y and z of the object, XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, in the frame of the sheet [mm], to
-    cut off what belongs to it in the photographs but should not."""
+    """Box around the object in the frame of the sheet [mm], as XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
+    Use it to cut off what touches the object in the photographs but is not part of it."""
     square_mm: float = SQUARE
-    """How long a square of the printed sheet is, measured with a ruler over several of them."""
+    """Length of one square of the printed sheet [mm].
+    Measure several squares with a ruler if the printer does not print at 100 %."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
@@ -90,7 +95,7 @@ class PhotosConfig:
             need("rembg", "--masks rembg")
 
     def words(self) -> list[str]:
-        """What tells it from others."""
+        """The options as strings, by which the same command is recognised."""
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
@@ -132,23 +137,23 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
-    if scene.exists() and (sheet.exists() or made_by(config.out) != config.words()):
+    if scene.exists() and (sheet.exists() or read_json(config.out / OPTIONS) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
     try:
-        with command.going_on(), locked(config.out, "DIR"):
+        with command.resumable(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt as stop:
-        # Native threads do not let themselves be ended; what they write is whole or not at all.
-        os._exit(command.status_of(stop))
+        # At once: native threads cannot be stopped. The files that they write are complete or absent.
+        os._exit(command.exit_status(stop))
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
 
 
 def require_apart(config: PhotosConfig) -> None:
-    """Raise InputError if what is written would come among the photographs or masks that are given."""
+    """Raise InputError if output files would be written among the given photographs or masks."""
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
     written = [out / name for name in ("images", "masks", "valid", "work")]
@@ -158,14 +163,8 @@ def require_apart(config: PhotosConfig) -> None:
             raise InputError(f"{folder}: {field}: is where the capture is written; give another DIR than {config.out}")
 
 
-def made_by(out: Path) -> list[str] | None:
-    """The `words` that a capture was made with; None if that is not known."""
-    file = out / "work/options.json"
-    return json.loads(file.read_text("utf-8")) if file.exists() else None
-
-
 def make(config: PhotosConfig, scene: Path) -> None:
-    """The capture, from what has been found so far."""
+    """Make the capture; steps that are complete in work/ are not repeated."""
     pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
@@ -174,11 +173,11 @@ def make(config: PhotosConfig, scene: Path) -> None:
         kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
         print(f"Cameras: of several models, by EXIF data ({kinds}), but all of one size are taken to share a lens, and "
               "all to have their flash in one place beside it; better give photographs of one")  # fmt: skip
-    if isinstance(config.masks, Path):  # before all the work
+    if isinstance(config.masks, Path):  # before the long work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
-    for left in config.out.glob(".scene.*/"):  # by a process that was killed
+    for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
     require_same_photographs(pictures, work)
@@ -215,22 +214,23 @@ def make(config: PhotosConfig, scene: Path) -> None:
         print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
               "about where it is: --flash-offset")  # fmt: skip
     taken = posed_pictures(pictures, sparse, found, offset, flash)
-    if silent := without_exposure([shot.picture for shot in taken if not shot.measured]):
+    if silent := without_exposure([posed.picture for posed in taken if not posed.measured]):
         print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
-    # Only where the flash's power is known is the reflectance, too, of which Fresnel's depends.
-    root, writer = scene_element([], ground, up, METRES if sheet else None, fresnel=flash is not None), Writer(scene)
+    # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
+    root = scene_element(ground=ground, up=up, metres=METRES if sheet else None, fresnel=flash is not None)
+    writer = Writer(scene)
     if config.turntable or (flash and flash.room.any()):  # on a turntable the object sees the room turn
-        harmonics = np.zeros((COUNT, 3))
+        harmonics = np.zeros((PER_FRAME, 3))
         harmonics[0] = np.sqrt(4 * np.pi) * flash.ambient if flash else 0.0
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
-        cuts = crop_windows([shot.mask for shot in taken], [shot.lens.size for shot in taken])
+        cuts = crop_windows([posed.mask for posed in taken], [posed.lens.size for posed in taken])
         written = in_threads(partial(write_posed_picture, writer), taken, cuts)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
             root.extend(write_table(writer, taken, plane, found.center, flash))
-        write_file(work / "options.json", json.dumps(config.words()))
+        write_file(config.out / OPTIONS, json.dumps(config.words()))
         writer.finish(scene_bytes(root))
     finally:
         writer.close()

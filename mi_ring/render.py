@@ -9,11 +9,11 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
-from mi_ring.errors import InputError
-from mi_ring.objects.material_edits import dress
+from mi_ring.errors import InputError, require_range
+from mi_ring.objects.material_edits import edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.ambiguity import ambiguity_of
-from mi_ring.output.camera_paths import RenderConfig, View, integrator_of, lit_surface, render_views, views_of
+from mi_ring.output.camera_paths import RenderConfig, RenderedView, integrator_of, lit_surface, render_views, views_of
 from mi_ring.output.film import write_film, write_picture
 from mi_ring.system import command
 from mi_ring.system.files import writing
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> None:
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
     require_options(config)
     ring = load_fit(config.run)
-    dress(ring, config)
+    edit_material(ring, config)
     capture = load_capture(config.scene, images=False)
     views = views_of(capture, ring, config)
     require_writable(views, capture, config)
@@ -32,42 +32,37 @@ def main(arguments: Sequence[str]) -> None:
     with writing(config.out):
         for folder in {(config.out if config.film else config.out / view.name).parent for view in views}:
             folder.mkdir(parents=True, exist_ok=True)
-    pictures = render_views(surface, ring, views, integrator, capture.shadows, config, capture.photographs.room)
+    pictures = render_views(surface, ring, views, integrator, capture, config)
     if config.film:
-        frames = (recorded(picture, view.sensor) for picture, view in zip(pictures, views))
-        write_film(frames, config.out, views[0].sensor.size, config.fps)
+        frames = (recorded(picture, view.shot) for picture, view in zip(pictures, views))
+        write_film(frames, config.out, views[0].shot.size, config.fps)
         print(config.out)
     else:
-        for picture, view in zip(pictures, views):  # in this order the progress bar gets to its end
-            write_picture(recorded(picture, view.sensor), config.out / view.name)
+        for picture, view in zip(pictures, views):  # `pictures` first, so that its progress bar ends
+            write_picture(recorded(picture, view.shot), config.out / view.name)
         print(f"{len(views)} pictures in {config.out}/")
     run = config.run if config.run.is_dir() else config.run.parent
-    own = config.scene.resolve().parent == run.resolve()  # in the light that was found with the material
-    if (untold := ambiguity_of(config.material or config.run)) and (config.material or config.envmap or not own):
-        print(f"{untold} In a known light pictures may be too bright, or of another colour", file=sys.stderr)
+    same_light = config.scene.resolve().parent == run.resolve() and not (config.material or config.envmap)
+    if (unknown := ambiguity_of(config.material or config.run)) and not same_light:
+        print(f"{unknown} In a known light pictures may be too bright, or of another colour", file=sys.stderr)
 
 
 def require_options(config: RenderConfig) -> None:
-    """Raise InputError for options out of range or that contradict each other."""
-    if config.subdivisions is not None and not 0 <= config.subdivisions <= 8:
-        raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to 8")
+    """Raise InputError for options that are out of range or contradict each other."""
+    require_range(config, "subdivisions", 0, 8)
     for name in ("turntable", "light_orbit", "flow"):
-        if not 0 <= getattr(config, name) <= 10000:
-            raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be 0 to 10000 pictures")
+        require_range(config, name, 0, 10000)
+    require_range(config, "width", 8, 8192)
+    require_range(config, "spp", 1)
+    require_range(config, "time", 0, 1)
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
         raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
     if config.view is not None and not config.count:
         raise InputError("--view: is for --turntable, --light-orbit and --flow; without them every photograph is taken")
     if config.flow and config.time != 1:
         raise InputError("--time: is one moment of the flow, --flow shows all of them; give one of the two")
-    if config.width is not None and not 8 <= config.width <= 8192:
-        raise InputError(f"--width: is {config.width}, must be 8 to 8192")
     if config.width and not config.count:
         raise InputError("--width: is for --turntable, --light-orbit and --flow; photographs have their own size")
-    if config.spp < 1:
-        raise InputError(f"--spp: is {config.spp}, must be at least 1")
-    if not 0 <= config.time <= 1:
-        raise InputError(f"--time: is {config.time}, must be 0 to 1")
     if not 0 < config.fps <= 240:
         raise InputError(f"--fps: is {config.fps}, must be above 0, 240 at most")
     if config.up is not None and not 0 < np.linalg.norm(config.up) < np.inf:
@@ -82,17 +77,17 @@ def require_options(config: RenderConfig) -> None:
         raise InputError(f"--format: is {config.format}, but {config.out.name} is a film; leave it out")
 
 
-def require_writable(views: list[View], capture: Capture, config: RenderConfig) -> None:
-    """Raise InputError for pictures that could not be written, or would overwrite each other or the photographs."""
+def require_writable(views: list[RenderedView], capture: Capture, config: RenderConfig) -> None:
+    """Raise InputError if pictures cannot be written, or would overwrite each other or the photographs."""
     if config.film:
-        sizes = sorted({view.sensor.size for view in views})
+        sizes = sorted({view.shot.size for view in views})
         if len(sizes) > 1:
             raise InputError(f"{config.scene}: film: photographs have several sizes, {sizes[0]} and {sizes[1]} [px]; "
                              "a film has one: name a folder")  # fmt: skip
         if config.out.is_dir():
             raise InputError(f"{config.out}: is a folder; a film needs the name of a file")
         return
-    own = {file for sensor in capture.sensors for file in sensor.files}
+    own = {file.resolve() for shot in capture.shots for file in shot.files if file}
     names = set()
     for view in views:
         if Path(view.name).suffix.lower() not in (".png", ".exr", ".jpg", ".jpeg"):

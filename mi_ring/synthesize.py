@@ -9,16 +9,16 @@ from mi_ring.system.files import locked
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(SynthesizeConfig, arguments, "mi_ring.synthesize")
     require_options(config)
     with locked(config.out, "OUT"):
         write_capture(config)
     out = config.out
-    said = "" if config.exact else f"\nWhat its calibration should say is in {out}/truth/exact.xml."
+    exact = "" if config.exact else f"\nThe exact calibration is in {out}/truth/exact.xml."
     unknown = "environment" if config.environment else "lamps" if config.lamps > 1 else ""
     light = f" --light {unknown}" if unknown and config.wrong_room else ""
-    print(f"{out}/scene.xml, and the true surface in {out}/truth/mesh.ply{said}\n"
+    print(f"{out}/scene.xml, and the true surface in {out}/truth/mesh.ply{exact}\n"
           f"Now: mi-ring check {out}/scene.xml; mi-ring fit {out}/scene.xml{light}")  # fmt: skip
 
 

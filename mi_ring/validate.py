@@ -13,6 +13,7 @@ from mi_ring.metrics.path_tracing import BATCHES, open_lit_scene, render_both
 from mi_ring.metrics.renderer_agreement import all_as_one, compare_renderers, comparison_table, verdict
 from mi_ring.output.validation_sheet import strip, validation_sheet
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.scene.shot import Shot
 from mi_ring.system import command
 from mi_ring.system.files import write_file, writing
 from mi_ring.system.progress import progress
@@ -20,34 +21,35 @@ from mi_ring.system.progress import progress
 
 @dataclass(frozen=True)
 class ValidateConfig:
-    """Compare `photometric` with Mitsuba's path tracer on every photograph: shadows, interreflection, disagreement.
+    """Compare `photometric` with Mitsuba's path tracer on every photograph.
 
-    Prints a line for each photograph and one for all. In % of path's mean radiance: the mean difference of the two, the
-    mean of its absolute value and how much of that Monte Carlo noise explains, what shadows take away, what
-    interreflection adds, and what is left unexplained, the difference of direct light. "p direct" is how likely so
-    large a difference is if both renderers' direct light is the same, "p path" likewise of photometric and all light of
-    path: tiny where there is interreflection.
+    Prints a line for each photograph and one for all, in % of the path tracer's mean radiance: the mean difference and
+    the mean absolute difference; how much of it Monte Carlo noise explains; what shadows remove; what interreflection
+    adds; the difference of direct light, which is left unexplained. "p direct" is the probability of so large a
+    difference if both renderers' direct light is the same. "p path" is the same for photometric and all light of the
+    path tracer; it is tiny where there is interreflection.
 
-    Writes validate.png, a contact sheet, and validate.json, all numbers. Exit status: 1 if the direct light of the two
-    differs by more than Monte Carlo noise, 2 if there is nothing to compare.
+    Writes validate.png, a contact sheet, and validate.json, all numbers. The exit status is 1 if the direct light
+    differs by more than Monte Carlo noise, and 2 if there is nothing to compare.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
     """Mitsuba XML file with photographs, or results folder of a fit."""
     out: Path | None = None
-    """Folder of the results. Default: RUN/validate, for a scene file out/validate/<name>."""
+    """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file."""
     photographs: tuple[str, ...] = ()
-    """Only these, by id or name of the image file. Default: all."""
+    """Ids or image names of the photographs to compare. Without it: all."""
     width: int = 128
-    """Width and height of the pictures, at most [px]."""
+    """Largest width and height of the pictures [px]."""
     spp: int = 64
-    """Samples per pixel, rounded up to a multiple of 16."""
+    """Samples per pixel, rounded up to a multiple of 16. More find smaller differences."""
     depth: int = 6
-    """Longest paths, `max_depth` of the path tracer: 3 or more, for 2 is direct light. -1: no limit."""
+    """Longest paths, `max_depth` of the path tracer. 2 is direct light, so it is 3 or more.
+    -1: no limit."""
     significance: float = 0.01
-    """Chance that renderers which agree are said to disagree."""
+    """Probability of a false alarm: that two renderers which agree are reported to differ."""
     seed: int = 0
-    """Of all samples."""
+    """Random seed of all samples."""
 
     def __post_init__(self) -> None:
         for name in ("width", "spp"):
@@ -61,16 +63,16 @@ class ValidateConfig:
             raise InputError(f"--seed: is {self.seed}, must be 0 to {(1 << 31) - 1}")
 
 
-def chosen_photographs(sensors: list, names: Sequence[str]) -> list[int]:
-    """Indices of the photographs with these ids or image names, all if there are none. Raises InputError."""
+def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:
+    """Indices of the photographs with these ids or image names, by default all. Raises InputError."""
     for name in names:
-        if not any(name in (s.id(), s.filename.name) for s in sensors):
-            raise InputError(f"--photographs: there is no {name}; the first is called {sensors[0].id()}")
-    return [k for k, s in enumerate(sensors) if not names or {s.id(), s.filename.name} & set(names)]
+        if not any(name in (shot.name, shot.file_name) for shot in shots):
+            raise InputError(f"--photographs: there is no {name}; the first is called {shots[0].name}")
+    return [k for k, shot in enumerate(shots) if not names or {shot.name, shot.file_name} & set(names)]
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command."""
+    """Run the command. Returns its exit status: 1 if the direct light of the renderers differs."""
     config = command.parse(ValidateConfig, arguments, "mi_ring.validate")
     path, out = config.scene, Path("out/validate") / command.scene_name(config.scene)
     if path.is_dir():
@@ -79,19 +81,20 @@ def main(arguments: Sequence[str]) -> int:
             raise InputError(f"{config.scene}: has no scene.xml; give the folder of a finished fit or a scene file")
     out = config.out or out
     scene, sensors = open_lit_scene(path)
-    chosen = chosen_photographs(sensors, config.photographs)
+    shots = [sensor.shot for sensor in sensors]
+    chosen = chosen_photographs(shots, config.photographs)
     with writing(f"{out}: --out"):
         out.mkdir(parents=True, exist_ok=True)
 
-    photographs, spp = Photographs.of(sensors), -(-config.spp // BATCHES)
-    names = [sensor.filename.name for sensor in sensors]
+    photographs, spp = Photographs.of(shots), -(-config.spp // BATCHES)
+    names = [shot.file_name for shot in shots]
     rows, strips = [], []
     for k in progress(chosen, "comparing", unit="photograph", leave=True):
-        size = sensors[k].size
+        size = shots[k].size
         scale = -(-max(size) // config.width)
         if min(size) < scale:
             raise InputError(f"--width: is {config.width}, too small for {names[k]} of {size[0]} x {size[1]} pixels")
-        seed = 2 * BATCHES * (config.seed * len(sensors) + k) % 2**32
+        seed = 2 * BATCHES * (config.seed * len(shots) + k) % 2**32
         pictures = render_both(scene, photographs, k, sensors[k], scale, spp, config.depth, seed)
         rows.append(compare_renderers(names[k], pictures))
         strips.append(strip(rows[-1], pictures))

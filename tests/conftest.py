@@ -15,6 +15,7 @@ import pytest
 
 import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 from mi_ring.doctor import OPTIONAL
+from mi_ring.system.optional import installed
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -43,14 +44,21 @@ def no_scenes_of_other_tests():
     gc.collect()
 
 
+def missing_package(error: BaseException | None) -> str | None:
+    """The package of `OPTIONAL` that an error, or what it came from, could not import for it is not installed."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL and not installed(error.name):
+            return error.name
+        error = error.__cause__ or error.__context__
+    return None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(call):
     """A test that needs a package which is not ready-made for every machine is skipped where it is missing."""
-    text = str(call.excinfo.value) if call.excinfo else ""
-    for name in OPTIONAL:
-        if f"needs the package {name}, which is not installed" in text or f"No module named '{name}'" in text:
-            skipped = pytest.skip.Exception(f"needs {name}")
-            call.excinfo = pytest.ExceptionInfo.from_exc_info((type(skipped), skipped, call.excinfo.tb))
+    if call.excinfo and (name := missing_package(call.excinfo.value)):
+        skipped = pytest.skip.Exception(f"needs {name}")
+        call.excinfo = pytest.ExceptionInfo.from_exc_info((type(skipped), skipped, call.excinfo.tb))
 
 
 @pytest.fixture
@@ -91,8 +99,8 @@ def small_capture(tmp_path_factory):
     from mi_ring.images import linear_to_srgb, to_bytes
     from mi_ring.scene.lights import Light
     from mi_ring.scene.plain_mesh import mesh_of
-    from mi_ring.synthesis.stage import Stage
-    from mi_ring.synthesis.tracing import Shot
+    from mi_ring.synthesis.object_on_table import ObjectOnTable
+    from mi_ring.synthesis.tracing import LensCamera
     from mi_ring.synthesis.viewpoints import look_at
 
     folder = tmp_path_factory.mktemp("small")
@@ -106,7 +114,7 @@ def small_capture(tmp_path_factory):
     colour = bands * [0.6, 0.2, 0.1] + (1 - bands) * [0.3, 0.4, 0.2]
     mesh.add_attribute("vertex_color", 3, colour.astype(np.float32).ravel())
     mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}))
-    stage = Stage(mesh, vertices)
+    scene = ObjectOnTable(mesh, vertices)
     width, height, fx, fy, cx, cy = 56, 40, 60.0, 66.0, 30.5, 18.0
     random, sensors = np.random.default_rng(5), []
     for k in range(12):
@@ -117,9 +125,9 @@ def small_capture(tmp_path_factory):
         matrix = look_at(origin, target, random.normal(size=3))
         light = origin + matrix[:3, :3] @ [15, 10, 0]
         intensity = 2.2 * np.linalg.norm(light - CENTER) ** 2
-        shot = Shot(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
-        radiance = stage.radiance(shot, Light("point", light, np.full(3, intensity)), 16, k, 2)
-        coverage = stage.coverage(shot, 16)
+        view = LensCamera(Camera(matrix, np.array([fx, fy]), np.array([cx, cy]), (width, height)))
+        radiance = scene.radiance(view, Light("point", light, np.full(3, intensity)), 16, k, 2)
+        coverage = scene.coverage(view, 16)
         mi.Bitmap(to_bytes(linear_to_srgb(radiance))).write(str(folder / f"images/{k:03}.png"))
         mi.Bitmap((coverage[..., None] > 0.5).astype(np.uint8) * 255).write(str(folder / f"masks/{k:03}.png"))
         sensors.append(SENSOR.format(

@@ -75,21 +75,24 @@ def test_an_iteration_has_what_was_predicted_and_observed(capture):
     for count, it in enumerate(fit, 1):
         vertices, (height, width) = (162, (20, 28)) if it.stage.level == 2 else (642, (40, 56))
         assert it.number == count == fit.iteration and it.progress == (count - 1) / 4
-        assert it.vertices.shape == (vertices, 3) and it.faces.shape == (2 * vertices - 4, 3)
-        assert it.predicted.shape == it.observed.shape == (4, height, width, 3) and it.mask.shape == (4, height, width)
-        assert {name: value.shape for name, value in it.material.items()} == {
+        seen, shown = it.observation, it.prediction
+        assert shown.vertices.shape == (vertices, 3) and it.batch.faces.shape == (2 * vertices - 4, 3)
+        assert shown.rgb.shape == seen.rgb.shape == (4, height, width, 3)
+        assert shown.coverage.shape == seen.mask.shape == (4, height, width)
+        assert {name: value.shape for name, value in shown.material.items()} == {
             "diffuse": (vertices, 3), "specular": (vertices,), "roughness": (vertices,)
         }  # fmt: skip
-        assert not (it.predicted.requires_grad or it.vertices.requires_grad)
+        assert not (shown.rgb.requires_grad or shown.coverage.requires_grad or shown.vertices.requires_grad)
+        assert not any(value.requires_grad for value in shown.material.values())
         assert it.loss == pytest.approx(sum(it.weights[name] * value for name, value in it.terms.items()), rel=1e-5)
     assert count == 4 and list(fit) == []
-    size = np.linalg.norm(it.vertices.numpy() - fit.ring.center.numpy(), axis=1)
+    size = np.linalg.norm(it.prediction.vertices.numpy() - fit.ring.center.numpy(), axis=1)
     assert size.min() > 10 and size.max() < 60  # scene units, about the object
 
 
 def test_presets_change_and_weights_that_are_not_given_stay():
     fast = mi_ring.Config.preset("fast", weights={"mask": 10.0})
-    off = dict.fromkeys(("normal_variation", "material_variation", "material_rank"), 0.0)
+    off = dict.fromkeys(("normal_variation", "material_rank"), 0.0)
     weights = {"rgb": 1.0, "mask": 10.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03} | off
     assert fast.iterations == 140 and fast.weights == weights
     assert mi_ring.Config(weights={"mask": 10.0}).weights == fast.weights
@@ -106,7 +109,7 @@ def test_own_terms_have_weights_schedules_and_entries_in_the_log(capture, tmp_pa
 
     def size(it):
         seen.append(it.number)
-        return (it.vertices - it.fit.ring.center).square().sum(1).mean()
+        return (it.prediction.vertices - it.context.model.ring.center).square().sum(1).mean()
 
     terms = {
         "rgb": mi_ring.default_terms["rgb"],
@@ -140,8 +143,8 @@ def test_previews_at_any_time_change_nothing(capture):
     plain, pictures = losses(capture), []
 
     def look(it):
-        pictures.append(it.fit.preview(k=it.number, width=28, level=4))
-        pictures.append(it.fit.preview(level=1))
+        pictures.append(fit.preview(k=it.number, width=28, level=4))
+        pictures.append(fit.preview(level=1))
 
     fit = mi_ring.Fit(capture, config(), callbacks=[look])
     fit.preview()
@@ -155,7 +158,8 @@ def test_previews_at_any_time_change_nothing(capture):
 
 
 def test_a_preview_from_within_a_term_is_an_error_and_no_crash(capture):
-    fit = mi_ring.Fit(capture, config(), terms={"bad": lambda it: it.fit.preview() is None or it.predicted.mean()})
+    terms = {"bad": lambda it: fit.preview() is None or it.prediction.rgb.mean()}
+    fit = mi_ring.Fit(capture, config(), terms=terms)
     with pytest.raises(RuntimeError, match="written again"):
         next(iter(fit))
     assert fit.preview().max() > 0
@@ -165,7 +169,7 @@ def test_networks_of_ones_own_are_fitted_saved_and_used(capture, tmp_path):
     from mi_ring import export, render
 
     fit = mi_ring.Fit(capture, config(weights={"velocity": 0.1}), networks=(Siren(width=24), Grey()))
-    assert float(fit.ring.brdf_net.scale) == pytest.approx(fit.albedo / np.pi)  # as bright as the photographs
+    assert float(fit.ring.brdf_net.scale) == pytest.approx(fit.model.albedo / np.pi)  # as bright as the photographs
     first, *_, last = fit
     assert "velocity" in last.terms and all(np.isfinite(it.loss) for it in (first, last))
     fit.save(tmp_path / "mine")
@@ -269,7 +273,7 @@ def test_what_was_frozen_stays_so(capture):
     before = [p.detach().clone() for p in shape_net.parameters()]
     fit = mi_ring.Fit(capture, config(), networks=(shape_net, brdf_net))
     list(fit)
-    assert fit.given is capture and not frozen.requires_grad
+    assert fit.problem.given is capture and not frozen.requires_grad
     moved = [not torch.equal(p, q) for p, q in zip(shape_net.parameters(), before)]
     assert not moved[0] and any(moved[1:])
 

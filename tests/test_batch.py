@@ -18,7 +18,7 @@ import pytest
 
 from mi_ring import batch
 from mi_ring.collection import fits
-from mi_ring.collection.jobs import Job, Record, jobs_of
+from mi_ring.collection.jobs import Job, Record, make_jobs
 from mi_ring.errors import InputError
 from mi_ring.output import results
 from mi_ring.output.index import Entry, write_index
@@ -84,7 +84,7 @@ def test_a_disk_that_is_full_for_a_while_does_not_end_a_batch(job, monkeypatch):
 
     def fit_all(todo, resources, retries, look):
         for state in ("running", "done"):
-            job.note(dataclasses.replace(job.record, state=state))
+            job.save(dataclasses.replace(job.record, state=state))
             look()
 
     monkeypatch.setattr(batch, "fit_all", fit_all)
@@ -95,7 +95,7 @@ def test_a_disk_that_is_full_for_a_while_does_not_end_a_batch(job, monkeypatch):
 @needs_ray
 def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
     def fit_all(todo, resources, retries, look):
-        job.note(dataclasses.replace(job.record, state="running", tries=9))
+        job.save(dataclasses.replace(job.record, state="running", tries=9))
         try:
             signal.raise_signal(signal.SIGTERM)
         except KeyboardInterrupt:
@@ -108,7 +108,7 @@ def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
     handler = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt) as stop:
         batch.main(arguments)
-    assert command.status_of(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
+    assert command.exit_status(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
     said = capsys.readouterr()
     assert "wrong: failed: " in said.out and said.err.endswith("interrupted; the same command goes on\n")
     page = (job.folder.parent / "index.html").read_text()
@@ -161,7 +161,7 @@ def test_paths_in_options_are_those_of_where_the_batch_was_begun(small_capture, 
     """A worker of a cluster is elsewhere."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    (job,) = jobs_of([small_capture], tmp_path / "out", ["--domain", "mesh", "ball.ply"])
+    (job,) = make_jobs([small_capture], tmp_path / "out", ["--domain", "mesh", "ball.ply"])
     before = job.fingerprint()
     (tmp_path / "here/ball.ply").write_text("ply")
     monkeypatch.chdir(tmp_path)
@@ -171,7 +171,7 @@ def test_paths_in_options_are_those_of_where_the_batch_was_begun(small_capture, 
 
 
 def test_what_a_fit_prints_is_told_while_it_goes_on(small_capture, tmp_path):
-    (job,) = jobs_of([small_capture], tmp_path, [])
+    (job,) = make_jobs([small_capture], tmp_path, [])
     job.output.parent.mkdir(parents=True)
     told = []
 
@@ -184,12 +184,12 @@ print("one", "tw", sep=chr(13), end="", flush=True)
 while not pathlib.Path("heard").exists():
     time.sleep(.01)
 print("o")"""
-    job = dataclasses.replace(job, place=tmp_path)
+    job = dataclasses.replace(job, cwd=tmp_path)
     assert fits.run([sys.executable, "-c", text], job, tell) == (0, "two") and told == ["one", "two"]
 
 
 def test_a_fit_ends_with_who_waits_for_it(small_capture, tmp_path):
-    (job,) = jobs_of([small_capture], tmp_path, [])
+    (job,) = make_jobs([small_capture], tmp_path, [])
     job.output.parent.mkdir(parents=True)
 
     def tell(line):
@@ -204,9 +204,9 @@ def test_a_fit_ends_with_who_waits_for_it(small_capture, tmp_path):
 
 def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_path):
     with pytest.raises(InputError, match=r"small\.xml: is given twice"):
-        jobs_of([small_capture, small_capture], tmp_path, [])
+        make_jobs([small_capture, small_capture], tmp_path, [])
     with pytest.raises(InputError, match=r"small\.xml: its results would go to .*small, where .*small\.xml is to be"):
-        jobs_of([small_capture, broken_capture[0]], tmp_path, [])
+        make_jobs([small_capture, broken_capture[0]], tmp_path, [])
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -219,7 +219,7 @@ def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_
 ])  # fmt: skip
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(batch, "jobs_of", lambda scenes, *_: [Job(scene, tmp_path) for scene in scenes])
+    monkeypatch.setattr(batch, "make_jobs", lambda scenes, *_: [Job(scene, tmp_path) for scene in scenes])
     with pytest.raises(InputError, match=re.escape(words)):
         batch.main(arguments)
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Gradients of `bridge.render` against central finite differences with the same seed."""
+"""Gradients of `prediction.render` against central finite differences with the same seed."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -13,9 +13,11 @@ import torch
 import trimesh
 
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.rendering import bridge, photographs
+from mi_ring.rendering import photographs, prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene import assembly
 from mi_ring.system import machine
 
@@ -44,9 +46,9 @@ class Setting:
         ball = {"type": "shapenet", "id": "ball", "subdivisions": 3, "bsdf": {"type": "cooktorrance"}}
         self.scene = mi.load_dict({"type": "scene", "ball": ball, **({"wall": WALL} if wall else {}), **sensors})
         shape = next(s for s in self.scene.shapes() if s.id() == "ball")
-        self.surface = bridge.Surface(self.scene, shape)
+        self.surface = Surface(self.scene, shape)
         harmonics = np.random.default_rng(9).normal(0, 0.4, (BASIS, 3)) if room else None
-        self.photographs = Photographs.of(self.scene.sensors(), harmonics)
+        self.photographs = Photographs.of([sensor.shot for sensor in self.scene.sensors()], harmonics)
         ico = trimesh.creation.icosphere(subdivisions=3)
         self.s, self.faces = ico.vertices, ico.faces
         self.surface.set_faces(self.faces)
@@ -80,7 +82,7 @@ class Setting:
         }  # fmt: skip
 
     def losses(self, vertices, material, spp, seed):
-        rgb, alpha = bridge.render(self.surface, self.photographs, vertices, material, spp, seed, self.shadows)
+        rgb, alpha = prediction.render(self.surface, self.photographs, vertices, material, spp, seed, self.shadows)
         return (self.radiance_weight * rgb).sum(), (self.coverage_weight * alpha).sum()
 
 
@@ -209,9 +211,9 @@ def test_gradients_do_not_depend_on_the_unit_of_length():
 def test_pictures_do_not_depend_on_whether_gradients_are_wanted():
     setting = Setting(**SETTINGS["light off the camera"])
     args = setting.surface, setting.photographs
-    with_gradients = bridge.render(*args, setting.vertices.clone().requires_grad_(), setting.material, 4, 9)
-    plain = bridge.render(*args, setting.vertices, setting.material, 4, 9)
-    drawn = bridge.draw(*args, 4, 9)
+    with_gradients = prediction.render(*args, setting.vertices.clone().requires_grad_(), setting.material, 4, 9)
+    plain = prediction.render(*args, setting.vertices, setting.material, 4, 9)
+    drawn = prediction.draw(*args, 4, 9)
     for a, b, c in zip(with_gradients, plain, drawn):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(b.cpu(), c, rtol=0, atol=0)
@@ -240,7 +242,7 @@ def test_new_faces_come_with_new_vertices_and_attributes():
         setting.surface.set_faces(ico.faces)
         material = {"diffuse": full((count, 3), 0.4), "specular": full((count,), 0.1), "roughness": full((count,), 0.4)}
         args = setting.surface, setting.photographs, tensor(CENTER + 0.8 * ico.vertices), material
-        pictures.append(bridge.render(*args, 64, 4, False))
+        pictures.append(prediction.render(*args, 64, 4, False))
     (coarse, coarse_alpha), (fine, fine_alpha) = pictures
     # An icosphere of level 3 lies inside the ball by up to 1 % of its radius, which is 8 px.
     assert (coarse_alpha - fine_alpha).abs().max() < 0.2
@@ -263,8 +265,8 @@ def test_nothing_is_compiled_and_nothing_kept_after_the_first_iterations():
             vertices = (setting.vertices + tensor(random.normal(scale=0.01, size=(642, 3)))).requires_grad_()
             material = {key: m.clone().requires_grad_() for key, m in setting.material.items()}
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-                rgb, alpha = bridge.render(setting.surface, setting.photographs, vertices, material, 1, seed)
-                rgb = rgb + bridge.surroundings(setting.surface, setting.photographs, alpha, seed).interreflection
+                rgb, alpha = prediction.render(setting.surface, setting.photographs, vertices, material, 1, seed)
+                rgb = rgb + GlobalIllumination.of(setting.surface, setting.photographs, alpha, seed).interreflection
                 (rgb.sum() + alpha.sum()).backward()
                 compiled += sum(not k["cache_hit"] for k in dr.kernel_history([dr.KernelType.JIT]))
         return compiled
@@ -279,7 +281,7 @@ def test_a_second_backward_pass_of_a_picture_is_refused():
     """Dr.Jit's graph is used up by the first: the second would return the first gradient, whatever it was asked for."""
     setting = Setting(OFF_CAMERA, shadows=True)
     vertices = setting.vertices.clone().requires_grad_()
-    rgb, _ = bridge.render(setting.surface, setting.photographs, vertices, setting.material, spp=1)
+    rgb, _ = prediction.render(setting.surface, setting.photographs, vertices, setting.material, spp=1)
     loss = rgb.sum()
     loss.backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="a second time; render it again"):
@@ -295,23 +297,25 @@ def test_vertices_that_do_not_go_with_the_triangles_are_refused():
         (setting.vertices, setting.material | {"diffuse": tensor(np.ones((642, 5)))}, "attribute diffuse"),
     ):
         with pytest.raises(ValueError, match=words):
-            bridge.render(setting.surface, setting.photographs, vertices, material)
+            prediction.render(setting.surface, setting.photographs, vertices, material)
 
 
 def test_pictures_in_chunks_are_those_in_one(monkeypatch):
     """Bit for bit, however the pixels of several photographs are shared out."""
     setting = Setting(OFF_CAMERA, shadows=True)
     setting.surface.write(setting.vertices, setting.material)
-    one = [*bridge.draw(setting.surface, setting.photographs, spp=6, seed=3)]
-    one.append(bridge.maps(setting.surface, setting.photographs))
-    launched, genuine = [], bridge.render_photographs
-    monkeypatch.setattr(bridge, "render_photographs", lambda *a, **k: launched.append(k["pixels"]) or genuine(*a, **k))
+    one = [*prediction.draw(setting.surface, setting.photographs, spp=6, seed=3)]
+    one.append(prediction.maps(setting.surface, setting.photographs))
+    launched, genuine = [], prediction.render_photographs
+    monkeypatch.setattr(
+        prediction, "render_photographs", lambda *a, **k: launched.append(k["pixels"]) or genuine(*a, **k)
+    )
     monkeypatch.setattr(photographs, "LANES", 6 * 400 + 5)
-    rgb, coverage = bridge.draw(setting.surface, setting.photographs, spp=6, seed=3)
+    rgb, coverage = prediction.draw(setting.surface, setting.photographs, spp=6, seed=3)
     assert launched == [(0, 400), (400, 800), (800, 1200), (1200, 1600), (1600, 2 * WIDTH * HEIGHT)]
     assert torch.equal(rgb, one[0]) and torch.equal(coverage, one[1]) and rgb.max() > 0
     monkeypatch.setattr(photographs, "LANES", 400)
-    again = bridge.maps(setting.surface, setting.photographs)
+    again = prediction.maps(setting.surface, setting.photographs)
     assert all(np.array_equal(again[name], values) for name, values in one[2].items())
 
 
@@ -321,7 +325,7 @@ def test_a_surface_of_a_ring_leaves_the_scene_as_it_was():
     shape = setting.surface.shape
     before, bsdf = np.array(shape.vertex_positions_buffer()), shape.bsdf()
     ring = FittedObject([0.3, -0.2, 0.15], 0.8, scale=0.2)
-    surface = bridge.Surface(setting.scene, shape, ring)
+    surface = Surface(setting.scene, shape, ring)
     surface.show(ring, *ring.domain.sample(2))
     assert np.array_equal(np.array(shape.vertex_positions_buffer()), before) and shape.bsdf() is bsdf
     assert [s.id() for s in surface.scene.shapes()] == [s.id() for s in setting.scene.shapes()]
@@ -338,7 +342,7 @@ def test_distant_emitters_of_a_surface_are_beyond_all_of_it(light):
     shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
     center, radius = np.array([400.0, -150.0, 90.0]), 700.0  # the origin is within
     ring = FittedObject(center, radius)
-    surface = bridge.Surface(assembly.assembled([shape], [emitter]), shape, ring)
+    surface = Surface(assembly.assembled([shape], [emitter]), shape, ring)
     surface.show(ring, *ring.domain.sample(2))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p = mi.Point3f(0.5 / surface.unit)

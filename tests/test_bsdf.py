@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from mi_ring.plugins.cooktorrance import CookTorrance, cosine_shares
+from mi_ring.plugins.cooktorrance import CookTorrance, cosine_factors
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.system import machine
 
@@ -560,5 +560,5 @@ def test_lobes_reflect_harmonics_as_samples_do(distribution, roughness, cosine):
 
 def test_a_matte_surface_reflects_harmonics_by_the_known_factors():
     """Ramamoorthi and Hanrahan 2001, table of A_l: π, 2π/3, π/4, 0, −π/24, 0, π/64."""
-    shares = cosine_shares(6)
+    shares = cosine_factors(6)
     np.testing.assert_allclose(shares, np.pi * np.array([1, 2 / 3, 1 / 4, 0, -1 / 24, 0, 1 / 64]), atol=1e-12)

@@ -16,7 +16,7 @@ from mi_ring.fitting import budget
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.lighting import Lighting
-from mi_ring.fitting.schedule import Stage, stages_of
+from mi_ring.fitting.schedule import Schedule, Stage
 from mi_ring.output.results import read_log
 from mi_ring.system.machine import threads_of
 
@@ -27,18 +27,18 @@ CHOICE = [Config.preset(name) for name in ("fast", "default", "fine")]
 def test_seconds_are_those_of_the_stages():
     """Of 100 iterations from a sphere 60 are at level 4 and 40 at level 5; what is around them takes 40 of these."""
     config = Config(iterations=100, levels=(4, 5), widths=(128, 256), shares=(0.6, 0.4))
-    assert budget.seconds_of(config, stages_of, COSTS) == pytest.approx(60 * 0.25 + 80 * 1.0)
+    assert budget.seconds_of(config, Schedule.of, COSTS) == pytest.approx(60 * 0.25 + 80 * 1.0)
     # From a hull two thirds of the first 60 are exchanged for 40 % as many of the second: 20 and 56.
-    assert budget.seconds_of(config, partial(stages_of, near=True), COSTS) == pytest.approx(20 * 0.25 + 96 * 1.0)
+    assert budget.seconds_of(config, partial(Schedule.of, near=True), COSTS) == pytest.approx(20 * 0.25 + 96 * 1.0)
 
 
 @pytest.mark.parametrize("near, settling", [(False, False), (True, False), (True, True)])
 def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near, settling):
-    stages_by = partial(stages_of, near=near, settling=settling)
+    plan = partial(Schedule.of, near=near, settling=settling)
     subdivisions, iterations = [], []
     for seconds in (60, 100, 150, 300, 900, 3000, 9000):
-        config = budget.fitting_into(seconds, CHOICE, stages_by, COSTS)
-        taken = budget.seconds_of(config, stages_by, COSTS)
+        config = budget.fitting_into(seconds, CHOICE, plan, COSTS)
+        taken = budget.seconds_of(config, plan, COSTS)
         assert taken <= 1.05 * seconds and taken > 0.9 * seconds
         subdivisions.append(len(config.levels))
         iterations.append((config.levels[-1], config.shares[-1], config.iterations))
@@ -47,7 +47,7 @@ def test_the_time_is_used_and_kept_to_and_more_of_it_means_a_finer_preset(near, 
 
 
 def test_there_is_a_least_number_of_iterations():
-    assert budget.fitting_into(0.1, CHOICE, stages_of, COSTS).iterations == budget.FEWEST
+    assert budget.fitting_into(0.1, CHOICE, Schedule.of, COSTS).iterations == budget.FEWEST
 
 
 def test_measuring_changes_nothing_of_the_fit(small_capture):
@@ -63,7 +63,7 @@ def test_measuring_changes_nothing_of_the_fit(small_capture):
                 assert costs.keys() == {(2, 28), (3, 56)} and all(0 < s < math.inf for s in costs.values())
             for _ in range(3):
                 fit.step()
-        assert fit.iteration == 3 and fit.log == []
+        assert fit.iteration == 3 and fit.course.log == []
         weights.append(list(fit.ring.parameters()))
     assert all(map(torch.equal, *weights))
 
@@ -74,7 +74,7 @@ def test_what_settles_is_timed_like_what_shapes(small_capture, monkeypatch):
     fit, timed = Fit(load_capture(small_capture), config, lighting=Lighting("environment")), []
     step = Fit.step
     monkeypatch.setattr(Fit, "step", lambda trial: timed.append(step(trial).stage.settles))
-    assert fit.stages[-1].settles
+    assert fit.schedule.stages[-1].settles
     budget.measure(fit, budget.all_stages(fit, [config]))
     assert timed and not any(timed)
 
@@ -84,7 +84,7 @@ def test_an_iteration_is_timed_twice_on_the_same_photographs(small_capture, monk
     config = Config(iterations=4, levels=(2,), widths=(28,), shares=(1,), domain="sphere", batch=4)
     fit, seen = Fit(load_capture(small_capture), config), []
     step = Fit.step
-    monkeypatch.setattr(Fit, "step", lambda trial: seen.append(tuple(step(trial).index)))
+    monkeypatch.setattr(Fit, "step", lambda trial: seen.append(tuple(step(trial).batch.photographs)))
     budget.measure(fit, [Stage(2, 28, 0, 1)])
     assert len(seen) == 2 and seen[0] == seen[1] and len(set(seen[0])) == 4
     assert budget.measure(fit, [Stage(2, 28, 0, 1)], interrupted=lambda: len(seen) == 3) == {} and len(seen) == 3
@@ -96,7 +96,7 @@ SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "
 def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):
     """At 0.5 s an iteration 20 of 60 s are for pictures and results, and 80 iterations are left."""
     monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
-    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0, perf_counter=lambda: 0.0))
     call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
     with pytest.raises(InputError, match="is 0.5, too few for a fit of this capture on this machine; give 0.8 or more"):
         command.main([*call[:-1], "0.5"])  # 40 iterations, and what takes as long: 40 s, and a fifth more

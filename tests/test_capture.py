@@ -1,6 +1,7 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
 import shutil
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -11,7 +12,7 @@ from conftest import AXES, CENTER
 from PIL import Image
 
 from mi_ring import images
-from mi_ring.capture import capture, decoding, loading
+from mi_ring.capture import decoding, loading, observation
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import fitted_scene_xml
 from mi_ring.errors import InputError
@@ -20,7 +21,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.importers.reading import pixels_of
 from mi_ring.objects.ring_file import load_fit, ring_state
-from mi_ring.rendering import bridge
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.files import write_state
 
 
@@ -136,7 +137,7 @@ def test_a_shape_needs_no_id(broken_capture):
     path, edit = broken_capture
     edit(' id="object"', "")
     scene = loading.load_capture(path)
-    bridge.Surface(scene.scene, scene.shape)
+    Surface(scene.scene, scene.shape)
 
 
 def test_declared_encoding_beats_the_default(broken_capture):
@@ -165,12 +166,12 @@ def test_shrinking_averages_blocks(small_capture):
 def decodes(monkeypatch):
     """How many photographs have been decoded."""
     calls, decode = [], decoding.decode
-    monkeypatch.setattr(capture, "decode", lambda *args: calls.append(None) or decode(*args))
+    monkeypatch.setattr(observation, "decode", lambda *args: calls.append(None) or decode(*args))
     return lambda: len(calls)
 
 
 def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypatch, decodes):
-    monkeypatch.setattr(capture, "REMEMBERED_PIXELS", 3 * 28 * 20 + 7)
+    monkeypatch.setattr(observation, "REMEMBERED_PIXELS", 3 * 28 * 20 + 7)
     scene = loading.load_capture(small_capture)
     first = scene.observe([5, 2, 9, 4], 2)
     again = scene.observe([4, 9, 5], 2)
@@ -229,7 +230,7 @@ def test_pixels_are_kept_as_many_as_fit_and_shared(monkeypatch):
 
 def test_pixels_may_be_replaced_by_arrays(small_capture):
     scene = loading.load_capture(small_capture)
-    scene.images = [image[..., ::-1].copy() for image in scene.images]
+    scene = replace(scene, images=Pixels.of([image[..., ::-1].copy() for image in scene.images]))
     part = scene.part([3, 1])
     np.testing.assert_array_equal(part.images[0][..., ::-1], loading.load_capture(small_capture).images[3])
     torch.testing.assert_close(part.observe([0])[0], scene.observe([3])[0])

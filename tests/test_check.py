@@ -154,7 +154,7 @@ def test_cameras_that_look_away(broken_capture, tmp_path, capsys):
 
 def test_more_photographs_than_the_hull_is_made_of(broken_capture, tmp_path, capsys, monkeypatch):
     path, _ = broken_capture
-    monkeypatch.setattr(hull, "MOST", 5)
+    monkeypatch.setattr(hull, "MAX_MASKS", 5)
     edit_images(path, lambda mask: np.roll(mask, 9, 1), "masks", "008")
     status, text = run(path, tmp_path, capsys)
     assert status == 1 and "To mend: 008.png: the others agree to" in text, text

@@ -2,7 +2,6 @@
 
 import json
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -36,10 +35,10 @@ def by_hand(R, t, calibration=K):
     return x[:, :2] / x[:, 2:]
 
 
-def in_scene(sensor):
+def in_scene(shot):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    lens = sensor.focal, sensor.centre, None
-    x, depth = pinhole.project(sensor.to_world.matrix, *lens, mi.Point3f(POINTS.T.astype("f4")))
+    lens = mi.Point2f(shot.camera.focal), mi.Point2f(shot.camera.centre), None
+    x, depth = pinhole.project(mi.Matrix4f(shot.camera.to_world), *lens, mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T
 
@@ -93,16 +92,16 @@ def diligent(tmp_path):
 
 def test_diligent_mv(diligent, tmp_path):
     scene = converted("diligent-mv", diligent, tmp_path / "bear.xml", "--views", 1, 3, "--lights", 2, 4)
-    assert [s.id() for s in scene.sensors] == ["01_002", "01_004", "03_002", "03_004"]
+    assert [shot.name for shot in scene.shots] == ["01_002", "01_004", "03_002", "03_004"]
     poses = list(cameras())
-    for sensor, (view, light) in zip(scene.sensors, [(0, 1), (0, 3), (2, 1), (2, 3)]):
+    for shot, (view, light) in zip(scene.shots, [(0, 1), (0, 3), (2, 1), (2, 3)]):
         R, t = poses[view]
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t) + 0.5, atol=0.01)  # Bouguet: integers are centres
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t) + 0.5, atol=0.01)  # Bouguet: integers are centres
         # The light in the camera's axes x right, y up, z back, from the surface to the light.
         towards = R.T @ (DIRECTIONS[light] * [1, -1, -1])
-        ds, irradiance = sensor.light.sample_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0))
-        np.testing.assert_allclose(np.ravel(ds.d), towards / np.linalg.norm(towards), atol=1e-5)
-        np.testing.assert_allclose(np.ravel(irradiance), INTENSITIES[light], rtol=1e-5)
+        assert shot.light.kind == "directional"
+        np.testing.assert_allclose(shot.light.vector, -towards / np.linalg.norm(towards), atol=1e-5)
+        np.testing.assert_allclose(shot.light.rgb, INTENSITIES[light], rtol=1e-5)
     # A camera's photographs share one mask; what is called alike is told apart by its folder.
     assert scene.masks[0] is scene.masks[1] and scene.masks[1] is not scene.masks[2]
     assert scene.names[1:3] == ["view_01/004.png", "view_03/002.png"]
@@ -152,8 +151,8 @@ def test_transforms_of_nerf(tmp_path):
     scene = converted("transforms", source, tmp_path / "nerf.xml")
     f = 0.5 * W / np.tan(angle / 2)
     calibration = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
-    for sensor, (R, t) in zip(scene.sensors, cameras()):
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
+    for shot, (R, t) in zip(scene.shots, cameras()):
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t, calibration), atol=0.01)
     lights = scene.photographs.lights
     R, t = list(cameras())[2]
     np.testing.assert_allclose(lights.positions(), [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
@@ -178,8 +177,8 @@ def test_transforms_of_nerfstudio(tmp_path):
         write(source / f"masks/{k}.png", disc())
     scene = converted("transforms", source / "transforms.json", tmp_path / "studio.xml", "--encoding", "linear")
     own = [K, np.array([[71.0, 0, 30], [0, 76, 27.25], [0, 0, 1]]), np.array([[80.0, 0, 20], [0, 81, 21], [0, 0, 1]])]
-    for sensor, (R, t), calibration in zip(scene.sensors, cameras(), own):
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t, calibration), atol=0.01)
+    for shot, (R, t), calibration in zip(scene.shots, cameras(), own):
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t, calibration), atol=0.01)
     assert (scene.masks[1] == disc()[..., 0]).all()
     np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
     assert not (tmp_path / "studio/masks").exists()
@@ -228,7 +227,7 @@ def test_distortion_is_undone(tmp_path, model, terms):
         assert (near * x).sum() / near.sum() == pytest.approx(u, abs=0.03)
         assert (near * y).sum() / near.sum() == pytest.approx(v, abs=0.03)
         assert scene.masks[0][int(v), int(u)] == 255
-    np.testing.assert_allclose(np.ravel(scene.sensors[0].focal), f)
+    np.testing.assert_allclose(scene.shots[0].camera.focal, f)
     assert scene.images[0].dtype == np.uint16  # all bits are kept
 
 
@@ -236,7 +235,7 @@ def test_a_fisheye_without_coefficients_is_no_pinhole(tmp_path):
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "camera_model": "OPENCV_FISHEYE"}
     source = transforms(tmp_path / "data", top, [{"file_path": "a.png"}], lambda k: noise(np.uint8))
     scene = converted("transforms", source, tmp_path / "lens.xml")
-    assert scene.sensors[0].filename.parts[-3:] == ("lens", "images", "a.png")  # written anew: straightened
+    assert scene.shots[0].files.filename.parts[-3:] == ("lens", "images", "a.png")  # written anew: straightened
 
 
 @pytest.mark.parametrize("scene", ["pot.xml", "pot/scene.xml"])
@@ -309,8 +308,8 @@ def test_colmap(colmap, tmp_path, model):
     scene = converted("colmap", colmap / model, tmp_path / "scan.xml", "--masks", colmap / "masks",
                       "--flash-offset", *offset, "--copy")  # fmt: skip
     lights = scene.photographs.lights
-    for sensor, place, (R, t) in zip(scene.sensors, lights.positions(), cameras()):
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
+    for shot, place, (R, t) in zip(scene.shots, lights.positions(), cameras()):
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t), atol=0.01)
         np.testing.assert_allclose(place, R.T @ (offset - t), rtol=1e-4)
     # exposure time · ISO: 1/50 · 100, 1/100 · 400, 1/150 · 900; brought to the median
     np.testing.assert_allclose(lights.rgb()[:, 0], [0.5, 1.0, 1.5], rtol=1e-5)
@@ -324,7 +323,7 @@ def test_a_model_that_keeps_its_reader_busy_for_ever_is_refused(colmap, tmp_path
     content = bytearray(path.read_bytes())
     content[5] = 1
     path.write_bytes(content)
-    monkeypatch.setattr(foreign, "PATIENCE", 3.0)
+    monkeypatch.setattr(foreign, "READ_SECONDS", 3.0)
     with pytest.raises(InputError, match="not a COLMAP model, or damaged"):
         convert.main(["colmap", str(path.parent), str(tmp_path / "scan.xml"), "--images", str(colmap / "images")])
     assert not (tmp_path / "scan.xml").exists()
@@ -379,8 +378,8 @@ def neus(folder, scale=6.0, **more):
 
 def test_neus(tmp_path):
     scene = converted("neus", neus(tmp_path / "dtu"), tmp_path / "dtu.xml")
-    for sensor, (R, t) in zip(scene.sensors, cameras()):
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t) + 0.5, atol=0.01)  # integers are pixels' centres
+    for shot, (R, t) in zip(scene.shots, cameras()):
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t) + 0.5, atol=0.01)  # integers are pixels' centres
     assert (scene.masks[0] == disc()[..., 0]).all()
     assert [image.dtype for image in scene.images] == [np.uint8] * 3  # sRGB, unless they say otherwise
 
@@ -389,11 +388,11 @@ def test_wildlight(tmp_path):
     """Energies are for the unit sphere, radiance is linear, photographs without flash are left out."""
     energies = {"light_energy_0": [2.0, 3.0, 4.0], "light_energy_1": [0.0, 0, 0], "light_energy_2": [1.0, 1.0, 1.0]}
     scene = converted("neus", neus(tmp_path / "wild", max_intensity=0.9, **energies), tmp_path / "wild.xml")
-    assert [s.id() for s in scene.sensors] == ["000", "002"]
+    assert [shot.name for shot in scene.shots] == ["000", "002"]
     lights = scene.photographs.lights
     np.testing.assert_allclose(lights.rgb(), 36 * np.array([[2, 3, 4], [1, 1, 1]]), rtol=1e-6)
     np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
-    assert scene.sensors[0].saturation == pytest.approx(0.9)
+    assert scene.shots[0].saturation == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize("names", ["{:03}", "IMG_{}"])
@@ -405,7 +404,7 @@ def test_photographs_of_neus_may_be_numbered_otherwise(tmp_path, names):
             (source / f"{folder}/{k:03}.png").rename(source / f"{folder}/{names.format(k + 7)}.png")
     scene = converted("neus", source, tmp_path / "dtu.xml")
     for k, (R, t) in enumerate(cameras()):
-        np.testing.assert_allclose(in_scene(scene.sensors[k]), by_hand(R, t) + 0.5, atol=0.01)
+        np.testing.assert_allclose(in_scene(scene.shots[k]), by_hand(R, t) + 0.5, atol=0.01)
         assert (scene.images[k] == noise(np.uint8, seed=k)[..., :3]).all()
 
 
@@ -415,7 +414,7 @@ def test_wildlight_photographs_in_one_array(tmp_path):
     np.save(source / "images.npy", stack)
     scene = converted("neus", source, tmp_path / "wild.xml")
     np.testing.assert_allclose(scene.observe([2])[0][0], stack[2], rtol=1e-3)
-    assert scene.sensors[0].saturation == pytest.approx(7)
+    assert scene.shots[0].saturation == pytest.approx(7)
 
 
 # IRON
@@ -435,8 +434,8 @@ def iron(folder, edit=lambda dictionary: None):
 
 def test_iron(tmp_path):
     scene = converted("iron", iron(tmp_path / "dragon"), tmp_path / "iron.xml")
-    for sensor, (R, t) in zip(scene.sensors, cameras()):
-        np.testing.assert_allclose(in_scene(sensor), by_hand(R, t), atol=0.01)
+    for shot, (R, t) in zip(scene.shots, cameras()):
+        np.testing.assert_allclose(in_scene(shot), by_hand(R, t), atol=0.01)
     np.testing.assert_allclose(scene.observe([1])[0][0], noise(np.uint8, seed=1), rtol=1e-3)
 
 
@@ -593,9 +592,9 @@ def test_both_formats_of_a_capture_agree(shared, tmp_path, name):
         converted("transforms", folder, tmp_path / "a.xml"),
         loading.load_capture(folder / "scene.xml", images=False),
     )
-    for a, b in zip(ours.sensors, theirs.sensors):
-        np.testing.assert_allclose(np.array(a.to_world.matrix), np.array(b.to_world.matrix), rtol=1e-4, atol=1e-5)
-        assert a.filename.resolve() == b.filename.resolve()
+    for a, b in zip(ours.shots, theirs.shots):
+        np.testing.assert_allclose(a.camera.to_world, b.camera.to_world, rtol=1e-4, atol=1e-5)
+        assert a.files.filename.resolve() == b.files.filename.resolve()
     for a, b in zip(ours.photographs.lights, theirs.photographs.lights, strict=True):
         assert a.kind == b.kind
         np.testing.assert_allclose(a.vector, b.vector, rtol=1e-4)

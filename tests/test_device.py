@@ -12,8 +12,8 @@ from torch.nn import functional as F
 import mi_ring
 from mi_ring import fit
 from mi_ring.errors import InputError
-from mi_ring.fitting.optimizers import optimizers_of
-from mi_ring.fitting.terms import mask_loss, rgb_loss, velocity_loss
+from mi_ring.fitting.losses import mask_loss, rgb_loss, velocity_loss
+from mi_ring.fitting.optimisation import network_steppers
 from mi_ring.nets.brdf_net import BRDFNet
 from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.rendering import bridge
@@ -75,8 +75,8 @@ def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, bf16, name, tol
             assert torch.is_autocast_enabled("cpu") == used
         # Muon never where the processor is slower with it.
         networks = mi_ring.FittedObject(torch.zeros(3), 1.0)
-        _, muon = optimizers_of(networks, mi_ring.Config(precision=precision), torch.device("cpu"))
-        assert muon.dtype == (torch.bfloat16 if expected and precision != "float32" else torch.float32)
+        _, muon = network_steppers(networks, mi_ring.Config(precision=precision), torch.device("cpu"))
+        assert muon.optimizer.dtype == (torch.bfloat16 if expected and precision != "float32" else torch.float32)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without GPU")

@@ -20,6 +20,7 @@ import pytest
 import torch
 import trimesh
 
+import mi_ring
 from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
 from mi_ring.objects.fitted_object import FittedObject
@@ -28,6 +29,7 @@ from mi_ring.plugins import cooktorrance, flash, merl, photograph, photometric, 
 from mi_ring.rendering.measured_brdf import LAYERS
 
 ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(path.relative_to(ROOT / "docs") for path in (ROOT / "docs").glob("*/*.md"))  #: the four parts
 
 
 def plugins():
@@ -69,14 +71,14 @@ def text_of(page: Path) -> str:
 
 @pytest.mark.parametrize("name", plugins())
 def test_every_plugin_has_its_page(built, name):
-    text = text_of(built / "plugins" / f"{name}.html")
+    text = text_of(built / "reference" / "plugins" / f"{name}.html")
     first = inspect.getdoc(plugins()[name]).split("\n")[0]
     assert squeezed(first.replace("`", "")) in text
     assert f"({name})" in text and f'"{name}"' in text  # the heading, a snippet
 
 
 def test_every_command_has_its_help_on_the_page(built):
-    text = text_of(built / "commands.html")
+    text = text_of(built / "reference" / "commands.html")
     for name in __main__.COMMANDS:
         usage, sentence = __main__.summary(name)
         assert squeezed(usage) in text and squeezed(sentence.replace("`", "")) in text
@@ -86,17 +88,86 @@ def test_every_command_has_its_help_on_the_page(built):
 
 
 def test_all_modules_of_the_rooms_are_on_the_python_page(built):
-    page = (built / "api.html").read_text("utf-8")
+    page = (built / "reference" / "api.html").read_text("utf-8")
     plugins = ROOT / "mi_ring" / "plugins"  # have pages of their own
     modules = [path for path in (ROOT / "mi_ring").glob("*/*.py") if path.stem != "__init__" and path.parent != plugins]
     for path in modules:
         assert f'id="module-mi_ring.{path.parent.name}.{path.stem}"' in page
-    assert len(modules) > 50 and 'id="module-mi_ring.errors"' in page and "mi_ring.load_capture" in page
+    assert len(modules) > 50 and 'id="module-mi_ring.errors"' in page
+    assert all(f'id="mi_ring.{name}"' in page for name in mi_ring._API)
 
 
-def test_the_readme_leads_to_pages(built):
-    page = (built / "guide.html").read_text("utf-8")
-    assert all(f'href="{name}.html"' in page for name in ("performance", "gradients", "reflectance", "light"))
+def test_the_first_page_leads_to_all_pages(built):
+    page = (built / "index.html").read_text("utf-8")
+    assert all(f'href="{name.with_suffix(".html").as_posix()}"' in page for name in DOCUMENTS)
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", *(f"docs/{name.as_posix()}" for name in DOCUMENTS)])
+def test_links_of_a_page_lead_somewhere(page):
+    """On the web pages of the repository, too: files, pictures, and headings of pages."""
+    for link in re.findall(r"\]\(([^)\s]+)\)", (ROOT / page).read_text("utf-8")):
+        name, _, heading = link.partition("#")
+        if "://" in link or not name:
+            continue
+        file = (ROOT / page).parent / name
+        assert file.exists(), link
+        headings = re.findall(r"^#+ (.*)$", file.read_text("utf-8"), re.M) if heading else []
+        assert not heading or heading in {slug(text) for text in headings}, link
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def count_words(*files: Path) -> int:
+    return sum(len(file.read_text("utf-8").split()) for file in files)
+
+
+def test_the_documentation_is_short():
+    """What nobody reads is not written: words by hand, in README, CONTRIBUTING and the four parts."""
+    assert count_words(ROOT / "README.md") <= 700
+    assert count_words(ROOT / "CONTRIBUTING.md") <= 800
+    assert (
+        count_words(ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / name for name in DOCUMENTS))
+        <= 15_000
+    )
+
+
+def options_of_commands() -> set[str]:
+    """All options of all commands."""
+    pages = [help_of(*words) for words in [("convert",), *PAGES]]
+    found = re.findall(r"--[a-z][\w.-]*", re.sub("[│╭╮╰╯─]", " ", "".join(pages)))
+    return {*found, "--version", "--traceback", "--help-all"}
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{part}" for part in ("tutorial", "how-to", "reference"))])
+def test_options_on_the_pages_are_those_of_the_commands(page):
+    files = [ROOT / page] if page.endswith(".md") else sorted((ROOT / page).glob("*.md"))
+    lines = [line for file in files for line in file.read_text("utf-8").split("\n")]
+    ours = [line for line in lines if not any(name in line for name in ("benchmarks/", "torchrun", "rdzv"))]
+    named = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*", "\n".join(ours)))
+    assert named - options_of_commands() == set()
+
+
+def test_the_python_of_the_pages_runs(small_capture, tmp_path, monkeypatch):
+    """Block by block, as somebody would who reads the tutorial, then how to extend a fit, then about gradients."""
+    monkeypatch.chdir(tmp_path)
+    quick = "iterations=1, levels=(2,), widths=(28,), shares=(1,), subdivisions=2, domain='sphere', refine=('none',)"
+    changed = {
+        "scenes/pot2.xml": str(small_capture), 'preset("fast"': f'preset("fast", {quick}', "spp=64": "spp=1",
+        "spp=16": "spp=1", '"subdivisions": 6': '"subdivisions": 2', "sample(5)": "sample(2)",
+        "picture)\n": "picture, write_async=False)\n", '"out/mine': f'"{tmp_path}/out/mine',
+    }  # fmt: skip
+    names = {}
+    for page in ("tutorial/python.md", "how-to/extend.md", "background/gradients.md"):
+        for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text("utf-8"), re.DOTALL):
+            for old, new in changed.items():
+                block = block.replace(old, new)
+            exec(block, names)
+    assert (tmp_path / "out/mine/mesh.ply").is_file() and (tmp_path / "pot.png").is_file()
+    assert np.array(names["scene"].bbox().extents()).max() > 0 and names["jacobian"].shape[1:] == (3, 3)
+    assert np.abs(np.array(names["dr"].grad(names["params"]["007.to_world"]).matrix)).max() > 0
 
 
 def tables(plugin) -> dict[str, list[tuple[str, str, str, str]]]:
@@ -250,9 +321,9 @@ def test_snippets_load_and_say_the_same(name, tmp_path):
 
 
 def help_of(name: str, *arguments: str) -> str:
-    page = io.StringIO()
+    page, asked = io.StringIO(), "--help-all" if name == "fit" else "--help"
     with contextlib.redirect_stdout(page), pytest.raises(SystemExit) as stop:
-        importlib.import_module(f"mi_ring.{name}").main([*arguments, "--help"])
+        importlib.import_module(f"mi_ring.{name}").main([*arguments, asked])
     assert not stop.value.code
     return page.getvalue()
 

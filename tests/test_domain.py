@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.domain import PLACES, Domain, Sphere, closed_domain
+from mi_ring.geometry.domain import CANDIDATES, Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import load_closed_mesh
 
 MAJOR, MINOR = 1.0, 0.35
@@ -42,7 +42,7 @@ def test_points_wander_over_all_of_the_surface_and_faces_stay_faces(torus):
     random = torch.Generator().manual_seed(1)
     still, faces = torus.sample(3)
     normals = trimesh.Trimesh(still.numpy(), faces, process=False).face_normals
-    drawn = [torus.sample(3, random)[0].numpy() for _ in range(2 * PLACES)]
+    drawn = [torus.sample(3, random)[0].numpy() for _ in range(2 * CANDIDATES)]
     for points in drawn:
         assert off_torus(points).max() < 0.01
         turned = trimesh.Trimesh(points, faces, process=False).face_normals
@@ -56,7 +56,7 @@ def test_points_wander_over_all_of_the_surface_and_faces_stay_faces(torus):
 
 def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
     pytest.importorskip("gpytoolbox")
-    monkeypatch.setattr("mi_ring.geometry.domain.FINEST", 3)
+    monkeypatch.setattr("mi_ring.geometry.domain.REMESHED", 3)
     torus.levels.pop(4, None)
     try:
         assert len(torus.sample(4)[1]) == 4 * len(torus.sample(3)[1])

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from mi_ring.rendering.edge_curves import outline_of
-from mi_ring.rendering.edge_gradients import cast
-from mi_ring.rendering.edge_selection import BORDER, CREASE, SMOOTH, Edges, paired
+from mi_ring.rendering.edge_gradients import cast_shadow
+from mi_ring.rendering.edge_selection import BORDER, CREASE, SMOOTH, Edges, paired_edges
 
 mi.set_log_level(mi.LogLevel.Error)
 
@@ -29,7 +29,7 @@ def mesh_of(vertices, faces, normals=True, name="mesh"):
 )
 def test_edges_of_a_closed_mesh(mesh):
     faces = np.random.default_rng(6).permutation(mesh.faces)
-    v0, v1, f0, f1, kind = paired(faces, np.arange(len(mesh.vertices)))
+    v0, v1, f0, f1, kind = paired_edges(faces, np.arange(len(mesh.vertices)))
     assert len(v0) == len(faces) * 3 // 2 and (kind == SMOOTH).all()
     assert set(map(frozenset, zip(v0.tolist(), v1.tolist()))) == set(map(frozenset, mesh.edges_unique.tolist()))
     sides = [{tuple(np.roll(face, k)[:2].tolist()) for k in range(3)} for face in faces]
@@ -163,7 +163,7 @@ def test_a_shadow_is_the_projection_of_its_edge(eye_name):
     shape = next(s for s in scene.shapes() if s.id() == "board")
     (edge,) = outline_of(shape, EYES[eye_name], 1, seed=1)
     camera = lambda view: (mi.Vector3f(4, -3, 2.5), mi.Bool(True))  # noqa: E731
-    shadow = cast(scene, edge, EYES[eye_name], camera)
+    shadow = cast_shadow(scene, edge, EYES[eye_name], camera)
     assert np.array(shadow.active).all()
     matrix = np.array(GROUND["to_world"].matrix)
     normal = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
@@ -179,7 +179,7 @@ def test_a_shadow_is_the_projection_of_its_edge(eye_name):
     np.testing.assert_allclose(np.array(shadow.tangent).T, step, atol=1e-3 * np.abs(step).max())
     # What the board hides from another camera is left out.
     eye = np.array([2, 1, 4.0])
-    shadow = cast(scene, edge, EYES[eye_name], lambda view: (mi.Vector3f(eye), mi.Bool(True)))
+    shadow = cast_shadow(scene, edge, EYES[eye_name], lambda view: (mi.Vector3f(eye), mi.Bool(True)))
     q = project(p)
     crossing = eye + (q - eye) * ((1 - eye[2]) / (q[:, 2] - eye[2]))[:, None]
     beside = np.abs(crossing[:, :2] - [0.3, 0.2]).max(1) - 0.3

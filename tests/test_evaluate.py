@@ -1,6 +1,7 @@
 """`mi_ring.evaluate`: each number against a closed form or a second way to find it, and the command as a whole."""
 
 import json
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.creation import box, icosphere, torus
 
 from mi_ring import evaluate, render
-from mi_ring.capture import calibrated, loading, scenefile
+from mi_ring.capture import loading, scenefile
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import image_errors, surfaces
 from mi_ring.metrics.evaluation import evaluate_fit
@@ -108,19 +109,19 @@ def test_photographs_move_with_the_truth(small_capture):
     turn, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]), np.array([5.0, -7, 2])
     matrix[:3] = np.c_[1.3 * turn.as_matrix(), shift]
     capture = loading.load_capture(small_capture)
-    there = calibrated.moved(capture, 1.3, turn.as_matrix(), shift)
-    for one, other in zip(capture.sensors, there.sensors):
+    there = capture.moved(1.3, turn.as_matrix(), shift)
+    for one, other in zip(capture.shots, there.shots):
         places = [
-            sensor.camera.project(p) for sensor, p in ((one, point), (other, trimesh.transform_points(point, matrix)))
+            shot.camera.project(p) for shot, p in ((one, point), (other, trimesh.transform_points(point, matrix)))
         ]
         np.testing.assert_allclose(places[0][0], places[1][0], atol=1e-3)
         np.testing.assert_allclose(1.3 * places[0][1], places[1][1], rtol=1e-5)
     sun = Light("directional", np.array([0.6, 0.0, -0.8]), np.array([3.0, 2, 1]))
-    lit = calibrated.with_calibration(capture, [s.camera for s in capture.sensors], [sun] * len(capture))
-    turned = Lights.of(calibrated.moved(lit, 1.3, turn.as_matrix(), shift).sensors)[0]
+    lit = replace(capture, shots=tuple(replace(shot, light=sun) for shot in capture.shots))
+    turned = Lights.of(lit.moved(1.3, turn.as_matrix(), shift).shots)[0]
     np.testing.assert_allclose(turned.vector, turn.apply(sun.vector), atol=1e-6)
     np.testing.assert_allclose(turned.rgb, sun.rgb)
-    before, after = Lights.of(capture.sensors), Lights.of(there.sensors)
+    before, after = Lights.of(capture.shots), Lights.of(there.shots)
     distances = [np.linalg.norm(lights.positions() - p, axis=1, keepdims=True)
                  for lights, p in ((before, point), (after, trimesh.transform_points(point, matrix)))]  # fmt: skip
     np.testing.assert_allclose(before.rgb() / distances[0] ** 2, after.rgb() / distances[1] ** 2, rtol=1e-4)
@@ -240,11 +241,11 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
     assert scene.lit_room
     ring = FittedObject(CENTER, 25.0, scale=0.5)
     numbers, views = image_errors.compare_photographs(scene, ring, 4)
-    surface = image_errors.bridge.Surface(scene.scene, scene.shape, ring)
+    surface = image_errors.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     for k in range(12):
-        rgb, _ = image_errors.bridge.draw(surface, scene.photograph(k), spp=4)
+        rgb, _ = image_errors.prediction.draw(surface, scene.photograph(k), spp=4)
         guess = np.clip(rgb[0].numpy(), 0, 1)
         guess = np.where(guess <= 0.0031308, 12.92 * guess, 1.055 * guess ** (1 / 2.4) - 0.055)
         inside = scene.masks[k] == 255

@@ -24,7 +24,6 @@ from mi_ring.nets.brdf_net import Parameter
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import atlas, gltf, mitsuba_scene, results
-from mi_ring.rendering.photograph_lights import Lights
 
 CENTER, RADIUS = np.array([400.0, -150.0, 90.0]), 25.0
 RESOLUTION = 256
@@ -114,9 +113,9 @@ def bilinear(image, uv):
 
 def closed(opened) -> trimesh.Trimesh:
     """The mesh of an atlas before it was cut."""
-    vertices = np.zeros((opened.whole.max() + 1, 3))
-    vertices[opened.whole] = opened.vertices
-    return trimesh.Trimesh(vertices, opened.whole[opened.faces], process=False)
+    vertices = np.zeros((opened.uncut.max() + 1, 3))
+    vertices[opened.uncut] = opened.vertices
+    return trimesh.Trimesh(vertices, opened.uncut[opened.faces], process=False)
 
 
 def normals_at(ring, s):
@@ -229,7 +228,7 @@ def test_charts_do_not_overlap_and_lose_nothing(ring, baked):
     corners = opened.uv[opened.faces]
     area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 2
     assert abs(len(texels.s) / RESOLUTION**2 - area) < 0.01 * area  # a texel in two triangles would count once
-    assert len(opened.faces) == 20 * 4**3 and opened.whole.max() + 1 == 10 * 4**3 + 2
+    assert len(opened.faces) == 20 * 4**3 and opened.uncut.max() + 1 == 10 * 4**3 + 2
     assert closed(opened).is_watertight and closed(opened).euler_number == 2
 
 
@@ -249,7 +248,7 @@ def test_there_are_no_seams(ring, baked):
     assert colour.std((0, 1)).min() > 0.02
     sides = {}
     for a, b in np.concatenate([opened.faces[:, [k, (k + 1) % 3]] for k in range(3)]):
-        sides.setdefault(frozenset(opened.whole[[a, b]]), []).append((a, b))
+        sides.setdefault(frozenset(opened.uncut[[a, b]]), []).append((a, b))
     seams = [pair for pair in sides.values() if len({frozenset(edge) for edge in pair}) > 1]
     assert len(seams) > 20
     one, two = (bilinear(colour, np.array([opened.uv[list(pair[k])].mean(0) for pair in seams])) for k in (0, 1))
@@ -396,10 +395,10 @@ assert "mi_ring" not in sys.modules
 np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
-    sensor, _ = mitsuba_scene.first_photograph(run)
-    matrix, (fx, fy), (cx, cy), *_ = sensor.camera
+    shot, _ = mitsuba_scene.first_photograph(run)
+    matrix, (fx, fy), (cx, cy), *_ = shot.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
-    light = Lights.of([sensor])[0]
+    light = shot.light
     scene = mi.load_dict({
         "type": "scene", "object": {"type": "shapenet", "weights": str(run / "ring.pt"), "subdivisions": 4,
                                     "bsdf": {"type": "cooktorrance"}},
@@ -420,7 +419,7 @@ def test_scene_for_mitsuba_of_reflectances_beyond_one(small_capture, tmp_path):
     torch.save(ring_state(bright, {"subdivisions": 4}), tmp_path / "ring.pt")
     (tmp_path / "scene.xml").write_text(small_capture.read_text())
     export.main([str(tmp_path), str(tmp_path / "stock.xml"), "--resolution", str(RESOLUTION)])
-    intensity = Lights.of(mitsuba_scene.first_photograph(tmp_path)[:1])[0].rgb
+    intensity = mitsuba_scene.first_photograph(tmp_path)[0].light.rgb
     stock = mi.load_file(str(tmp_path / "stock.xml"), parallel=False)
     boost = np.ravel(mi.traverse(stock.emitters()[0])["intensity.value"]) / intensity
     assert boost.min() > 20

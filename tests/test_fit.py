@@ -26,23 +26,24 @@ from PIL import Image
 
 from mi_ring import __main__, fit, render
 from mi_ring.capture import capture
+from mi_ring.capture.capture import Observation
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.fitting import checkpoint, optimizers, session, start, terms
+from mi_ring.fitting import checkpoint, session, start, terms
 from mi_ring.fitting.config import PRESETS, Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.muon import Muon
-from mi_ring.fitting.nan_guard import Caution
-from mi_ring.fitting.processes import ALONE, Share
-from mi_ring.fitting.restraint import Restraint
-from mi_ring.fitting.rounds import Rounds
-from mi_ring.fitting.schedule import stages_of
+from mi_ring.fitting.nan_guard import NanGuard
+from mi_ring.fitting.optimisation import network_steppers
+from mi_ring.fitting.regulariser_strength import RegulariserStrength
+from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import results
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.system import files, machine
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
@@ -97,13 +98,13 @@ def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
 
 def test_muon_has_the_hidden_weights_and_adam_all_the_others():
     ring = FittedObject([0, 0, 0], 1.0)
-    adam, muon = optimizers.optimizers_of(ring, Config(), torch.device("cpu"))
+    adam, muon = (stepper.optimizer for stepper in network_steppers(ring, Config(), torch.device("cpu")))
     assert isinstance(adam, torch.optim.Adam) and isinstance(muon, Muon)
     ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))
     assert [tuple(p.shape) for p in ours] == 2 * [(256, 96), (256, 256), (256, 256)] + 2 * [(256, 256)]
     assert sorted(map(id, ours + theirs)) == sorted(map(id, ring.parameters()))
-    (alone,) = optimizers.optimizers_of(ring, Config(optimizer="adam"), torch.device("cpu"))
-    assert len(alone.param_groups[0]["params"]) == len(list(ring.parameters()))
+    (alone,) = network_steppers(ring, Config(optimizer="adam"), torch.device("cpu"))
+    assert len(alone.optimizer.param_groups[0]["params"]) == len(list(ring.parameters()))
 
 
 def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
@@ -112,7 +113,9 @@ def test_regulariser_does_not_suffer_from_bfloat16(small_capture):
     def value(precision):
         running = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--precision", precision]))
         running.ring.shape_net.output.weight.data.mul_(30)
-        return terms.velocity(SimpleNamespace(fit=running, s=s, stage=running.stages[0])).item()
+        batch = SimpleNamespace(points=s, seeds={"regulariser": 3})
+        it = SimpleNamespace(batch=batch, context=running.context(), stage=running.schedule.stages[0])
+        return terms.velocity(it).item()
 
     assert value("bfloat16") == pytest.approx(value("float32"), rel=0.01)
 
@@ -171,27 +174,6 @@ def test_render_takes_every_photograph_under_its_name(finished, small_capture, t
     assert -10 * np.log10(np.mean(errors)) > 22
 
 
-def test_the_python_of_the_guide_runs(finished, tmp_path, monkeypatch):
-    guide = (Path(__file__).parents[1] / "docs" / "guide.md").read_text("utf-8")
-    block = re.search(r"```python\n(.*?)```", guide, re.DOTALL)[1]
-    monkeypatch.chdir(tmp_path)
-    block = block.replace("picture)", "picture, write_async=False)")  # else it is written when this test is over
-    exec(block.replace("out/pot2/ring.pt", str(finished / "ring.pt")).replace("spp=64", "spp=1"), names := {})
-    assert (tmp_path / "pot.png").is_file()
-    assert np.array(names["picture"]).mean() > 0  # at least the sky: its camera looks at the pot
-
-
-def test_the_python_of_the_readme_runs(small_capture, tmp_path, monkeypatch, capsys):
-    readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
-    block = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
-    monkeypatch.chdir(tmp_path)
-    quick = "iterations=2, levels=(2,), widths=(28,), shares=(1,), subdivisions=2"
-    block = block.replace("scenes/pot2.xml", str(small_capture)).replace('preset("fast")', f'preset("fast", {quick})')
-    exec(block, names := {})
-    assert names["ring"].subdivisions == 2 and (tmp_path / "out/mine/mesh.ply").is_file()
-    assert re.match(r"1 0\.\d+\n2 0\.\d+\n", capsys.readouterr().out)
-
-
 def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
     before = (finished / "mesh.ply").read_bytes()
     assert fit.main([str(small_capture), "--out", str(finished), "--iterations", "2", *SPHERE]) == 0
@@ -238,9 +220,9 @@ def test_interreflection_is_averaged_beside_a_table(broken_capture, table, indir
     running = Fit(load_capture(path), Config(iterations=7, indirect=indirect, **one_stage))
     seen = np.zeros(len(running.capture), int)
     for it in running:
-        seen[it.index] += 1
+        seen[it.batch.photographs] += 1
     assert seen.sum() == 7 * 4
-    counts = {k: count for k, (count, _) in running.averages.pictures.items()}
+    counts = {k: count for k, (count, _) in running.renderer.average.pictures.items()}
     assert counts == ({k: count for k, count in enumerate(seen) if count} if table and indirect else {})
 
 
@@ -312,32 +294,14 @@ def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(sm
                 weights[0, 0] = np.inf
         if it.number == 13:  # as it was after the tenth step
             assert weights.isfinite().all() and 0 < (weights - kept).norm() < 0.1 * kept.norm()
-        expected = 0.3 ** (broken.caution.retreats)
+        expected = 0.3 ** (broken.optimisation.guard.retreats)
         if it.number in (1, 5, 13, 24, 30):
-            assert broken.caution.retreats == {1: 0, 5: 0, 13: 1, 24: 2, 30: 2}[it.number]
-        assert broken.caution.factor == pytest.approx(expected)
-    (group,) = broken.optimizers[0].param_groups[:1]
-    assert group["lr"] == pytest.approx(0.09 * group["initial_lr"] * broken.config.decay ** (39 / 40))
-    assert Fit(broken.capture, broken.config, state=broken.state()).caution.retreats == 2
-
-
-def test_each_photograph_comes_before_one_comes_again():
-    sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
-    sensors = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]
-    rounds, random = (
-        Rounds(SimpleNamespace(sensors=sensors, sizes=sizes), np.arange(12)),
-        torch.Generator().manual_seed(5),
-    )
-    drawn: dict = {size: [] for size in sizes}
-    for _ in range(60):
-        index, size = rounds.draw(3, random)
-        assert len({*index.tolist()}) == 3 and {*index.tolist()} <= {*sizes[size].tolist()}
-        drawn[size] += index.tolist()
-    for size, alike in sizes.items():
-        times = np.bincount(drawn[size])[alike]
-        assert times.sum() > 40 and times.max() - times.min() <= 1
-        orders = [drawn[size][k : k + len(alike)] for k in range(0, len(drawn[size]) - len(alike), len(alike))]
-        assert len({tuple(one) for one in orders}) > len(orders) / 2  # in another order
+            assert broken.optimisation.guard.retreats == {1: 0, 5: 0, 13: 1, 24: 2, 30: 2}[it.number]
+        assert broken.optimisation.guard.factor == pytest.approx(expected)
+    config = broken.problem.config
+    rate = broken.optimisation.learning_rate
+    assert rate == pytest.approx(0.09 * config.learning_rate * config.decay ** (39 / 40))
+    assert Fit(broken.capture, config, state=broken.state()).optimisation.guard.retreats == 2
 
 
 def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():
@@ -345,14 +309,14 @@ def test_what_optimisers_remember_and_modules_keep_must_be_numbers_too():
     adam = torch.optim.Adam(module.parameters())
     module(torch.ones(2, 3)).sum().backward()
     adam.step()
-    caution = Caution([module], [adam])
-    assert caution.finite()
+    guard = NanGuard(module, [adam])
+    assert guard.finite()
     for number in (module.running_var, adam.state[module.weight]["exp_avg_sq"]):
         before = float(number[1])
         number[1] = np.inf
-        assert not caution.finite()
+        assert not guard.finite()
         number[1] = before
-    assert caution.finite()
+    assert guard.finite()
 
 
 def test_gradients_of_unknowns_that_are_none_make_no_step(small_capture, monkeypatch):
@@ -360,14 +324,14 @@ def test_gradients_of_unknowns_that_are_none_make_no_step(small_capture, monkeyp
     running = Fit(load_capture(small_capture), Config(iterations=30, refine=("light",), **settings))
     for _ in range(10):
         running.step()
-    running.calibration.light.register_hook(lambda gradient: gradient * np.nan)
+    running.model.calibration.light.register_hook(lambda gradient: gradient * np.nan)
     before = running.ring.brdf_net.output.weight.detach().clone()
     running.step()
-    assert torch.equal(running.ring.brdf_net.output.weight, before) and running.caution.failures == 1
+    assert torch.equal(running.ring.brdf_net.output.weight, before) and running.optimisation.guard.failures == 1
 
 
 def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch):
-    monkeypatch.setattr(bridge.Surroundings, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
+    monkeypatch.setattr(GlobalIllumination, "interreflection", property(lambda it: 1000 * it.coverage[..., None]))
     for options, bright in (([], True), (["--no-indirect"], False)):
         first = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), *SPHERE, *options]))
         assert (first.step().terms["rgb"] > 100) == bright
@@ -384,8 +348,8 @@ def test_interreflection_is_left_out_where_intensities_cannot_be_true_nor_be_ref
 
 def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatch):
     path, edit = broken_capture
-    genuine, used = bridge.render, []
-    monkeypatch.setattr(bridge, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
+    genuine, used = prediction.render, []
+    monkeypatch.setattr(prediction, "render", lambda *a, **k: used.append(k["shadows"]) or genuine(*a, **k))
 
     def step(*options):
         Fit(load_capture(path), fit.parse_options([str(path), *SPHERE, *options])).step()
@@ -469,7 +433,8 @@ def test_fits_from_a_hull_go_on_from_the_same_hull(small_capture, tmp_path, monk
         assert torch.equal(s, again) and np.array_equal(faces, same)
     with torch.no_grad():
         torch.testing.assert_close(before.ring.surface(s), after.ring.surface(s))
-    assert torch.equal(before.ring.domain.sample(2, before.random)[0], after.ring.domain.sample(2, after.random)[0])
+    drawn = [f.ring.domain.sample(2, f.sampler.random["rotations"])[0] for f in (before, after)]
+    assert torch.equal(*drawn)
 
 
 def test_start_from_a_mesh(small_capture, tmp_path):
@@ -644,13 +609,15 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
     # Nor does what is left depend on the scene, which may have been on the same drive, nor on the report.
     running = Fit(load_capture(small_capture), Config(iterations=2, levels=(1,), widths=(28,), shares=(1,)))
     keeper = session.Keeper(running, folder, lambda: None)
-    scene = results.fitted_scene(running, folder)
-    running.capture = replace(running.capture, path=tmp_path / "gone.xml")
-    said = keeper.rescue(scene)
+    scene = results.fitted_scene(running.problem.given, running.ring, folder)
+    result = running.result()
+    result = replace(result, given=replace(result.given, path=tmp_path / "gone.xml"))
+    said = keeper.rescue(result, scene)
     where = Path(re.fullmatch("the results are in (.*) instead", said)[1])
     assert where != elsewhere and load_fit(where) and (where / "report.html").exists()
     monkeypatch.setattr(results.report, "report_html", Mock(side_effect=OSError("full")))
-    where = Path(re.fullmatch("what could be written is in (.*) instead, with a checkpoint", keeper.rescue(scene))[1])
+    said = keeper.rescue(result, scene)
+    where = Path(re.fullmatch("what could be written is in (.*) instead, with a checkpoint", said)[1])
     assert load_fit(where) and (where / "checkpoint.pt").exists() and not (where / "report.html").exists()
 
 
@@ -670,7 +637,7 @@ def test_a_damaged_checkpoint_is_made_good_by_the_one_before(small_capture, tmp_
     assert f"{path}: is damaged or gone; going on from the one before" in capsys.readouterr().out
     assert (folder / "mesh.ply").read_bytes() == mesh
     assert (folder / "checkpoint.before.pt").read_bytes() == before
-    assert torch.load(folder / "checkpoint.before.pt", weights_only=False)["fit"]["iteration"] == 5
+    assert torch.load(folder / "checkpoint.before.pt", weights_only=False)["fit"]["course"]["iteration"] == 5
 
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path, begun):
@@ -704,19 +671,22 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         )
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
     files.write_state(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
-    with pytest.raises(InputError, match="checkpoint.pt: is a checkpoint of format 3, mi_ring .* goes on from 4"):
+    with pytest.raises(InputError, match="checkpoint.pt: is a checkpoint of format 4, mi_ring .* goes on from 5"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
 
 
-@pytest.mark.parametrize("change", [
-    {"iteration": -5}, {"iteration": 10**9}, {"iteration": "5"}, {"seconds": math.nan}, {"log": [{}]}, {"log": 3},
-    {"random": torch.zeros(3)}, {"optimizers": []}, {"restraint": 1}, {"ring": None},
+@pytest.mark.parametrize(("part", "change"), [
+    ("course", {"iteration": -5}), ("course", {"iteration": 10**9}), ("course", {"iteration": "5"}),
+    ("course", {"seconds": math.nan}), ("course", {"log": [{}]}), ("course", {"log": 3}), ("course", {"unknown": 1}),
+    ("sampler", {"random": torch.zeros(3)}), ("sampler", {"waiting": {(56, 40): [12]}}),
+    ("optimisation", {"optimizers": []}), (None, {"regulariser": 1}), (None, {"ring": None}),
 ])  # fmt: skip
-def test_a_checkpoint_that_no_fit_has_written_is_refused(change, finished, small_capture, tmp_path):
+def test_a_checkpoint_that_no_fit_has_written_is_refused(part, change, finished, small_capture, tmp_path):
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
+    change = {part: state["fit"][part] | change} if part else change
     files.write_state(state | {"fit": state["fit"] | change}, tmp_path / "checkpoint.pt")
     options = ["--out", str(tmp_path), "--resume", "--iterations", "90", *SPHERE]
     with pytest.raises(InputError, match=r"checkpoint\.pt: holds no fit that could go on"):
@@ -839,7 +809,7 @@ def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
 def test_presets_are_valid_and_can_be_overridden(preset):
     config = fit.parse_options(["scene.xml", "--preset", preset, "--seed", "7"])
     assert config.preset == preset and config.seed == 7
-    stages = stages_of(config)
+    stages = Schedule.of(config).stages
     assert stages[0].first == 0 and stages[-1].last == config.iterations
     assert all(a.last == b.first for a, b in zip(stages, stages[1:]))
     for name, value in PRESETS[preset].items():
@@ -848,11 +818,14 @@ def test_presets_are_valid_and_can_be_overridden(preset):
 
 
 def test_starts_near_the_object_spend_less_on_the_coarse_stage():
+    def lengths(near):
+        return [stage.last - stage.first for stage in Schedule.of(config, near).stages]
+
     config = Config(iterations=100, shares=(0.5, 0.3, 0.2))
-    assert [s.last - s.first for s in stages_of(config)] == [50, 30, 20]
-    assert [s.last - s.first for s in stages_of(config, near=True)] == [17, 43, 20]  # 16.7, and 30 + 0.4 · 33.3
+    assert lengths(near=False) == [50, 30, 20]
+    assert lengths(near=True) == [17, 43, 20]  # 16.7, and 30 + 0.4 · 33.3
     config = Config(iterations=100, levels=(4,), widths=(128,), shares=(1,))
-    assert [s.last for s in stages_of(config, near=True)] == [100]
+    assert [s.last for s in Schedule.of(config, near=True).stages] == [100]
 
 
 def test_paper_preset_is_the_papers():
@@ -860,20 +833,21 @@ def test_paper_preset_is_the_papers():
     assert config.weights["mask"] == 0.0 and config.weights["velocity"] == 0.01 and config.loss == "l2"
     assert config.refine == ("none",)
     assert config.optimizer == "adam" and config.learning_rate == 1e-4 and config.decay == 1
-    assert config.levels == (5, 6) and [s.last - s.first for s in stages_of(config)] == [2000, 4000]
+    assert config.levels == (5, 6) and [s.last - s.first for s in Schedule.of(config).stages] == [2000, 4000]
     assert config.precision == "float32" and config.steps == 20 and not config.shadows and not config.indirect
     assert config.velocity_decay == 1
 
 
 def test_regulariser_is_relaxed_and_nothing_else():
-    it = SimpleNamespace(fit=SimpleNamespace(config=Config(velocity_decay=0.04), restraint=Restraint()))
-    it.fit.restraint.calm, it.fit.restraint.unexplained = 0.5, 0.06
-    schedule = terms.default_terms["velocity"].schedule
-    assert schedule(it) == pytest.approx(0.2)
-    it.fit.restraint.unexplained = 0.18  # photographs that disagree with the model
-    assert schedule(it) == pytest.approx(0.9**4)
-    it.fit.restraint.unexplained = 0.5
-    assert schedule(it) == 1
+    regulariser = RegulariserStrength()
+    regulariser.weakened, regulariser.unexplained = 0.5, 0.06
+    assert regulariser.strength(0.04) == pytest.approx(0.2)
+    regulariser.unexplained = 0.18  # photographs that disagree with the model
+    assert regulariser.strength(0.04) == pytest.approx(0.9**4)
+    regulariser.unexplained = 0.5
+    assert regulariser.strength(0.04) == 1
+    it = SimpleNamespace(context=SimpleNamespace(regulariser=0.3))
+    assert terms.default_terms["velocity"].schedule(it) == 0.3
     scheduled = {name for name, term in terms.default_terms.items() if term.schedule}
     assert scheduled == {"velocity", "settling"}  # the latter in the last stage alone
 
@@ -883,50 +857,45 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
     predicted = torch.tensor([0.4, 0.30, 9.0, 0.7, 0.0]).reshape(1, 1, 5, 1).expand(1, 1, 5, 3)
     clipped = torch.zeros(1, 1, 5, 3, dtype=torch.bool)
     clipped[..., 3, :] = True  # brighter than observed: no error
-    it = SimpleNamespace(predicted=predicted, observed=observed, clipped=clipped, masked=torch.tensor([True]),
-                         mask=torch.tensor([[[1.0, 1, 1, 1, 0]]]), valid=None,
-                         coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))  # fmt: skip
-    it.surely, it.share = lambda: Iteration.surely(it), Share(ALONE, 1)
-    assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
-    it.masked = torch.tensor([False])  # then what is predicted to be the object is
-    assert Iteration.unexplained(it) == pytest.approx((0.1 + 0.05 + 9) / (0.5 + 0.25 + 0.4 + 9))
+    seen = Observation(observed, clipped, torch.tensor([[[1.0, 1, 1, 1, 0]]]), torch.tensor([True]), None)
+    shown = SimpleNamespace(rgb=predicted, coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))
+    batch = SimpleNamespace(total=lambda tensor: tensor)
+    found = Iteration(batch, seen, shown, None).unexplained()
+    assert found == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
+    seen = seen._replace(masked=torch.tensor([False]))  # then what is predicted to be the object is
+    found = Iteration(batch, seen, shown, None).unexplained()
+    assert found == pytest.approx((0.1 + 0.05 + 9) / (0.5 + 0.25 + 0.4 + 9))
 
 
 def test_regulariser_is_held_while_the_surface_crosses_itself_and_catches_up_unless_it_is_late():
     ball = trimesh.creation.icosphere(2)
     two = ball + trimesh.creation.icosphere(2).apply_translation([0.5, 0, 0])
-    state = Restraint()
+    state = RegulariserStrength()
     state.unexplained = 0.5
 
     def go(numbers, mesh):
         for number in numbers:
             vertices, faces = torch.from_numpy(np.array(mesh.vertices)), np.array(mesh.faces)
             share = 0.1 if number < 20 else math.nan
-            state.note(SimpleNamespace(number=number, progress=(number - 1) / 200, vertices=vertices, faces=faces,
-                                       unexplained=lambda share=share: share), 200)  # fmt: skip
+            schedule = SimpleNamespace(shaping=200)
+            state.note(SimpleNamespace(number=number, progress=(number - 1) / 200, batch=SimpleNamespace(faces=faces),
+                                       prediction=SimpleNamespace(vertices=vertices),
+                                       context=SimpleNamespace(schedule=schedule),
+                                       unexplained=lambda share=share: share))  # fmt: skip
 
     go(range(1, 20), ball)
-    assert state.calm == pytest.approx(19 / 200)  # as planned
+    assert state.weakened == pytest.approx(19 / 200)  # as planned
     assert state.unexplained == pytest.approx(0.1 + 0.4 * 0.9**19)
     go(range(20, 80), two)
-    assert state.crossing > 0.05 and state.calm == pytest.approx(-0.3)
+    assert state.crossing > 0.05 and state.weakened == pytest.approx(-0.3)
     go(range(80, 100), ball)
-    assert not state.held and state.calm == pytest.approx(-0.3 + 20 * 0.015)
+    assert not state.held and state.weakened == pytest.approx(-0.3 + 20 * 0.015)
     go(range(100, 139), ball)
-    assert state.calm == pytest.approx(39 * 0.015)
+    assert state.weakened == pytest.approx(39 * 0.015)
     go(range(139, 160), two)
-    assert state.held and state.calm == pytest.approx(40 * 0.015 - 20 * 0.01)
+    assert state.held and state.weakened == pytest.approx(40 * 0.015 - 20 * 0.01)
     go(range(160, 180), ball)
-    assert state.calm == pytest.approx(0.4 + 20 * 0.005)
-
-
-def test_help_names_every_option(capsys):
-    with pytest.raises(SystemExit) as stop:
-        fit.parse_options(["--help"])
-    text = capsys.readouterr().out
-    assert stop.value.code == 0
-    for name in fit.FitConfig.__dataclass_fields__:
-        assert name == "scene" or f"--{name.replace('_', '-')}" in text
+    assert state.weakened == pytest.approx(0.4 + 20 * 0.005)
 
 
 def test_program_lists_its_commands():

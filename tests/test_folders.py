@@ -237,11 +237,11 @@ def test_a_bar_is_lines_of_a_log(monkeypatch):
     monkeypatch.setattr(sys, "stderr", log)
     list(progress(range(3), "counting"))
     assert not log.getvalue()  # it took no time
-    monkeypatch.setattr("mi_ring.system.progress.PATIENCE", 0.0)
+    monkeypatch.setattr("mi_ring.system.progress.DELAY", 0.0)
     list(progress(range(3), "counting", mininterval=0))
     first, last = log.getvalue().splitlines()  # it took no time between them
     assert first.startswith("counting") and "3/3" not in first and "3/3" in last and log.getvalue().endswith("\n")
-    monkeypatch.setattr("mi_ring.system.progress.QUIET", 0.0)
+    monkeypatch.setattr("mi_ring.system.progress.LOG_INTERVAL", 0.0)
     list(progress(range(3), "counting", mininterval=0))
     lines = log.getvalue().splitlines()[2:]
     assert len(lines) >= 3 and "3/3" in lines[-1] and "\r" not in log.getvalue()

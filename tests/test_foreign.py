@@ -19,20 +19,20 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
-from mi_ring.foreign import EXPANSION, ROOM, load_npy, load_npz, reading, require_room, require_survival
+from mi_ring.foreign import EXPANSION, SMALL, load_npy, load_npz, reading, require_plausible_size, require_readable
 from mi_ring.geometry.meshes import read_mesh
-from mi_ring.images import Bounded, write_image
+from mi_ring.images import BoundedFile, write_image
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_exposure, exposure_of
 from mi_ring.importers.reading import has_alpha, image_size, load_mat, pixels_of
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.capture_findings import told_before
+from mi_ring.metrics.capture_findings import findings_of_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import default_folder, read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured_brdf import Network
+from mi_ring.rendering.measured_brdf import MerlNetwork
 from mi_ring.system.files import write_state
 
 HUGE = 60_000  #: sides of a picture of 10 GB [px]
@@ -130,13 +130,13 @@ def test_photographs_of_phones_are_not_enormous(tmp_path):
     """200 million pixels; and what compresses well, as masks do, to a thousandth."""
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(2_000_000))
-    require_room(path, 3 * 200_000_000)
+    require_plausible_size(path, 3 * 200_000_000)
     path.write_bytes(bytes(70_000))
-    require_room(path, 50_000_000)
-    for size in (ROOM + 1, EXPANSION * 70_000 + 1):
-        if size > max(ROOM, EXPANSION * 70_000):
+    require_plausible_size(path, 50_000_000)
+    for size in (SMALL + 1, EXPANSION * 70_000 + 1):
+        if size > max(SMALL, EXPANSION * 70_000):
             with pytest.raises(ValueError, match="declares"):
-                require_room(path, size)
+                require_plausible_size(path, size)
 
 
 def test_arrays_that_declare_more_than_there_is(tmp_path, monkeypatch):
@@ -155,7 +155,7 @@ def test_arrays_that_declare_more_than_there_is(tmp_path, monkeypatch):
         (tmp_path / "a.npy").write_bytes(content[:-4] + b"\xff" * 4)
         with pytest.raises(InputError, match="a.npy: .* .has characters that are none"):
             load_npy(tmp_path / "a.npy")
-    monkeypatch.setattr(foreign, "ROOM", 2**16)
+    monkeypatch.setattr(foreign, "SMALL", 2**16)
     monkeypatch.setattr(foreign, "EXPANSION", 100)
     np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(2**17))
     with pytest.raises(InputError, match="bomb.npz: .* .declares 1,048,704 bytes"):
@@ -173,13 +173,13 @@ def test_networks_that_are_damaged(tmp_path):
     for given in ({"w2": arrays["w2"].astype(str)}, {"names": np.array(3.0), "w1": np.ones(3)}):
         np.savez(path, **{"names": ["one"], **arrays, **given})
         with pytest.raises(InputError, match=r"nets.npz: w\d is of shape"):
-            Network(path, "one")
+            MerlNetwork(path, "one")
     np.savez(path, names=["one"], **arrays)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with pytest.raises(InputError, match="nets.npz: cannot be read"):
-        Network(path, "one")
+        MerlNetwork(path, "one")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".stl", ".obj"])
@@ -216,7 +216,7 @@ def test_what_other_runs_have_left_is_damaged(tmp_path, monkeypatch):
         assert default_folder(tmp_path / "pot.xml").resolve() == folder
     for far in ("1" * 400, "[" * 100_000, '"x"'):
         (tmp_path / "calibration.json").write_text(f'{{"photographs": {{"a": {{"moved_px": {far}}}}}}}')
-        assert told_before(tmp_path / "pot.xml", ["a"]) == ("", "")
+        assert findings_of_fit(tmp_path / "pot.xml", ["a"]) == ("", "")
     (folder / "log.jsonl").write_bytes(b'{"iteration": 1}\n\xff\xff\n{"iteration"')
     assert read_log(folder) == [{"iteration": 1}]
 
@@ -273,8 +273,8 @@ def test_native_readers_that_crash_are_tried_elsewhere(tmp_path):
         ("bytearray(2**33)", "MemoryError"),
     ):
         with pytest.raises(InputError, match=f"a.mat: not a MATLAB file, or damaged .{words}"):
-            require_survival(read, path, 8, "a MATLAB file")
-    require_survival("open(sys.argv[1], 'rb').read()", path, 8, "a MATLAB file")
+            require_readable(read, path, 8, "a MATLAB file")
+    require_readable("open(sys.argv[1], 'rb').read()", path, 8, "a MATLAB file")
     with pytest.raises(InputError, match="a.mat: not a MATLAB file, or damaged"):
         load_mat(path)
 
@@ -294,7 +294,7 @@ def test_a_png_whose_pixels_declare_to_be_enormous_asks_for_no_more_than_it_has(
     content = file.read_bytes()
     place = content.index(b"IDAT")
     file.write_bytes(content[: place - 4] + struct.pack(">I", 2**31 - 1) + content[place:])
-    with Bounded(io.FileIO(file)) as stream:
+    with BoundedFile(io.FileIO(file)) as stream:
         stream.read(5)
         assert len(stream.read(2**62)) == len(content) - 5 and stream.read(1) == b""
     assert image_size(file) == (7, 5)

@@ -112,7 +112,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def estimate(scene):
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     return Estimate(lambda seed: many(scene, photographs, seed=seed))
 
 
@@ -127,14 +127,14 @@ def test_every_photograph_equals_mi_render(scene, estimate, integrator):
 
 def test_selection_chooses_and_orders(scene, estimate):
     order = [2, 0, 3, 2]
-    photographs = Photographs.of(scene.sensors()).select(order, (WIDTH, HEIGHT))
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()]).select(order, (WIDTH, HEIGHT))
     assert len(photographs) == 4
     assert_same(Estimate(lambda seed: many(scene, photographs, seed=50 + seed)), estimate.map(lambda x: x[order]))
 
 
 def test_scale_is_a_box_average(scene, estimate):
     """Of an odd picture, the last row and column are left out."""
-    photographs = Photographs.of(scene.sensors()).select(range(4), (WIDTH, HEIGHT), scale=2)
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()]).select(range(4), (WIDTH, HEIGHT), scale=2)
     assert photographs.size == (17, 12)
     halved = Estimate(lambda seed: many(scene, photographs, spp=64, seed=50 + seed))
     full = Estimate.map(estimate, lambda x: x[:, :24, :34].reshape(4, 12, 2, 17, 2, 4).mean((2, 4)))
@@ -143,7 +143,7 @@ def test_scale_is_a_box_average(scene, estimate):
 
 
 def test_same_seed_same_picture_and_other_seed_another(scene):
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     first, again, other = (many(scene, photographs, spp=2, seed=seed) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first, again)
     assert (first != other).mean() > 0.1
@@ -151,7 +151,7 @@ def test_same_seed_same_picture_and_other_seed_another(scene):
 
 def test_samples_are_stratified(scene):
     """Four samples per pixel have less noise than the mean of four pictures of one sample."""
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     four = np.stack([many(scene, photographs, spp=4, seed=s) for s in range(8)])
     one = np.stack([many(scene, photographs, spp=1, seed=s) for s in range(100, 132)]).reshape(8, 4, *four.shape[1:])
     assert four.var(0).mean() < 0.7 * one.mean(1).var(0).mean()
@@ -180,7 +180,7 @@ def ball_distance(origin, direction):
 
 def test_alpha_is_the_coverage_of_the_ball():
     scene = load(BALL)
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     alpha = many(scene, photographs, spp=256)[..., 3]
     reference = one_by_one(scene, "photometric", spp=256)[..., 3]
     for k in range(4):
@@ -200,7 +200,7 @@ def test_maps_are_normals_and_material_at_the_pixel_centres():
     for name, value in (("diffuse", DIFFUSE), ("specular", [SPECULAR]), ("roughness", [ROUGHNESS])):
         params[f"ball.vertex_{name}"] = mi.Float(np.tile(value, 10242))
     params.update()
-    photographs = Photographs.of(scene.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
     maps = render_maps(scene, photographs, {"vertex_diffuse": 3, "vertex_specular": 1, "vertex_roughness": 1})
     maps = np.stack([np.array(m).reshape(4, HEIGHT, WIDTH) for m in maps], -1)
     for k in range(4):
@@ -257,7 +257,7 @@ def on_board(p, direction):
 @pytest.mark.parametrize("shadows", [True, False])
 def test_shadow_of_a_board_on_the_ground_is_its_projection(shadows):
     scene = load(BOARD, GROUND, lights=LAMPS)
-    image = many(scene, Photographs.of(scene.sensors()), spp=256, shadows=shadows)
+    image = many(scene, Photographs.of([sensor.shot for sensor in scene.sensors()]), spp=256, shadows=shadows)
     for k, lamp in enumerate(LAMPS):
         origin, direction = rays(k, 16)
         p = origin + direction * (-origin[2] / direction[..., 2:])
@@ -282,7 +282,9 @@ def test_photometric_without_shadows_lights_what_the_board_hides():
         ])
         for s in (True, False)
     )  # fmt: skip
-    np.testing.assert_allclose(off, many(scene, Photographs.of(scene.sensors()), shadows=False), atol=0.1)
+    np.testing.assert_allclose(
+        off, many(scene, Photographs.of([sensor.shot for sensor in scene.sensors()]), shadows=False), atol=0.1
+    )
     assert ((off - on)[..., 0] > 0.05).sum() > 30
     assert ((on - off)[..., 0] > 0.05).sum() == 0
 
@@ -293,7 +295,7 @@ def test_photometric_without_shadows_lights_what_the_board_hides():
 def test_environment_adds_its_light_to_every_photograph_and_to_the_background(scene, estimate):
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.3, 0.5]}}
     under_sky = load(BALL, WALL, sky=sky)
-    photographs = Photographs.of(under_sky.sensors())
+    photographs = Photographs.of([sensor.shot for sensor in under_sky.sensors()])
     both = Estimate(lambda seed: many(under_sky, photographs, seed=seed, spp=32))
     assert_same(both, Estimate(lambda seed: one_by_one(under_sky, "direct", seed, spp=64)))
     background, inside = both.mean[..., 3] == 0, both.mean[..., 3] == 1
@@ -304,8 +306,8 @@ def test_environment_adds_its_light_to_every_photograph_and_to_the_background(sc
 def test_lamp_of_the_scene_casts_shadows_even_where_photographs_do_not(scene):
     lamp = {"type": "point", "position": [1.4, 2.0, 2.0], "intensity": 4.0}
     lit = load(BALL, WALL, lights=[None, None], lamp=lamp)  # flash at the camera: its shadows are hidden
-    assert Photographs.of(lit.sensors()).colocated
-    photographs = Photographs.of(lit.sensors())
+    assert Photographs.of([sensor.shot for sensor in lit.sensors()]).colocated
+    photographs = Photographs.of([sensor.shot for sensor in lit.sensors()])
     assert_same(
         Estimate(lambda seed: many(lit, photographs, seed=seed, shadows=False)),
         Estimate(lambda seed: one_by_one(lit, "direct", seed, spp=32)),

@@ -13,13 +13,15 @@ from conftest import photographed_ellipsoid
 from test_bridge import OFF_CAMERA, Setting, tensor
 
 import mi_ring
-from mi_ring.fitting.calibration import Calibration, refined_of
-from mi_ring.fitting.covariance import deviations
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.rig import Rig
+from mi_ring.fitting.covariance import covariance
 from mi_ring.fitting.light_selection import Trials, brightest
 from mi_ring.fitting.lighting import Lighting, lit, moved
-from mi_ring.rendering import bridge
+from mi_ring.fitting.refinement import refined_of
+from mi_ring.rendering import prediction
 from mi_ring.scene.assembly import lamp_lights, lamps_of, with_lamps
-from mi_ring.scene.lights import Light, emitter_of, light_of, place_lamp, place_of
+from mi_ring.scene.lights import Light, emitter_of, light_of, move_lamp, position_of
 
 LAMPS = [
     Light("point", np.array([-1.9, 2.4, 1.8]), np.array([9.0, 12.0, 7.0])),
@@ -48,13 +50,13 @@ def test_an_emitter_is_what_its_numbers_say(light):
     np.testing.assert_allclose(found.rgb, light.rgb, rtol=1e-5)
     place = mi.Vector3f(mi.Float(0.36), mi.Float(-0.48), mi.Float(0.8))
     dr.enable_grad(place)
-    place_lamp(emitter, place, mi.Color3f(3, 4, 5))
+    move_lamp(emitter, place, mi.Color3f(3, 4, 5))
     moved = light_of(emitter)
     np.testing.assert_allclose(
         moved.vector, np.array([0.36, -0.48, 0.8]) * (1 if light.kind == "point" else -1), rtol=1e-5
     )
     np.testing.assert_allclose(moved.rgb, [3, 4, 5])
-    where, _ = place_of(emitter)
+    where, _ = position_of(emitter)
     dr.backward(dr.dot(where, mi.Vector3f(1, 2, 3)))
     np.testing.assert_allclose(np.ravel(dr.grad(place)), [1, 2, 3], atol=1e-5)
 
@@ -69,7 +71,9 @@ def test_gradients_of_lamps_equal_finite_differences():
     ball = tensor(np.array([0.3, -0.2, 0.15]) + 0.8 * setting.s)  # convex: nothing is in its own shadow
 
     def loss(lamps):
-        rgb, _ = bridge.render(setting.surface, setting.photographs, ball, setting.material, 16, 3, False, lamps=lamps)
+        rgb, _ = prediction.render(
+            setting.surface, setting.photographs, ball, setting.material, 16, 3, False, lamps=lamps
+        )
         return (setting.radiance_weight * rgb).sum()
 
     lamps = [t.clone().requires_grad_() for t in now]
@@ -141,7 +145,7 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
 def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture):
     """As far away as the cameras, in the directions that the environment has, by its colours."""
     capture = mi_ring.load_capture(small_capture)
-    trials = Trials(capture, mi_ring.Config(), None)
+    trials = Trials(capture, mi_ring.Config())
     toward, colour = np.array([0.48, 0.6, -0.64]), np.array([1.0, 0.8, 0.5])
     values = dr.sh_eval(mi.Vector3f(*toward.tolist()), 4)
     trials.environment = np.stack([np.ravel(v)[0] for v in values])[:, None] * colour, np.ones(25)
@@ -150,7 +154,7 @@ def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture
     center = capture.sphere()[0]
     own = under.photographs.lights[0]
     away = -own.vector if distant else own.vector - center
-    distances = [np.linalg.norm(sensor.camera.position - center) for sensor in capture.sensors]
+    distances = [np.linalg.norm(shot.camera.position - center) for shot in capture.shots]
     assert np.linalg.norm(away) == pytest.approx(1.0 if distant else np.median(distances), rel=1e-4)
     assert np.degrees(np.arccos(away @ toward / np.linalg.norm(away))) < 8
     assert np.pi * under.reflectance(center, capture.exposure()) == pytest.approx(0.5, rel=1e-4)
@@ -159,10 +163,11 @@ def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture
 def test_one_material_is_the_mean_of_all_until_it_may_vary():
     material = {"diffuse": torch.tensor([[0.1, 0.2, 0.3], [0.5, 0.4, 0.9]]), "roughness": torch.tensor([0.2, 0.6])}
     plain = Lighting("environment", plain=0.6)
-    shared = plain.shared(material, 0.59)
+    shared = plain.material_at(0.59, material)
     torch.testing.assert_close(shared["diffuse"], torch.tensor([[0.3, 0.3, 0.6]]).expand(2, 3))
     torch.testing.assert_close(shared["roughness"], torch.tensor([0.4, 0.4]))
-    assert plain.shared(material, 0.6) is material and Lighting("environment").shared(material, 0.0) is material
+    assert plain.material_at(0.6, material) is material
+    assert Lighting("environment").material_at(0.0, material) is material
 
 
 def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path):
@@ -179,7 +184,7 @@ def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path
     scene.write_text(text)
     capture = mi_ring.load_capture(scene)
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, refine=("lamps",)))
-    assert fit.calibration.refined == ("lamps",)
+    assert fit.model.calibration.refined == ("lamps",)
     list(fit)
     refined = fit.calibrated()
     (found,) = lamp_lights(refined.scene)
@@ -190,7 +195,7 @@ def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path
         lamp_lights(capture.scene)[0].vector, wrong.vector, rtol=1e-5
     )  # the capture is left as it was
 
-    state, config = fit.state(), fit.config
+    state, config = fit.state(), fit.problem.config
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     (written,) = lamp_lights(again.scene)
@@ -211,23 +216,25 @@ def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     begun = tuple((tuple(light.vector), tuple(said[0].rgb)) for light in said)
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 12}, light="lamps", holdout=5)
     fit = mi_ring.Fit(capture, config, lighting=Lighting("lamps", begun))
-    assert fit.calibration.refined == ("light", "gain", "ambient", "lamps")
-    widths = fit.calibration.widths
+    assert fit.model.calibration.refined == ("light", "gain", "ambient", "lamps")
+    widths = fit.model.calibration.widths
     assert widths["light"] == widths["lamp"] == pytest.approx(0.3)  # nobody has measured where they are
     errors = [it.terms["rgb"] for it in fit]
     assert np.mean(errors[-4:]) < 0.8 * errors[0]
-    assert fit.confirmed["unexplained"] > 0 and fit.confirmed["before"] > 0  # of those that are kept out
+    validation = fit.course.validation
+    assert validation["unexplained"] > 0 and validation["before"] > 0  # of those that are kept out
     (before,) = lamp_lights(fit.calibrated().scene)
-    deviations(fit)
-    after = light_of(lamps_of(fit.surface.scene)[0])
+    covariance(fit.problem, fit.model, fit.renderer, 3)
+    after = light_of(lamps_of(fit.renderer.surface.scene)[0])
     np.testing.assert_allclose(after.rgb, before.rgb, rtol=1e-6)
     np.testing.assert_allclose(after.vector, before.vector, rtol=1e-6)
     resumed = mi_ring.Fit(capture, config, state=fit.state())
-    assert resumed.lighting == fit.lighting and len(resumed.calibration.lamp) == 1
+    assert resumed.problem.lighting == fit.problem.lighting and len(resumed.model.calibration.lamp) == 1
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert len(lamps_of(again.scene)) == 1
-    assert refined_of(again, mi_ring.Config(), 0.5) == ("light", "power", "ambient")  # the second is known now
+    refined = refined_of(again, mi_ring.Config(), "capture", 0.5)
+    assert refined == ("light", "power", "ambient")  # the second is known now
 
 
 def test_lamps_are_refined_where_there_are_some(small_capture):
@@ -236,11 +243,11 @@ def test_lamps_are_refined_where_there_are_some(small_capture):
         with pytest.raises(mi_ring.InputError, match="emitter: --refine lamps: the scene has none, point or direction"):
             mi_ring.Fit(capture, mi_ring.Config.preset("fast", light=light, refine=("lamps",)))
     one = mi_ring.Config.preset("fast", light="lamps", refine=("auto", "lamps"))
-    assert "lamps" not in refined_of(capture, one, 0.5)
+    assert "lamps" not in refined_of(capture, one, "lamps", 0.5)
     lamp = Light("point", np.array([30.0, 40, 50]), np.ones(3))
     under = replace(capture, scene=with_lamps(capture.scene, [lamp]))
-    calibration = Calibration(under, ["lamps", "scale"], np.zeros(3), 0.5, power=3.0)
+    calibration = Calibration(under, ["lamps", "scale"], Rig(under, np.zeros(3), 0.5, power=3.0, lamps=True))
     with torch.no_grad():
         calibration.scale += 1
         ratio = float(calibration.value("scale").exp())
-        np.testing.assert_allclose(calibration.lamps_now().strengths, np.full((1, 3), 3 * ratio), rtol=1e-5)
+        np.testing.assert_allclose(calibration.lamps().strengths, np.full((1, 3), 3 * ratio), rtol=1e-5)

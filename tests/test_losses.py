@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from mi_ring import images
-from mi_ring.fitting import priors, terms
+from mi_ring.fitting import losses, priors, terms
 from mi_ring.fitting.config import Config
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
 
@@ -26,12 +26,12 @@ NONE = torch.zeros(1, 1, 4, 3, dtype=torch.bool)
 def test_rgb_loss_by_hand():
     predicted, observed = pixels(0.1, 0.4, 0.0, 1.0), pixels(0.2, 0.2, 0.0, 0.4)
     # in units of the exposure 0.5: differences -0.2, 0.4, 0, 1.2
-    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l2").item() == pytest.approx((0.04 + 0.16 + 1.44) / 4)
-    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l1").item() == pytest.approx((0.2 + 0.4 + 1.2) / 4)
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l2").item() == pytest.approx((0.04 + 0.16 + 1.44) / 4)
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1").item() == pytest.approx((0.2 + 0.4 + 1.2) / 4)
     log = [math.log1p(8 * p) - math.log1p(8 * o) for p, o in ((0.1, 0.2), (0.4, 0.2), (0, 0), (1.0, 0.4))]
     log = sum(map(abs, log)) / 4
-    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(log, rel=1e-5)
-    assert terms.rgb_loss(predicted, observed, NONE, 0.5, "l1+log").item() == pytest.approx((0.45 + log) / 2, rel=1e-5)
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "log").item() == pytest.approx(log, rel=1e-5)
+    assert losses.rgb_loss(predicted, observed, NONE, 0.5, "l1+log").item() == pytest.approx((0.45 + log) / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["l2", "l1", "log", "l1+log"])
@@ -39,16 +39,16 @@ def test_a_clipped_pixel_says_at_least_this_bright(kind):
     clipped = torch.ones(1, 1, 2, 3, dtype=torch.bool)
     observed = pixels(1.0, 1.0)
     brighter = pixels(1.5, 3.0).clone().requires_grad_()
-    loss = terms.rgb_loss(brighter, observed, clipped, 0.3, kind)
+    loss = losses.rgb_loss(brighter, observed, clipped, 0.3, kind)
     loss.backward()
     assert loss == 0 and (brighter.grad == 0).all()
-    assert terms.rgb_loss(pixels(0.9, 1.0), observed, clipped, 0.3, kind) > 0
+    assert losses.rgb_loss(pixels(0.9, 1.0), observed, clipped, 0.3, kind) > 0
 
 
 def test_mask_loss_without_blur_is_the_mean_square():
     coverage = torch.tensor([[[1.0, 0.5], [0.0, 0.0]]])
     mask = torch.tensor([[[1.0, 1.0], [0.0, 1.0]]])
-    assert terms.mask_loss(coverage, mask, 0.1).item() == pytest.approx((0.25 + 1) / 4)
+    assert losses.mask_loss(coverage, mask, 0.1).item() == pytest.approx((0.25 + 1) / 4)
 
 
 def test_blur_is_a_gaussian_and_keeps_the_sum():
@@ -74,7 +74,7 @@ def test_mask_loss_feels_a_mask_it_does_not_touch():
     coverage.requires_grad_()
     mask = torch.zeros(1, 20, 20)
     mask[0, 10, 11] = 1.0
-    terms.mask_loss(coverage, mask, 3.0).backward()
+    losses.mask_loss(coverage, mask, 3.0).backward()
     gradient = coverage.grad[0, 10]
     assert gradient[8] < gradient[2]  # growing toward the mask pays, away from it does not
 
@@ -90,14 +90,14 @@ def test_velocity_loss_of_a_plane_wave_is_its_closed_form():
 
     # −Δ sin(k·x) = |k|² sin(k·x), so (I − αΔ)V = (1 + α|k|²) V
     expected = ((1 + alpha * 49) ** 2 * wave(x).square().sum(-1)).mean()
-    found = terms.velocity_loss(wave, x, alpha)
+    found = losses.velocity_loss(wave, x, alpha)
     # The stencil's relative error in Δ is about (k h)²/12 = 0.2 %, of which a third counts here.
     assert found.item() == pytest.approx(expected.item(), rel=2e-3)
 
 
 def test_velocity_loss_without_laplacian_is_the_mean_square():
     x = torch.randn(9, 3)
-    assert terms.velocity_loss(lambda p: 2 * p, x, 0.0).item() == pytest.approx(
+    assert losses.velocity_loss(lambda p: 2 * p, x, 0.0).item() == pytest.approx(
         (4 * x.square().sum(-1)).mean().item(), rel=1e-6
     )
 
@@ -107,20 +107,20 @@ def test_a_mask_that_is_in_doubt_counts_less_the_more_it_differs():
     mask, coverage = torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.01, 1.0]]])
     for doubt in (0.5, 0.2):
         wanted = (0.01**2 / (1 + (0.01 / doubt) ** 2) + 1 / (1 + 1 / doubt**2)) / 3
-        assert terms.mask_loss(coverage, mask, 0.1, doubt=doubt).item() == pytest.approx(wanted)
+        assert losses.mask_loss(coverage, mask, 0.1, doubt=doubt).item() == pytest.approx(wanted)
 
 
 def test_pixels_that_say_nothing_have_no_part_in_the_mask_loss():
     coverage, mask = torch.tensor([[[0.5, 1.0, 0.0]]]), torch.tensor([[[0.0, 0.0, 0.0]]])
     valid = torch.tensor([[[True, False, True]]])
-    assert terms.mask_loss(coverage, mask, 0.1, valid).item() == pytest.approx(0.25 / 3)
+    assert losses.mask_loss(coverage, mask, 0.1, valid).item() == pytest.approx(0.25 / 3)
 
 
 def test_pixels_that_say_nothing_have_no_part_in_the_colour_loss():
     predicted, observed = torch.rand(1, 2, 3, 3), torch.rand(1, 2, 3, 3)
     telling = torch.tensor([[[True, False, True], [False, False, True]]])
     clipped = torch.zeros(1, 2, 3, 3, dtype=torch.bool)
-    loss = terms.rgb_loss(predicted, observed, clipped, 0.5, "l1", telling)
+    loss = losses.rgb_loss(predicted, observed, clipped, 0.5, "l1", telling)
     expected = sum(
         float((predicted - observed)[0, y, x].abs().sum()) / 0.5 for y in range(2) for x in range(3) if telling[0, y, x]
     )
@@ -206,17 +206,20 @@ def test_columns_are_in_units_of_the_light_or_of_their_range():
 
 
 def test_priors_are_off_unless_asked_for_and_do_not_depend_on_units():
-    names = ["normal_variation", "material_variation", "material_rank"]
+    names = ["normal_variation", "material_rank"]
     assert all(Config().weights[name] == 0 for name in names)
     mesh = trimesh.creation.icosphere(subdivisions=3)
     for size, scale in ((1.0, 1.0), (50.0, 300.0)):
         ring = SimpleNamespace(radius=torch.tensor(size), brdf_net=BRDFNet(scale))
         tint = torch.tensor(mesh.vertices[:, :1] + 2).expand(-1, 3)
         material = {"diffuse": scale * tint, "specular": scale * tint[:, 0], "roughness": 0.2 * tint[:, 0]}
-        it = SimpleNamespace(vertices=torch.tensor(size * mesh.vertices), faces=mesh.faces, material=material,
-                             fit=SimpleNamespace(ring=ring))  # fmt: skip
+        vertices = torch.tensor(size * mesh.vertices)
+        it = SimpleNamespace(batch=SimpleNamespace(faces=mesh.faces),
+                             prediction=SimpleNamespace(vertices=vertices, material=material),
+                             context=SimpleNamespace(model=SimpleNamespace(ring=ring)))  # fmt: skip
         assert terms.default_terms["normal_variation"].function(it).item() == pytest.approx(1, rel=0.03)
         assert terms.default_terms["material_rank"].function(it).item() == pytest.approx(1)
         # The gradient of x along a sphere is sin of the angle to the axis, π/4 in the mean.
-        slope = terms.default_terms["material_variation"].function(it).item()
+        columns = priors.columns_of(material, ring.brdf_net)
+        slope = size * priors.variation_of_values(vertices, mesh.faces, columns).item()
         assert slope == pytest.approx(4.2 * math.pi / 4, rel=0.01)

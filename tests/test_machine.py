@@ -24,27 +24,27 @@ def write(path, text):
 
 
 def test_quota_of_a_container_by_version_1(tmp_path):
-    assert machine.quota(tmp_path) == float("inf")
+    assert machine.cpu_quota(tmp_path) == float("inf")
     write(tmp_path / "cpu/cpu.cfs_quota_us", "150000\n")
     write(tmp_path / "cpu/cpu.cfs_period_us", "100000\n")
-    assert machine.quota(tmp_path) == 1.5
+    assert machine.cpu_quota(tmp_path) == 1.5
     write(tmp_path / "cpu/cpu.cfs_quota_us", "-1\n")
-    assert machine.quota(tmp_path) == float("inf")
+    assert machine.cpu_quota(tmp_path) == float("inf")
 
 
 def test_quota_of_a_container_by_version_2(tmp_path):
     write(tmp_path / "cpu.max", "300000 100000\n")
-    assert machine.quota(tmp_path) == 3
+    assert machine.cpu_quota(tmp_path) == 3
     write(tmp_path / "cpu.max", "max 100000\n")
-    assert machine.quota(tmp_path) == float("inf")
+    assert machine.cpu_quota(tmp_path) == float("inf")
     write(tmp_path / "cpu.max", "nonsense\n")
-    assert machine.quota(tmp_path) == float("inf")
+    assert machine.cpu_quota(tmp_path) == float("inf")
 
 
 def test_cores_are_at_least_one_and_heed_the_quota(monkeypatch):
-    monkeypatch.setattr(machine, "quota", lambda root: 0.3)
+    monkeypatch.setattr(machine, "cpu_quota", lambda root: 0.3)
     assert machine.cores() == 1
-    monkeypatch.setattr(machine, "quota", lambda root: float("inf"))
+    monkeypatch.setattr(machine, "cpu_quota", lambda root: float("inf"))
     if hasattr(os, "sched_getaffinity"):
         assert machine.cores() == len(os.sched_getaffinity(0))
         monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS and Windows
@@ -201,7 +201,7 @@ def test_what_nobody_reads_is_dropped(tmp_path, monkeypatch):
     with (tmp_path / "pipe").open("w") as pipe:
         monkeypatch.setattr(stream, "fileno", pipe.fileno)
         monkeypatch.setattr(sys, "stdout", stream)
-        with progress.outliving_readers():
+        with progress.tolerating_closed_output():
             assert sys.stdout.encoding == "utf-8" and not sys.stdout.isatty()
             print("one")
             stream.trouble = errno.ENOSPC
@@ -237,7 +237,7 @@ def test_with_one_thread_nothing_else_runs_meanwhile(monkeypatch):
     for count, several in ((1, False), (2, True)):
         monkeypatch.setattr(machine.dr, "thread_count", lambda count=count: count)
         where.clear()
-        assert list(machine.in_turn(seen, seen, "ab")) == [("a", ("a",)), ("b", ("b",))]
+        assert list(machine.pipelined(seen, seen, "ab")) == [("a", ("a",)), ("b", ("b",))]
         assert (len({*where}) > 1) is several
 
 
@@ -263,14 +263,14 @@ def heard_signals():
 def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, capsys, heard_signals):
     """Mitsuba does where it comes while one of our plugins is made."""
     handler = signal.getsignal(number)
-    with pytest.raises(command.Interrupted) as stop, command.going_on():
+    with pytest.raises(command.Interrupted) as stop, command.resumable():
         try:
             signal.raise_signal(number)
         except KeyboardInterrupt as error:
             raise InputError("scene.xml: failed to instantiate a plugin") from error
-    assert command.status_of(stop.value) == 128 + number and signal.getsignal(number) is handler
+    assert command.exit_status(stop.value) == 128 + number and signal.getsignal(number) is handler
     assert capsys.readouterr().err == "interrupted; the same command goes on\n"
-    with pytest.raises(InputError, match="no signal"), command.going_on():
+    with pytest.raises(InputError, match="no signal"), command.resumable():
         raise InputError("no signal")
     assert not command.interrupted()
 

@@ -14,7 +14,7 @@ from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets.brdf_net import Parameter
 from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import ring_state
 
 PRINCIPLED = """<bsdf type="principled">
@@ -60,7 +60,7 @@ def equal(a, b):
 
 def test_its_own_material_changes_nothing(tmp_path):
     ring = wild(1)
-    dress(ring, MaterialOptions(material=save(ring, tmp_path / "ring.pt")))
+    edit_material(ring, MaterialOptions(material=save(ring, tmp_path / "ring.pt")))
     again = wild(1)
     assert torch.equal(ring.surface(S), again.surface(S)) and equal(ring.brdf_net(S), again.brdf_net(S))
 
@@ -73,7 +73,7 @@ def test_anothers_material_is_on_this_shape(tmp_path, mesh):
     ring, other = wild(1, domain=domain()), wild(2, domain=domain(), center=[0.0, 0, 0], radius=70.0, scale=12.0)
     (tmp_path / "other").mkdir()
     save(other, tmp_path / "other" / "ring.pt")
-    dress(ring, MaterialOptions(material=tmp_path / "other"))
+    edit_material(ring, MaterialOptions(material=tmp_path / "other"))
     before = wild(1, domain=domain())
     assert torch.equal(ring.surface(S), before.surface(S)) and not torch.equal(ring.surface(S), other.surface(S))
     assert equal(ring.brdf_net(S), other.brdf_net(S)) and not equal(ring.brdf_net(S), before.brdf_net(S))
@@ -91,7 +91,7 @@ def test_another_bsdf_comes_along(tmp_path):
         np.testing.assert_allclose(np.array(ply[f"vertex_{name}"]), value.detach().ravel(), rtol=1e-6)
     assert "vertex_diffuse" not in ply
     ring = wild(1, indirect=True)
-    dress(ring, MaterialOptions(material=tmp_path / "other.pt"))
+    edit_material(ring, MaterialOptions(material=tmp_path / "other.pt"))
     assert ring.bsdf == PRINCIPLED and not ring.indirect
 
 
@@ -133,7 +133,7 @@ def test_a_material_of_another_start_is_carried_by_way_of_the_sphere(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=5)
     domains = [Domain(ball.vertices * axes, ball.faces) for axes in ([1, 1, 1.02], [2, 2, 2])]
     ring, other = wild(1, domain=domains[0]), wild(2, domain=domains[1])
-    dress(ring, MaterialOptions(material=save(other, tmp_path / "other.pt")))
+    edit_material(ring, MaterialOptions(material=save(other, tmp_path / "other.pt")))
     # Nearly spheres both: each point corresponds to that in the same direction.
     s = domains[0].sample(3)[0]
     for name, value in other.brdf_net(2 * torch.nn.functional.normalize(s)).items():
@@ -145,7 +145,7 @@ def test_a_material_of_another_start_is_carried_by_way_of_the_sphere(tmp_path):
 
 def test_edits_are_what_they_say():
     ring, plain = wild(1), wild(1).brdf_net(S)
-    dress(ring, MaterialOptions(specular_scale=2.0, roughness_add=0.5, tint=(0.5, 1.0, 3.0)))
+    edit_material(ring, MaterialOptions(specular_scale=2.0, roughness_add=0.5, tint=(0.5, 1.0, 3.0)))
     edited = ring.brdf_net(S)
     torch.testing.assert_close(edited["diffuse"], plain["diffuse"] * torch.tensor([0.5, 1, 3]))
     torch.testing.assert_close(edited["specular"], 2 * plain["specular"])
@@ -156,7 +156,7 @@ def test_edits_are_what_they_say():
 
 def test_edits_stay_in_the_ranges_of_the_fit():
     ring, plain = wild(1, parameters=PREDICTED, bsdf=PRINCIPLED), wild(1, parameters=PREDICTED).brdf_net(S)
-    dress(ring, MaterialOptions(roughness_add=-0.25, tint=(9.0, 1.0, 0.0)))
+    edit_material(ring, MaterialOptions(roughness_add=-0.25, tint=(9.0, 1.0, 0.0)))
     edited = ring.brdf_net(S)
     torch.testing.assert_close(edited["roughness"], (plain["roughness"] - 0.25).clamp(min=0.2))
     assert (edited["roughness"] == 0.2).any() and edited["roughness"].max() > 0.3
@@ -168,7 +168,7 @@ def test_two_edits_of_one_parameter_are_both_made():
     """The reflectance of a metal is its highlight and its colour."""
     metal = [Parameter("specular_reflectance", 3, 0.0, math.inf)]
     ring, plain = wild(1, parameters=metal, bsdf=METAL), wild(1, parameters=metal).brdf_net(S)
-    dress(ring, MaterialOptions(specular_scale=0.5, tint=(1.0, 0.2, 3.0)))
+    edit_material(ring, MaterialOptions(specular_scale=0.5, tint=(1.0, 0.2, 3.0)))
     torch.testing.assert_close(
         ring.brdf_net(S)["specular_reflectance"], plain["specular_reflectance"] * torch.tensor([0.5, 0.1, 1.5])
     )
@@ -177,13 +177,13 @@ def test_two_edits_of_one_parameter_are_both_made():
 def test_no_edit_is_none():
     ring = wild(1)
     net = ring.brdf_net
-    dress(ring, MaterialOptions())
+    edit_material(ring, MaterialOptions())
     assert ring.brdf_net is net
 
 
 def test_another_material_is_edited_as_it_is(tmp_path):
     ring, other = wild(1), wild(2)
-    dress(ring, MaterialOptions(material=save(other, tmp_path / "other.pt"), specular_scale=3.0))
+    edit_material(ring, MaterialOptions(material=save(other, tmp_path / "other.pt"), specular_scale=3.0))
     torch.testing.assert_close(ring.brdf_net(S)["specular"], 3 * other.brdf_net(S)["specular"])
     assert torch.equal(ring.brdf_net(S)["diffuse"], other.brdf_net(S)["diffuse"])
 
@@ -200,7 +200,7 @@ def test_another_material_is_edited_as_it_is(tmp_path):
 )
 def test_an_edit_that_is_none_is_one_line(options, words):
     with pytest.raises(InputError) as error:
-        dress(wild(1), MaterialOptions(**options))
+        edit_material(wild(1), MaterialOptions(**options))
     assert "\n" not in str(error.value) and all(word in str(error.value) for word in words), error.value
 
 
@@ -212,7 +212,7 @@ def test_an_edit_that_is_none_is_one_line(options, words):
 def test_an_edit_of_what_a_material_lacks_names_what_it_has(options, word):
     haze = [Parameter("haze", 1, 0.0, 1.0), Parameter("flatness", 1, 0.0, 1.0)]
     with pytest.raises(InputError, match=f"^{word}: .*haze, flatness"):
-        dress(wild(1, parameters=haze), MaterialOptions(**options))
+        edit_material(wild(1, parameters=haze), MaterialOptions(**options))
 
 
 # The flow at any time, and the domain's nearest points, on which films and exports rest

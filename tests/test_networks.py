@@ -86,7 +86,7 @@ def plain(net, x):
 def threads(request, monkeypatch):
     threads, kept = request.param
     monkeypatch.setattr(chunks, "CHUNK", 16)
-    monkeypatch.setattr(chunks, "KEPT", kept)
+    monkeypatch.setattr(chunks, "MAX_STORED", kept)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     yield

@@ -4,6 +4,10 @@ import subprocess
 import sys
 
 import pytest
+from conftest import missing_package
+
+from mi_ring.errors import InputError
+from mi_ring.system import optional
 
 CODE = """
 import sys
@@ -49,3 +53,22 @@ def test_what_needs_one_says_so(package, command, arguments, small_capture, tmp_
     status, complaint = without(package, command, *arguments, cwd=tmp_path)
     assert status == 1 and "InputError" in complaint
     assert f"needs the package {package}, which is not installed; try `pip install {package}`" in complaint
+
+
+def test_tests_are_skipped_for_packages_that_are_not_there_and_for_nothing_else(monkeypatch):
+    with pytest.raises(InputError) as there:
+        monkeypatch.setattr(optional.importlib, "import_module", fails_for("xatlas"))
+        optional.need("xatlas", "textures")
+    said = str(there.value)
+    assert missing_package(there.value) is None or not optional.installed("xatlas")
+    monkeypatch.setattr(optional.importlib.util, "find_spec", lambda name: None)
+    assert missing_package(there.value) == "xatlas"
+    assert missing_package(AssertionError(said)) is missing_package(InputError(said)) is None
+    assert missing_package(ModuleNotFoundError("of ours", name="mi_ring.outlines")) is None
+
+
+def fails_for(package):
+    def import_module(name):
+        raise ModuleNotFoundError(f"No module named '{name}'", name=package)
+
+    return import_module

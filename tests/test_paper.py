@@ -25,19 +25,9 @@ from mi_ring.capture import scenefile
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection import fits
 from mi_ring.errors import InputError
-from mi_ring.experiments import engine, measures, published, recipes, single_view, slices, tables
-from mi_ring.experiments.catalogue import EXPERIMENTS, seeded
-from mi_ring.experiments.experiment import (
-    NOT_RUN,
-    QUICK,
-    Asked,
-    Column,
-    Experiment,
-    Made,
-    Outcome,
-    Run,
-    require_distinct,
-)
+from mi_ring.experiments import brdf_slices, datasets, engine, measures, published, selection, single_view, tables
+from mi_ring.experiments.catalogue import EXPERIMENTS
+from mi_ring.experiments.experiment import NOT_RUN, QUICK, Column, Experiment, ExperimentOptions, Outcome, Run
 from mi_ring.experiments.plots import bars, curves
 from mi_ring.fit import parse_options
 from mi_ring.fitting.config import Config
@@ -47,12 +37,13 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.rendering.photograph_lights import Lights
 from mi_ring.synthesis.materials import load_material, pattern_of
+from mi_ring.synthesis.object_on_table import shape_of
 from mi_ring.synthesis.options import SynthesizeConfig
 from mi_ring.synthesis.path_traced_capture import settings_of
-from mi_ring.synthesis.stage import shape_of
 from mi_ring.system import machine
 
 ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
+NO_DATA = datasets.Dataset("none", Path("none.xml"), Path("none"))
 TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
 
 
@@ -112,27 +103,27 @@ def test_every_run_is_one_that_a_fit_takes(known_capture, photographed_ball, tmp
 
 
 def require_valid(experiment, data, known_capture, seeds):
-    for asked in (
-        Asked(data, seeds=(3,)),
-        Asked(data, preset="paper", seeds=seeds),
-        Asked(data, (), "fast", quick=True),
+    for options in (
+        ExperimentOptions(data, seeds=(3,)),
+        ExperimentOptions(data, preset="paper", seeds=seeds),
+        ExperimentOptions(data, (), "fast", quick=True),
     ):
-        runs = experiment.runs(asked)
+        runs = experiment.runs(options)
         assert runs and len({run.name for run in runs}) == len(runs)
         for run in runs:
-            config = run.config(asked)
+            config = run.config(options)
             assert Path(run.name).name == run.name and set(experiment.columns).isdisjoint(run.labels)
-            assert config.iterations == QUICK["iterations"] or not asked.quick
-            if len(asked.seeds) == 1:  # reading options takes a while
-                command = parse_options([str(known_capture / "scene.xml"), *run.options(asked)])
+            assert config.iterations == QUICK["iterations"] or not options.quick
+            if len(options.seeds) == 1:  # reading options takes a while
+                command = parse_options([str(known_capture / "scene.xml"), *run.fit_options(options)])
                 assert {f.name: getattr(command, f.name) for f in dataclasses.fields(Config)} == vars(config)
 
 
 def test_what_the_paper_compares_is_what_runs_differ_in(known_capture):
     def of(name, *fields):
-        return {tuple(getattr(run.config(asked), f) for f in fields) for run in EXPERIMENTS[name].runs(asked)}
+        return {tuple(getattr(run.config(options), f) for f in fields) for run in EXPERIMENTS[name].runs(options)}
 
-    asked = Asked((known_capture,))
+    options = ExperimentOptions((known_capture,))
     assert of("steps", "steps") == {(t,) for t in (1, 2, 3, 5, 10, 20, 40)}
     assert {("ring", "sphere"), ("resnet", "sphere"), ("wide-resnet", "sphere")} <= of(
         "ablation", "shape_net", "domain"
@@ -140,19 +131,21 @@ def test_what_the_paper_compares_is_what_runs_differ_in(known_capture):
     assert {("linear", 16), ("octaves", 10), ("none", 16)} <= of("encoding", "encoding", "frequencies")
     assert of("genus", "domain") == {("sphere",), ("hull",)}
     assert of("table3", "refine") == {(("none",),), (("cameras",),)}
-    assert [run.labels["views"] for run in EXPERIMENTS["views"].runs(asked)] == [5, 10, 12]  # it has twelve
+    assert [run.labels["views"] for run in EXPERIMENTS["views"].runs(options)] == [5, 10, 12]  # it has twelve
 
 
 def test_labels_say_what_runs_are(known_capture):
     """Whatever the preset is; and a run is called the same whatever seeds stand beside it."""
     for preset in ("default", "paper"):
-        asked = Asked((known_capture,), preset=preset)
-        for run in EXPERIMENTS["ablation"].runs(asked):
+        options = ExperimentOptions((known_capture,), preset=preset)
+        for run in EXPERIMENTS["ablation"].runs(options):
             if told := re.search(r"T = (\d+)", str(run.labels["network"])):
-                assert run.config(asked).steps == int(told[1])
-    one, two = (EXPERIMENTS["table1"].runs(Asked((known_capture,), seeds=seeds)) for seeds in ((0,), (0, 3)))
+                assert run.config(options).steps == int(told[1])
+    one, two = (
+        EXPERIMENTS["table1"].runs(ExperimentOptions((known_capture,), seeds=seeds)) for seeds in ((0,), (0, 3))
+    )
     assert [run.name for run in two] == [one[0].name, f"{one[0].name}-3"]
-    gloss = Asked(materials=("roughconductor alpha=0.1", "roughconductor alpha=0.3"), seeds=(0, 1))
+    gloss = ExperimentOptions(materials=("roughconductor alpha=0.1", "roughconductor alpha=0.3"), seeds=(0, 1))
     assert len({run.labels["material"] for run in EXPERIMENTS["specularity"].runs(gloss)}) == 2
 
 
@@ -220,30 +213,29 @@ def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
 
 def test_each_run_has_a_folder_of_its_own(known_capture):
     """Captures egg with seed 3 and egg-3, and one that would be among the records."""
-    egg, three, batch = (recipes.Given(name, known_capture / "scene.xml") for name in ("egg", "egg-3", "batch"))
-    seeds = seeded([Run(r.name, r, {"capture": r.name}) for r in (egg, three)], Asked(seeds=(0, 3)))
+    runs = [Run(name, datasets.given(known_capture), {"capture": name}) for name in ("egg", "egg-3", "batch")]
     with pytest.raises(InputError, match="DATA: two runs would both be called egg-3; rename a capture, leave out what"):
-        require_distinct(seeds)
+        trial(runs[:2]).runs(ExperimentOptions(seeds=(0, 3)))
     with pytest.raises(InputError, match="DATA: a run would be called batch, as the folder of records is; rename"):
-        require_distinct([Run(batch.name, batch, {})])
+        trial(runs[2:]).runs(ExperimentOptions())
 
 
 def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypatch, capsys):
     folders = []
-    monkeypatch.setattr(paper, "perform", lambda experiment, asked, out, *_: folders.append(out.name) or 2)
+    monkeypatch.setattr(paper, "run_experiment", lambda experiment, options, out, *_: folders.append(out.name) or 2)
     for options in ([], ["--preset", "fast"], ["--preset", "paper"], ["--quick"]):
         assert paper.main(["ablation", *options, "--out", str(tmp_path)]) == 1
     assert "ablation/table.md; 2 runs failed" in capsys.readouterr().out  # and no figure
     assert folders == ["ablation", "ablation-fast", "ablation-paper", "ablation-quick"]
     materials = [("diffuse reflectance=0.2", "diffuse"), ("diffuse reflectance=0.3", "diffuse")]
-    asked = [Asked((tmp_path / mesh,), two) for mesh in ("a.ply", "b/a.ply") for two in materials]
+    options = [ExperimentOptions((tmp_path / mesh,), two) for mesh in ("a.ply", "b/a.ply") for two in materials]
     for name, different in (("specularity", 6), ("stripes", 4)):
-        assert len({run.name for a in asked for run in EXPERIMENTS[name].runs(a)}) == different
+        assert len({run.name for a in options for run in EXPERIMENTS[name].runs(a)}) == different
 
 
 def test_a_capture_without_truth_is_refused(small_capture):
     with pytest.raises(InputError, match="has no truth, neither"):
-        recipes.given(small_capture)
+        datasets.given(small_capture)
 
 
 # The engine.
@@ -252,30 +244,30 @@ def test_a_capture_without_truth_is_refused(small_capture):
 def trial(runs):
     columns = {"normal_mean": Column("normals °"), "iou": Column("IoU", 3)}
     reference = [{"capture": "egg", "by": "somebody", "normal_mean": 5.0}]
-    return Experiment("A trial.", lambda asked: runs, columns, bars(("normal_mean", "°")), "none", reference)
+    return Experiment("A trial.", lambda options: runs, columns, bars(("normal_mean", "°")), "none", reference)
 
 
 def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, tmp_path, monkeypatch):
-    asked, out = Asked(preset="fast", threads=1, quick=True), tmp_path / "trial"
-    egg, broken = recipes.given(known_capture), recipes.Given("cup", tmp_path / "cup.xml")
+    options, out = ExperimentOptions(preset="fast", threads=1, quick=True), tmp_path / "trial"
+    egg, broken = datasets.given(known_capture), datasets.Dataset("cup", tmp_path / "cup.xml", tmp_path / "truth")
     runs = [Run(f"egg-{k}", egg, {"capture": "egg", "seed": k}, TINY | {"seed": k}, watched=k == 1) for k in (0, 1)]
     runs.insert(1, Run("cup", broken, {"capture": "cup", "seed": 0}, TINY))
 
-    assert engine.perform(trial(runs), asked, out, ["egg-0"]) == 0
+    assert engine.run_experiment(trial(runs), options, out, ["egg-0"]) == 0
     rows = list(csv.DictReader((out / "table.csv").open()))
     assert [row["state"] for row in rows] == ["", "not run", "not run", "", ""]  # with the mean of one
     ring = (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns
 
     measured = []
 
-    def evaluated(run, made):
+    def evaluated(run, *arguments):
         measured.append(run.name)
-        return measures.evaluated(run, made)
+        return measures.evaluated(run, *arguments)
 
     monkeypatch.setattr(engine, "evaluated", evaluated)
-    monkeypatch.setattr(engine, "show", Mock(wraps=engine.show))
-    assert engine.perform(trial(runs), asked, out) == 1
-    assert engine.show.call_count == 2  # nothing is new of the first
+    monkeypatch.setattr(engine, "write_table_and_figure", Mock(wraps=engine.write_table_and_figure))
+    assert engine.run_experiment(trial(runs), options, out) == 1
+    assert engine.write_table_and_figure.call_count == 2  # nothing is new of the first
     assert measured == ["egg-1"] and (out / "runs" / "egg-0" / "ring.pt").stat().st_mtime_ns == ring
     rows = list(csv.DictReader((out / "table.csv").open()))
     assert [(row["capture"], row["seed"], row["by"]) for row in rows] == [
@@ -293,16 +285,16 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
 
     # What is compared with has changed.
     time.sleep(0.01)
-    (egg.truth(out) / "mesh.ply").touch()
-    assert engine.perform(trial(runs[:1]), asked, out) == 0 and measured == ["egg-1", "egg-0"]
-    assert engine.perform(trial(runs[1:2]), asked, out) == 1 and not (out / "figure.png").exists()
+    (egg.truth / "mesh.ply").touch()
+    assert engine.run_experiment(trial(runs[:1]), options, out) == 0 and measured == ["egg-1", "egg-0"]
+    assert engine.run_experiment(trial(runs[1:2]), options, out) == 1 and not (out / "figure.png").exists()
 
     # The second was looked at in its course, which ends with its result.
-    made = Made(out / "runs" / "egg-1", egg.scene, egg.truth(out), out, asked)
-    course = measures.course(runs[2], made)
+    arguments = runs[2], out / "runs" / "egg-1", options
+    course = measures.course(*arguments)
     assert [row["iteration"] for row in course] == [1, 2] and 0 < course[0]["seconds"] < course[1]["seconds"]
     monkeypatch.setattr(measures, "LEVELS", (1, 2, 3))
-    levels = measures.by_level(runs[2], made)
+    levels = measures.by_level(*arguments)
     assert [row["vertices"] for row in levels] == [10 * 4**k + 2 for k in (1, 2, 3)]
     for row in (course[-1], levels[TINY["subdivisions"] - 1]):
         assert row["normal_mean"] == pytest.approx(float(rows[2]["normal_mean"]), abs=1e-3)
@@ -311,10 +303,10 @@ def test_a_trial_goes_on_where_it_stopped_and_shows_what_failed(known_capture, t
 def test_interrupts_are_no_deaths(known_capture, tmp_path, monkeypatch):
     begun = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(fits, "run", begun)
-    run = Run("egg", recipes.given(known_capture), {"capture": "egg"}, TINY)
+    run = Run("egg", datasets.given(known_capture), {"capture": "egg"}, TINY)
     for _ in range(engine.RETRIES + 2):
         with pytest.raises(KeyboardInterrupt):
-            engine.attempted(run, Asked(preset="fast", threads=1, quick=True), tmp_path / "trial")
+            engine.try_run(run, ExperimentOptions(preset="fast", threads=1, quick=True), tmp_path / "trial")
     assert begun.call_count == engine.RETRIES + 2
 
 
@@ -322,10 +314,10 @@ def test_a_figure_that_cannot_be_drawn_stops_nothing(tmp_path, capsys):
     def broken(ran):
         raise ValueError("too\nlarge")
 
-    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    run = Run("a", NO_DATA, {"capture": "egg", "seed": 0})
     (tmp_path / "figure.png").touch()  # of before
-    engine.show(
-        dataclasses.replace(trial([run]), figure=broken), [Outcome(run, None, [{"iou": 0.5}], "")], tmp_path, ""
+    engine.write_table_and_figure(
+        dataclasses.replace(trial([run]), figure=broken), [Outcome(run, Path(), [{"iou": 0.5}], "")], tmp_path, ""
     )
     assert capsys.readouterr().out == f"{tmp_path}/figure.png: cannot be drawn: too large\n"
     assert (tmp_path / "table.md").is_file() and not (tmp_path / "figure.png").exists()
@@ -333,9 +325,9 @@ def test_a_figure_that_cannot_be_drawn_stops_nothing(tmp_path, capsys):
 
 def of_labels(rows, **labels):
     """Outcomes of runs of an egg, one for each of some rows, with other values of labels; no row: one that failed."""
-    runs = [Run("a", recipes.Example("example"), {"capture": "egg", **dict(zip(labels, values))})
+    runs = [Run("a", NO_DATA, {"capture": "egg", **dict(zip(labels, values))})
             for values in zip(*labels.values())]  # fmt: skip
-    return [Outcome(run, None, [row], "") if row else Outcome(run, failed="burst") for run, row in zip(runs, rows)]
+    return [Outcome(run, Path(), [row], "") if row else Outcome(run, failed="burst") for run, row in zip(runs, rows)]
 
 
 def test_figures_leave_out_nothing():
@@ -372,9 +364,9 @@ def test_a_table_says_on_which_gpu(monkeypatch):
 
 
 def test_numbers_that_are_none_are_shown():
-    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    run = Run("a", NO_DATA, {"capture": "egg", "seed": 0})
     other = dataclasses.replace(run, name="b", labels={"capture": "egg", "seed": 1})
-    outcomes = [Outcome(run, None, [{"normal_mean": float("nan")}], ""), Outcome(other, failed="it | burst")]
+    outcomes = [Outcome(run, Path(), [{"normal_mean": float("nan")}], ""), Outcome(other, failed="it | burst")]
     experiment = trial([run, other])
     rows = tables.table_of(experiment, outcomes)
     names = tables.headings(experiment, outcomes, rows)
@@ -385,9 +377,12 @@ def test_numbers_that_are_none_are_shown():
 
 
 def test_a_mean_is_of_numbers_that_all_have():
-    run = Run("a", recipes.Example("example"), {"capture": "egg", "seed": 0})
+    run = Run("a", NO_DATA, {"capture": "egg", "seed": 0})
     other = dataclasses.replace(run, name="b", labels={"capture": "egg", "seed": 1})
-    outcomes = [Outcome(run, None, [{"normal_mean": 1.0, "iou": 0.5}], ""), Outcome(other, None, [{"iou": 0.7}], "")]
+    outcomes = [
+        Outcome(run, Path(), [{"normal_mean": 1.0, "iou": 0.5}], ""),
+        Outcome(other, Path(), [{"iou": 0.7}], ""),
+    ]
     mean = tables.means(trial([run, other]), outcomes)
     assert mean == [{"capture": "egg", "seed": "mean of 2", "by": "ours", "state": "", "iou": pytest.approx(0.6)}]
 
@@ -399,13 +394,13 @@ def test_slices_are_those_of_equation_1():
     random = np.random.default_rng(1)
     material = {"diffuse": random.uniform(0.1, 0.5, (5, 3)), "specular": random.uniform(0.02, 0.2, 5),
                 "roughness": random.uniform(0.2, 0.8, 5)}  # fmt: skip
-    found = slices.slices(slices.bsdf_of(material), 5)
-    cosine, r = np.cos(slices.ANGLES), material["roughness"][:, None]
+    found = brdf_slices.brdf_slices(brdf_slices.bsdf_of(material), 5)
+    cosine, r = np.cos(brdf_slices.ANGLES), material["roughness"][:, None]
     d = r**2 / (cosine**2 * (r**2 - 1) + 1) ** 2
-    g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(slices.ANGLES) ** 2))) ** 2
+    g = (2 / (1 + np.sqrt(1 + r**2 * np.tan(brdf_slices.ANGLES) ** 2))) ** 2
     gloss = material["specular"][:, None] * d * g / np.pi / cosine**2
     np.testing.assert_allclose(found, material["diffuse"][:, None] + gloss[..., None], rtol=1e-3)
-    grey = slices.slices(load_material("diffuse reflectance=0.3,0.6,0.9", "--material", False), 1)
+    grey = brdf_slices.brdf_slices(load_material("diffuse reflectance=0.3,0.6,0.9", "--material", False), 1)
     np.testing.assert_allclose(grey, np.broadcast_to(np.array([0.3, 0.6, 0.9]) / np.pi, grey.shape), rtol=1e-5)
 
 
@@ -424,12 +419,12 @@ def test_places_of_the_second_material_are_where_it_is_seen():
     config = SynthesizeConfig(Path(), Path(), "diffuse reflectance=0,0,0", "diffuse reflectance=1,1,1", bands=5)
     black, white = (load_material(str(m), "", False) for m in (config.material, config.second))
     pattern = pattern_of("stripes", np.asarray(ball.vertices), 5, 1, "")
-    scene = mi.load_dict({"type": "scene", "ball": shape_of(ball, None, pattern.of(black, white), pattern)})
+    scene = mi.load_dict({"type": "scene", "ball": shape_of(ball, None, pattern.blend(black, white), pattern)})
     points = ball.triangles_center
     out = mi.Vector3f(*map(mi.Float, ball.face_normals.T))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(mi.Float, points.T)) + out, -out))
     seen = np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi))[0] > 0.1
-    found = slices.second_at(config, ball.bounds, points)
+    found = brdf_slices.is_second_material(config, ball.bounds, points)
     assert np.array_equal(found, seen) and 0.3 < found.mean() < 0.7
 
 
@@ -439,15 +434,18 @@ def test_each_point_has_its_stripe_however_coarse_the_mesh_is():
     config = SynthesizeConfig(Path(), Path(), second="diffuse", bands=6)
     heights = np.array([9.9, 10.4, 11.5, 12.9, 13.1, 14.6, 15.9, 16.2])
     points = np.stack([np.linspace(-4, 4, 8), heights, np.linspace(6, -2, 8)], 1)
-    assert slices.second_at(config, bounds, points).tolist() == [k % 2 == 1 for k in (0, 0, 1, 2, 3, 4, 5, 5)]
+    assert brdf_slices.is_second_material(config, bounds, points).tolist() == [
+        k % 2 == 1 for k in (0, 0, 1, 2, 3, 4, 5, 5)
+    ]
 
 
 def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path, monkeypatch):
     """Concentric ones: between them it is 1.5 mm, along a ray that passes the middle at a distance b a little more."""
     monkeypatch.setattr(surfaces, "POINTS", 2000)
     monkeypatch.setattr(evaluation, "compare_photographs", lambda *_: ({}, [{}]))  # which are no lengths
-    part = recipes.Part("part", recipes.given(known_capture), 3)
-    scene = part.made(tmp_path / "captures")
+    part = datasets.Subset.of(tmp_path / "part", datasets.given(known_capture), 3)
+    part.prepare()
+    part, scene = dataclasses.replace(part, truth=tmp_path / "truth"), part.scene
     radius, more, ball = 16.0, 1.5, trimesh.creation.icosphere(subdivisions=4)
     ring = FittedObject(CENTER, radius, scale=0.5, subdivisions=2)
     torch.save(ring_state(ring), tmp_path / "ring.pt")
@@ -457,11 +455,10 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
     (tmp_path / "truth").mkdir()
     for file, r in (("mesh.ply", radius + more), ("truth/mesh.ply", radius)):
         trimesh.Trimesh(CENTER + r * ball.vertices, ball.faces).export(tmp_path / file)
-    made = Made(tmp_path, scene, tmp_path / "truth", tmp_path / "captures", Asked())
-    (row,) = measures.in_millimetres(Run("ball", part, {}), made)
+    (row,) = measures.in_millimetres(Run("ball", part, {}), tmp_path, ExperimentOptions())
     depths = []
-    for sensor in load_capture(scene, images=False).sensors:
-        camera = sensor.camera
+    for shot in load_capture(scene, images=False).shots:
+        camera = shot.camera
         x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in camera.size))
         rays = np.stack([(camera.centre[0] - x) / camera.focal[0], (camera.centre[1] - y) / camera.focal[1], x**0], -1)
         rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.to_world[:3, :3].T
@@ -475,8 +472,9 @@ def test_errors_in_millimetres_are_those_of_two_spheres(known_capture, tmp_path,
 
 def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp_path):
     file, middle, radius = photographed_ball
-    recipe = single_view.SingleView("single-ball", file)
-    scene = recipe.made(tmp_path / "captures")
+    scene = tmp_path / "captures/ball/scene.xml"
+    dataset = single_view.SingleView.of(scene.parent, file)
+    dataset.prepare()
     center, size = load_capture(scene).sphere()
     assert np.linalg.norm(center - middle) < 3 and size == pytest.approx(radius, rel=0.05)
     folder = tmp_path / "run"
@@ -484,101 +482,101 @@ def test_photographs_from_one_side_are_where_the_truth_is(photographed_ball, tmp
     ball = trimesh.creation.icosphere(subdivisions=5)
     trimesh.Trimesh(middle + radius * ball.vertices, ball.faces).export(folder / "mesh.ply")
     (folder / "log.jsonl").write_text('{"seconds": 7.0}\n')
-    made = Made(folder, scene, tmp_path / "none", tmp_path / "captures", Asked())
-    (row,) = measures.normals_from_one_side(Run("ball", recipe, {}), made)
+    (row,) = measures.single_view_normals(Run("ball", dataset, {}), folder, ExperimentOptions())
     assert row["normal_mean"] < 0.5 and row["missed"] < 2 and row["seconds"] == 7
     capture = load_capture(scene)
     seen, _, normals, _ = hits(load_true_mesh(folder / "mesh.ply")[1], capture.photograph(0))
     for k, observed in enumerate(capture.observe([0, 1, 2]).rgb.numpy()):
-        light = Lights.of(capture.sensors)[k]
+        light = Lights.of(capture.shots)[k]
         brightness = ALBEDO * light.rgb * np.maximum(normals @ -light.vector, 0)[:, None]  # by Lambert
         there = seen & (observed.reshape(-1, 3) > 0).any(1)
         assert there.sum() > 0.5 * seen.sum()
         np.testing.assert_allclose(observed.reshape(-1, 3)[there], brightness[there], atol=0.01)
     with pytest.raises(InputError, match="pixels_uint16: is of float64, must be of uint16"):
         np.savez(tmp_path / "float.npz", **{**np.load(file), "pixels_uint16": np.load(file)["pixels_uint16"] / 65535})
-        single_view.SingleView("float", tmp_path / "float.npz").read()
+        dataclasses.replace(dataset, file=tmp_path / "float.npz").read()
     with pytest.raises(InputError, match=r"light_int: is of shape \(2, 3\), must be \(3, 3\) by mask and"):
         np.savez(file, **{**np.load(file), "light_int": np.ones((2, 3))})
-        recipe.read()
+        dataset.read()
     with pytest.raises(InputError, match="has no array light_dir of 2 dimensions"):
         np.savez(file, **{k: v for k, v in np.load(file).items() if k != "light_dir"})
-        recipe.read()
+        dataset.read()
 
 
 def test_captures_of_one_name_have_folders_of_their_own(tmp_path):
-    config = SynthesizeConfig(Path(), Path(), "plastic roughness=0.2")
-    cups = [recipes.Synthetic("cup", c, mesh) for c, mesh in [
-        (config, tmp_path / "a/cup.ply"), (config, tmp_path / "b/cup.ply"),
-        (dataclasses.replace(config, material="plastic roughness=0.3"), tmp_path / "a/cup.ply"),
-    ]]  # fmt: skip
-    assert len({cup.place(tmp_path) for cup in cups}) == 3
+    cups = [selection.path_traced(ExperimentOptions(), tmp_path / mesh, f"plastic roughness={roughness}")
+            for mesh, roughness in (("a/cup.ply", 0.2), ("b/cup.ply", 0.2), ("a/cup.ply", 0.3))]  # fmt: skip
+    assert {cup.name for cup in cups} == {"cup"} and len({cup.scene for cup in cups}) == 3
 
 
 def test_parts_and_perturbed_captures_are_of_the_same_photographs(known_capture, tmp_path):
-    egg = recipes.given(known_capture)
+    egg = datasets.given(known_capture)
     whole = load_capture(egg.scene)
-    part = recipes.Part("part", egg, 5)
-    some = load_capture(part.made(tmp_path))
-    assert [sensor.id() for sensor in some.sensors] == ["000", "003", "006", "008", "011"]
-    assert part.truth(tmp_path) == known_capture / "truth"
+
+    def made(dataset):
+        dataset.prepare()
+        return dataset.scene
+
+    part = datasets.Subset.of(tmp_path / "part", egg, 5)
+    some = load_capture(made(part))
+    assert [shot.name for shot in some.shots] == ["000", "003", "006", "008", "011"]
+    assert part.truth == known_capture / "truth"
     torch.testing.assert_close(some.observe([1]).rgb, whole.observe([3]).rgb)
-    scene = part.made(tmp_path)
-    before = scene.stat().st_ino
-    assert part.made(tmp_path).stat().st_ino == before  # it is there already
-    more = recipes.Part("part", egg, 6)
-    assert len(load_capture(more.made(tmp_path))) == 6  # of the same name
-    wrong = recipes.Perturbed("wrong", egg, 0.5, 0)
-    other = load_capture(wrong.made(tmp_path))
+    before = part.scene.stat().st_ino
+    assert made(part).stat().st_ino == before  # it is there already
+    more = datasets.Subset.of(tmp_path / "part", egg, 6)
+    assert len(load_capture(made(more))) == 6  # of the same name
+    wrong = datasets.PerturbedCameras.of(tmp_path / "wrong", egg, 0.5, 0)
+    other = load_capture(made(wrong))
     torch.testing.assert_close(other.observe([3]).rgb, whole.observe([3]).rgb)
-    assert 0.4 < measures.turns(egg.scene, other.path) < 1.4  # √3 · 0.5° but for chance
-    assert measures.turns(egg.scene, egg.scene) < 1e-3
+    assert 0.4 < measures.rotation_error(egg.scene, other.path) < 1.4  # √3 · 0.5° but for chance
+    assert measures.rotation_error(egg.scene, egg.scene) < 1e-3
     said = egg.scene.with_name("calibrated.xml")
     said.write_text(re.sub('(<sensor type="photograph"[^>]*>)', r'\1<boolean name="calibrated" value="true"/>',
                            egg.scene.read_text()))  # fmt: skip
-    exact = recipes.Given("exact", said)
-    wrong = recipes.Perturbed("said", exact, 0.5, 0)
-    assert load_capture(exact.scene).known and not load_capture(wrong.made(tmp_path)).known
+    wrong = datasets.PerturbedCameras.of(tmp_path / "said", datasets.given(said), 0.5, 0)
+    assert load_capture(said).known and not load_capture(made(wrong)).known
     said.unlink()
 
 
 @dataclasses.dataclass(frozen=True)
-class Slow(recipes.Recipe):
+class Slow(datasets.CachedDataset):
     """A capture that takes a while and comes to nothing."""
 
     events: list
     pause: Callable = lambda: time.sleep(0.3)
 
-    def make(self, captures):
+    def origin(self):
         self.events.append("begun")
         self.pause()
         self.events.append("done")
         raise InputError("there is\nnone")
 
 
-def both_attempted(first, second, out):
+def both_tried(first, second, out):
     """What has become of two runs that are made at the same time."""
-    asked = Asked(preset="fast", quick=True)
+    options = ExperimentOptions(preset="fast", quick=True)
     with ThreadPoolExecutor(2) as pool:
-        return [*pool.map(lambda recipe: engine.attempted(Run("a", recipe, {}), asked, out).failed, [first, second])]
+        return [*pool.map(lambda dataset: engine.try_run(Run("a", dataset, {}), options, out).failed, [first, second])]
 
 
 def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsys):
     events = []
-    assert both_attempted(Slow("cup", events), Slow("cup", events), tmp_path / "out") == ["there is none"] * 2
+    two = [Slow.of(tmp_path / "cup", events) for _ in range(2)]
+    assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert events == ["begun", "done"] * 2
     assert "cup, which another process makes" in capsys.readouterr().out
     barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
-    two = [Slow(name, [], barrier.wait) for name in ("cup", "pot")]
-    assert both_attempted(*two, tmp_path / "out") == ["there is none"] * 2
+    two = [Slow.of(tmp_path / name, [], barrier.wait) for name in ("cup", "pot")]
+    assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert "waiting" not in capsys.readouterr().out
 
 
-def test_captures_of_runs_that_are_not_asked_for_are_not_made(tmp_path):
-    asked, events = Asked(preset="fast", quick=True), []
-    nowhere = recipes.Given("cup", tmp_path / "cup.xml")  # has no truth
-    for recipe in (Slow("cup", events), nowhere, recipes.Part("part", nowhere, 3)):
-        outcome = engine.attempted(Run("a", recipe, {}), asked, tmp_path / "out", wanted=False)
+def test_captures_of_runs_that_are_not_wanted_are_not_made(tmp_path):
+    options, events = ExperimentOptions(preset="fast", quick=True), []
+    nowhere = datasets.Dataset("cup", tmp_path / "cup.xml", tmp_path / "truth")
+    for dataset in (Slow.of(tmp_path / "cup", events), nowhere, datasets.Subset.of(tmp_path / "part", nowhere, 3)):
+        outcome = engine.try_run(Run("a", dataset, {}), options, tmp_path / "out", wanted=False)
         assert outcome.failed == NOT_RUN and not events
 
 
@@ -590,11 +588,11 @@ def test_a_converted_capture_is_made_again_when_any_of_its_files_changes(tmp_pat
     for name in names:
         (bear / name).touch()
     written = []
-    monkeypatch.setattr(recipes, "write_scene", lambda source: written.append(source.scene.write_text("<scene/>")))
-    recipe = recipes.DiligentObject("bear", bear)
+    monkeypatch.setattr(datasets, "write_scene", lambda source: written.append(source.scene.write_text("<scene/>")))
+    dataset = datasets.DiligentObject.of(tmp_path / "captures/bear", bear)
     for count, name in enumerate(names, 1):
-        recipe.made(tmp_path / "captures")
-        recipe.made(tmp_path / "captures")
+        dataset.prepare()
+        dataset.prepare()
         assert len(written) == count
         os.utime(bear / name, (count, count))
 

@@ -424,7 +424,7 @@ mi.set_variant("llvm_ad_rgb")
 scene, sensors = path_tracing.open_lit_scene(Path(sys.argv[1]))
 assert len(sensors) == 1 and not direct_light.shared_emitters(scene)
 assert sum(isinstance(e, path_tracing.flash.Flash) for e in scene.emitters()) == 1
-assert loading.load_capture(sys.argv[1], images=False).sensors
+assert loading.load_capture(sys.argv[1], images=False).shots
 """
 
 

@@ -57,9 +57,9 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     center, radius = capture.sphere()
     np.testing.assert_allclose(center, 0, atol=0.02)
     assert 1.0 < 18 * radius / 2.5 < 1.7  # of the ellipsoid's mean axis; the unit is the distance of the cameras
-    distances = [np.linalg.norm(sensor.camera.position) for sensor in capture.sensors]
+    distances = [np.linalg.norm(shot.camera.position) for shot in capture.shots]
     assert np.median(distances) == pytest.approx(1, abs=0.02)
-    camera, light = capture.sensors[3].camera, capture.photographs.lights.positions()[3]
+    camera, light = capture.shots[3].camera, capture.photographs.lights.positions()[3]
     local = camera.to_world[:3, :3].T @ (light - camera.position)
     np.testing.assert_allclose(local, [-0.1, 0.05, 0], atol=1e-5)  # Mitsuba's axes
     assert capture.reflectance(np.zeros(3), capture.exposure()) * np.pi > 1.5  # not known: interreflection is left out

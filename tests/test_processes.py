@@ -17,7 +17,8 @@ from mi_ring.system.files import is_sealed
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="PyTorch is built without gloo")
 
-#: One step by all processes and by the first alone; then the command, in which the second process is killed.
+#: A step of a fit by both processes, and of the same fit by the first alone; then the command, in which the second
+#: process is killed.
 CODE = """
 import os, signal, sys
 from pathlib import Path
@@ -26,6 +27,7 @@ import mi_ring
 from mi_ring import fit as command
 from mi_ring.fitting import processes
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.renderer import Renderer
 from mi_ring.system.machine import threads_of
 
 folder, scene = sys.argv[1:3]
@@ -34,48 +36,50 @@ small = {"levels": (2,), "widths": (28,), "shares": (1.0,), "domain": "sphere", 
          "precision": "float32"}
 
 def step(fit):
-    fit.iteration = fit.iterations // 2
-    it = fit.predict()
-    loss = fit.weigh(it)
-    for optimizer in fit.lookers:
-        optimizer.look(it)
-    for optimizer in fit.optimizers:
-        optimizer.zero_grad()
-    (loss + 0 * it.vertices.sum()).backward()
-    parts = {"shape": fit.ring.shape_net, "brdf": fit.ring.brdf_net, "calibration": fit.calibration}
-    fit.processes.sum_gradients([p for part in parts.values() for p in part.parameters()])
-    found = {name: torch.cat([p.grad.flatten() for p in part.parameters() if p.grad is not None])
-             for name, part in parts.items()}
-    powers, poses = fit.lookers
-    found |= {"powers": torch.stack([value for _, value in powers.seen]) if powers.seen else torch.zeros(1),
-              "curvature": poses.seen[1], "room": fit.calibration.room.vector, "loss": torch.tensor(it.loss),
-              "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.terms]),
+    found, optimisation, calibration = {}, fit.optimisation, fit.model.calibration
+    parts = {"shape": fit.ring.shape_net, "brdf": fit.ring.brdf_net, "calibration": calibration}
+    backward = optimisation.backward
+
+    def noting(loss, it):  # before the gradients are clipped
+        backward(loss, it)
+        found.update({name: torch.cat([p.grad.flatten() for p in part.parameters() if p.grad is not None])
+                      for name, part in parts.items()})
+
+    optimisation.backward = noting
+    fit.course.iteration = fit.iterations // 2
+    it = fit.step()
+    _, exposure, pose = optimisation.solvers
+    seen = [value for _, value in exposure.seen]
+    found |= {"powers": torch.stack(seen) if seen else torch.zeros(1), "curvature": pose.seen[1],
+              "room": calibration.room.vector, "loss": torch.tensor(it.loss),
+              "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),
-              "averages": torch.stack([picture for _, picture in fit.averages.pictures.values()])}
+              "averages": torch.stack([picture for _, picture in fit.renderer.average.pictures.values()]),
+              "stepped": torch.cat([p.detach().flatten() for p in fit.model.parameters()])}
     return found
 
 capture = mi_ring.load_capture(scene)
-with processes.joined() as team, threads_of(1):
-    assert team.count == 2
-    shared, alone = (Fit(capture, mi_ring.Config(**small)) for _ in range(2))
-    alone.processes = processes.ALONE
-    for batch in 5, 1:  # of the one photograph one process has nothing
-        shared.config = alone.config = mi_ring.Config(batch=batch, **small)
-        found = step(shared)
-        if team.rank == 0:
-            torch.save([found, step(alone)], f"{folder}/batch{batch}.pt")
+configs = [mi_ring.Config(batch=batch, **small) for batch in (5, 1)]  # of one photograph one process has nothing
+with threads_of(1):
+    alone = [Fit(capture, config) for config in configs]
+    with processes.joined() as team:
+        assert team.count == 2
+        for config, single in zip(configs, alone):
+            found = step(Fit(capture, config))
+            if team.rank == 0:
+                torch.save([found, step(single)], f"{folder}/batch{config.batch}.pt")
 
 try:
     command.main([scene, "--iterations", "0"])
 except (mi_ring.InputError, SystemExit) as error:
     Path(folder, f"mistake{os.environ['RANK']}.txt").write_text(repr(error))
 
-predict = Fit.predict
-def killed(fit):
-    if fit.iteration == 6 and os.environ["RANK"] == "1":
+predict = Renderer.predict
+def killed(renderer, problem, model, batch):
+    if batch.number == 7 and os.environ["RANK"] == "1":
         os.kill(os.getpid(), signal.SIGKILL)
-    return predict(fit)
-Fit.predict = killed
+    return predict(renderer, problem, model, batch)
+Renderer.predict = killed
 sys.exit(command.main(sys.argv[3:]))
 """
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--subdivisions", "3", "--batch", "5",

@@ -14,7 +14,8 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene import xml_elements
 
 QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
@@ -38,7 +39,7 @@ def arguments(path, out):
 
 def test_parameters_have_the_channels_of_their_constants_and_start_there(scene):
     loaded = load_capture(scene[0])
-    (colour, rough), xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
+    (colour, rough), xml = reflectance.predicted_parameters(loaded, PREDICT)
     assert colour[:4] == ("base_color", 3, 0.0, 0.9) and rough[:4] == ("roughness", 1, 0.2, 1.0)
     assert 0.9 / (1 + math.exp(-colour.start)) == pytest.approx(0.4)  # the mean of the colour
     assert 0.2 + 0.8 / (1 + math.exp(-rough.start)) == pytest.approx(0.6)
@@ -56,8 +57,8 @@ def test_principled_is_fitted_and_opens_in_mitsuba(scene, tmp_path):
     assert any("base_color" in name for name in saved.dtype.names)
     loaded = load_capture(out / "scene.xml")
     # As it stands in the file: the shape's own weights, without a ring given
-    surface = bridge.Surface(loaded.scene, loaded.shape)
-    predicted, _ = bridge.draw(surface, loaded.photograph(2), spp=256)
+    surface = Surface(loaded.scene, loaded.shape)
+    predicted, _ = prediction.draw(surface, loaded.photograph(2), spp=256)
     stock = mi.render(loaded.scene, sensor=2, integrator=mi.load_dict({"type": "direct"}), spp=256)
     assert predicted.mean() > 0.01
     stock = np.maximum(np.array(stock)[..., :3], 0)  # a room that was found may be below 0 in places
@@ -71,9 +72,9 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
     ring, pictures = load_fit(out), []
     for path in (out / "scene.xml", small_capture):
         loaded = load_capture(path)
-        surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+        surface = Surface(loaded.scene, loaded.shape, ring)
         surface.show(ring, *ring.domain.sample(3))
-        pictures.append(bridge.draw(surface, loaded.photograph(4), spp=64)[0])
+        pictures.append(prediction.draw(surface, loaded.photograph(4), spp=64)[0])
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
     assert pictures[0].mean() > 0.01
 
@@ -81,9 +82,9 @@ def test_the_material_of_a_run_goes_along_into_other_scenes(scene, small_capture
 @pytest.mark.parametrize("which", PREDICT)
 def test_gradients_of_attributes_equal_finite_differences(scene, which):
     loaded = load_capture(scene[0])
-    parameters, xml = reflectance.predicted_parameters(scene[0], loaded.shape, PREDICT)
+    parameters, xml = reflectance.predicted_parameters(loaded, PREDICT)
     ring = FittedObject(*loaded.sphere(), 1.0, None, parameters, xml)
-    surface = bridge.Surface(loaded.scene, loaded.shape, ring)
+    surface = Surface(loaded.scene, loaded.shape, ring)
     s, faces = ring.domain.sample(3)
     surface.set_faces(faces)
     vertices = ring.surface(s).detach()
@@ -96,7 +97,7 @@ def test_gradients_of_attributes_equal_finite_differences(scene, which):
 
     def loss(change):
         moved = material | {which: material[which] + change}
-        return (weight * bridge.render(surface, loaded.photograph(1), vertices, moved, 16, 3)[0]).sum()
+        return (weight * prediction.render(surface, loaded.photograph(1), vertices, moved, 16, 3)[0]).sum()
 
     change = torch.zeros_like(material[which], requires_grad=True)
     loss(change).backward()
@@ -119,14 +120,14 @@ def test_part_of_cooktorrance(broken_capture):
     """What the XML leaves to mesh attributes needs no starting value."""
     path, edit = broken_capture
     edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="specular" value="0.05"/></bsdf>')
-    shape = load_capture(path).shape
-    parameters, xml = reflectance.predicted_parameters(path, shape, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
+    loaded = load_capture(path)
+    parameters, xml = reflectance.predicted_parameters(loaded, {"diffuse": (0, math.inf), "roughness": (0.1, 1)})
     assert [p.channels for p in parameters] == [3, 1]
     assert "vertex_specular" not in str(xml_elements.load_bsdf(xml))
     # Without ranges: all but the constant.
-    assert [p.name for p in reflectance.predicted_parameters(path, shape, {})[0]] == ["diffuse", "roughness"]
+    assert [p.name for p in reflectance.predicted_parameters(loaded, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
-        reflectance.predicted_parameters(path, shape, {"diffuse": (0, 1)})
+        reflectance.predicted_parameters(loaded, {"diffuse": (0, 1)})
 
 
 WRONG = {
@@ -143,7 +144,7 @@ WRONG = {
 def test_wrong_parameters_are_refused_in_one_line(scene, ranges, message):
     loaded = load_capture(scene[0])
     with pytest.raises(InputError, match=message) as caught:
-        reflectance.predicted_parameters(scene[0], loaded.shape, ranges)
+        reflectance.predicted_parameters(loaded, ranges)
     assert "\n" not in str(caught.value)
 
 
@@ -165,9 +166,9 @@ def test_unfit_bsdfs_are_refused_in_one_line(broken_capture, xml):
     path, edit = broken_capture
     (path.parent / "other.xml").write_text('<scene version="3.0.0"/>')
     edit('<bsdf type="cooktorrance"/>', xml)
-    shape = load_capture(path).shape
+    loaded = load_capture(path)
     with pytest.raises(InputError, match=REFUSED[xml]) as caught:
-        reflectance.predicted_parameters(path, shape, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
+        reflectance.predicted_parameters(loaded, {"reflectance": (0.0, 1.0)} if "blend" in xml else {})
     assert "\n" not in str(caught.value)
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import struct
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -65,11 +66,10 @@ def glb(positions, normals, uv, faces, image, scale=1.0, seen=None):
 
 @pytest.fixture(scope="module")
 def fitted(small_capture):
-    """A quick fit."""
+    """The result of a quick fit."""
     fitted = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--iterations", "50", *QUICK]))
     assert len(list(fitted)) == 50
-    fitted.surface.show(fitted.ring, *fitted.ring.domain.sample(3))
-    return fitted
+    return fitted.result()
 
 
 @pytest.fixture(scope="module")
@@ -170,11 +170,9 @@ class Parts(HTMLParser):
 def test_names_that_are_meant_to_run_are_text(page_file, fitted, monkeypatch, open_page, tmp_path):
     """Of photographs, of the scene, of files in the settings: they add no element and no attribute to the page."""
     usual = Parts(page_file.read_text("utf-8"))
-    settings = {"domain": ["mesh", *HOSTILE]}
     monkeypatch.setattr(type(fitted.capture), "names", property(lambda self: HOSTILE))
-    monkeypatch.setattr(type(fitted.config), "settings", lambda self: settings)
     monkeypatch.setattr(report, "scene_name", lambda path: " ".join(HOSTILE))
-    page = report.report_html(fitted)
+    page = report.report_html(replace(fitted, settings={"domain": ["mesh", *HOSTILE]}))
     own = Parts(page)
     assert own.names <= usual.names and page.count("<script") == 1
     assert all(own.text.count(name) >= 2 for name in HOSTILE)  # in the heading, and above its pictures
@@ -396,23 +394,24 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
     assert report.shift(blob(0, 0), 0 * blob(0, 0), inside) is None
 
 
-def panel(fit, k):
+def panel(result, k):
     """The row of photograph `k` in the report."""
-    return report.panel_of(fit, fit.capture, k, report.predicted(fit, fit.capture, np.array([k]))[0])[0]
+    surface = result.drawn(result.ring.subdivisions)
+    return report.panel_of(result, k, report.predicted(result, surface, np.array([k]))[0])[0]
 
 
-def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, small_capture, broken_capture, monkeypatch):
+def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, broken_capture):
     good = [panel(fitted, k) for k in range(12)]
     assert not report.fit_findings(good, 500, 500)
     path, edit = broken_capture
     edit('name="cx" value="30.5"', 'name="cx" value="32.5"', count=-1)
-    monkeypatch.setattr(fitted, "capture", load_capture(path))
-    moved = [panel(fitted, k) for k in range(12)]
+    wrong = replace(fitted, capture=load_capture(path))
+    moved = [panel(wrong, k) for k in range(12)]
     found = [found for found in report.fit_findings(moved, 50, 50) if "cx and cy" in found]
     assert len(found) == 1 and re.search(r"(1\.[5-9]|2\.[0-5]) px to the left and 0\.[0-2] px", found[0])
 
 
-def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monkeypatch):
+def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted):
     path, _ = broken_capture
     image = np.array(Image.open(path.parent / "images" / "003.png"))
     mask = np.array(Image.open(path.parent / "masks" / "003.png")) > 127
@@ -420,15 +419,14 @@ def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted, monk
     inside = np.argwhere(mask)
     image[tuple(inside[: len(inside) // 4].T)] = 255
     Image.fromarray(image).save(path.parent / "images" / "003.png")
-    monkeypatch.setattr(fitted, "capture", load_capture(path))
-    assert panel(fitted, 3).saturated == pytest.approx(0.25, abs=0.01)
+    assert panel(replace(fitted, capture=load_capture(path)), 3).saturated == pytest.approx(0.25, abs=0.01)
 
 
 def test_the_bundle_is_whole_small_as_stated_and_can_be_embedded():
     bundle = (VIEWER / "viewer.min.js").read_text("utf-8")
     assert "three.js authors" in bundle and "WITHOUT WARRANTY OF ANY KIND" in bundle
     assert "</script" not in bundle and "<!--" not in bundle
-    guide = (Path(__file__).parents[1] / "docs" / "guide.md").read_text("utf-8")
-    stated = int(re.search(r"three\.js, (\d+) kB", guide)[1])
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "results-folder.md").read_text("utf-8")
+    stated = int(re.search(r"three\.js, (\d+) kB", page)[1])
     assert abs((VIEWER / "viewer.min.js").stat().st_size / 1000 - stated) < 1
     assert "resolved" not in (VIEWER / "package-lock.json").read_text()

@@ -22,16 +22,17 @@ from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.photogrammetry.marker_sheet import MarkerSheet
 from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import COUNT
+from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of, scene_of
+from mi_ring.scene.shot import Shot
 from mi_ring.synthesis import light_sources
 from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
-from mi_ring.synthesis.materials import COLOURS, load_material, plugin
+from mi_ring.synthesis.materials import COLOURS, load_material, parse_plugin
+from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.path_traced_capture import Production, write_scenes
-from mi_ring.synthesis.stage import Stage, load_object
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.path_traced_capture import Studio, write_scenes
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import look_at, poses
 
 SMALL = ["--views", "9", "--size", "56", "40", "--spp", "16", "--novel", "2"]
@@ -92,12 +93,12 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
     """ρ / π cos θ I / d²."""
     turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]) @ turn.T + [3, -2, 5]
-    stage = Stage(lambert(mesh_of(square, [[0, 1, 2], [0, 2, 3]]), ALBEDO), square)
+    scene = ObjectOnTable(lambert(mesh_of(square, [[0, 1, 2], [0, 2, 3]]), ALBEDO), square)
     n, middle = turn[:, 2], square.mean(0)
     camera = camera_at(middle + turn @ [4, 3, 20], middle + turn @ [1, -1, 0])
     rgb, place = np.array([900.0, 500.0, 700.0]), middle + turn @ [-6, 2, 11]
     light = Light("point", place, rgb) if kind == "point" else Light("directional", -turn @ [0.3, 0.5, 0.8], rgb / 900)
-    found = stage.radiance(Shot(camera), light, 64, 3, 2)
+    found = scene.radiance(LensCamera(camera), light, 64, 3, 2)
     d = rays(camera)
     p = camera.position + ((middle - camera.position) @ n / (d @ n))[..., None] * d
     to_light = place - p if kind == "point" else np.broadcast_to(turn @ [0.3, 0.5, 0.8], p.shape)
@@ -111,12 +112,13 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
 def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     """Order l of the room's radiance brings π, 2π/3, π/4 times as much irradiance (Ramamoorthi and Hanrahan 2001)."""
     ball = trimesh.creation.icosphere(subdivisions=5)
-    stage = Stage(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
+    scene = ObjectOnTable(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
     camera = camera_at([5, 9, -14], [0.05, 0.02, 0], (27, 21))
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
-    room = light_sources.room_of("harmonics", in_camera, np.random.default_rng(4))
-    lamp = light_sources.environment_of(light_sources.seen_from_within(room, camera.to_world))
-    found = stage.radiance(Shot(camera), lamp, 256, 5, 2)
+    room = light_sources.random_room("harmonics", in_camera, np.random.default_rng(4))
+    seen = mi.Bitmap(light_sources.room_envmap(room, camera.to_world).astype(np.float32))
+    lamp = mi.load_dict({"type": "envmap", "bitmap": seen})
+    found = scene.radiance(LensCamera(camera), lamp, 256, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
     root = half**2 - camera.position @ camera.position + 1
@@ -126,7 +128,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     direction = mi.Vector3f(*own.reshape(-1, 3).T.astype(np.float32))
     basis = [np.array(h) + np.zeros(hit.size) for h in dr.sh_eval(direction, 2)]
     order = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4], [1, 3, 5])
-    harmonics = np.vstack([room[:1], room[COUNT : COUNT + 8]]) if in_camera else room[:9]
+    harmonics = np.vstack([room[:1], room[PER_FRAME : PER_FRAME + 8]]) if in_camera else room[:9]
     irradiance = (np.array(basis).T @ (order[:, None] * harmonics)).reshape(*hit.shape, 3)
     assert hit.sum() > 100
     error = (found / np.maximum(ALBEDO / np.pi * irradiance, 1e-9) - 1)[hit]  # of 256 paths: 1.5 % each
@@ -138,7 +140,7 @@ def test_the_scene_file_says_how_bright_every_pixel_is(matt):
     capture = mi_ring.load_capture(matt / "scene.xml")
     mesh = trimesh.load(matt / "truth/mesh.ply")
     for k in (1, 6):
-        camera, light = capture.sensors[k].camera, Lights.of(capture.sensors)[k]
+        camera, light = capture.shots[k].camera, Lights.of(capture.shots)[k]
         p, n, index = hits(camera, mesh)
         to_light = light.vector - p
         distance = np.linalg.norm(to_light, axis=1)
@@ -157,12 +159,12 @@ def test_masks_and_the_surface_agree_and_nothing_is_to_be_mended(matt, tmp_path)
     numbers, _ = compare_surfaces(capture, truth, truth, float(np.linalg.norm(mesh.extents)))
     assert numbers["normal_mean"] < 0.05 and numbers["depth_mean"] < 1e-3 and numbers["flipped"] == 0
     assert np.abs(mesh.bounds.mean(0)).max() < 1e-4 and abs(np.linalg.norm(mesh.vertices, axis=1).max() - 50) < 1e-3
-    for sensor, mask in zip(capture.sensors, capture.masks):  # a mesh's outline is that of its vertices
-        pixels, _ = sensor.camera.project(mesh.vertices)
+    for shot, mask in zip(capture.shots, capture.masks):  # a mesh's outline is that of its vertices
+        pixels, _ = shot.camera.project(mesh.vertices)
         rows, columns = np.nonzero(mask)
         np.testing.assert_allclose([columns.min(), rows.min()], pixels.min(0), atol=1.1)
         np.testing.assert_allclose([columns.max() + 1, rows.max() + 1], pixels.max(0), atol=1.1)
-        assert pixels.min() > 0 and (pixels.max(0) < sensor.size).all()
+        assert pixels.min() > 0 and (pixels.max(0) < shot.size).all()
 
 
 def test_a_mesh_is_known_by_what_it_holds(lump, matt, tmp_path, capsys):
@@ -223,16 +225,16 @@ def test_a_wrong_calibration_is_kept_apart_from_the_truth(lump, tmp_path):
     (out / "truth").mkdir(parents=True)
     config = SynthesizeConfig(lump, out, views=30, novel=0, room=0.1, wrong_cameras=0.5, wrong_light=3, wrong_power=10,
                        wrong_room=True, light="flash")  # fmt: skip
-    production = Production(config)
-    write_scenes(production, production.views(30), [], exposure=7.0)
+    studio = Studio(config)
+    write_scenes(studio, studio.photographs(30), [], exposure=7.0)
     said, true = (mi_ring.load_capture(out / name, images=False) for name in ("scene.xml", "truth/exact.xml"))
-    assert said.photographs.room is None and not said.sensors[0].calibrated and true.sensors[0].calibrated
-    a, b = ([s.camera.to_world for s in c.sensors] for c in (said, true))
+    assert said.photographs.room is None and not said.shots[0].calibrated and true.shots[0].calibrated
+    a, b = ([s.camera.to_world for s in c.shots] for c in (said, true))
     turns = [Rotation.from_matrix(x[:3, :3] @ y[:3, :3].T).as_rotvec(degrees=True) for x, y in zip(a, b)]
     assert 0.4 < np.std(turns) < 0.6
     distance = np.linalg.norm(np.array(b)[:, :3, 3], axis=1)
     np.testing.assert_allclose(np.std((np.array(a) - b)[:, :3, 3] / distance[:, None]), 0.005, rtol=0.25)
-    lights, truths = Lights.of(said.sensors), Lights.of(true.sensors)
+    lights, truths = Lights.of(said.shots), Lights.of(true.shots)
     own = [x[:3, :3].T @ (place - x[:3, 3]) for x, place in zip(a, lights.positions())]  # of flashes at the lens
     np.testing.assert_allclose(np.linalg.norm(own, axis=1), 0.03 * distance, rtol=0.02)
     assert np.std(own, axis=0).max() < 0.02 * np.abs(own).max()
@@ -250,9 +252,9 @@ def test_photographs_that_are_exposed_differently(lump, tmp_path):
         synthesize.main([str(lump), str(tmp_path / name), *options, *more])
         pictures[name] = [read_image(path).astype(float) for path in sorted((tmp_path / name).rglob("*.exr"))]
     said, true = (mi_ring.load_capture(tmp_path / "apart" / name) for name in ("scene.xml", "truth/exact.xml"))
-    assert not said.sensors[0].calibrated and all((sensor.gain == 1).all() for sensor in said.sensors)
+    assert not said.shots[0].calibrated and all(shot.response.gain == (1, 1, 1) for shot in said.shots)
     for k, (alike, apart) in enumerate(zip(pictures["alike"], pictures["apart"])):
-        gain = true.sensors[k].gain if k < 3 else 1.0  # the last shows a view that no fit sees
+        gain = true.shots[k].response.gain if k < 3 else 1.0  # the last shows a view that no fit sees
         np.testing.assert_allclose(apart, alike * gain, rtol=2e-3, atol=1e-6)
     np.testing.assert_allclose(true.observe([1]).rgb[0], pictures["alike"][1], rtol=2e-3, atol=1e-6)
     many = exposures(20_000, 30, np.random.default_rng(1))
@@ -271,8 +273,8 @@ def test_stripes_are_where_they_are_said_to_be(lump, tmp_path):
     capture = mi_ring.load_capture(out / "scene.xml")
     mesh = trimesh.load(out / "truth/mesh.ply")
     low, high = mesh.bounds[:, 2]
-    for k, sensor in enumerate(capture.sensors):
-        p, _, index = hits(sensor.camera, mesh)
+    for k, shot in enumerate(capture.shots):
+        p, _, index = hits(shot.camera, mesh)
         band = 5 * (p[:, 2] - low) / (high - low)
         picture = np.array(capture.images[k]).reshape(-1, 3)[index]
         inside = np.abs(band - np.round(band)) > 0.25
@@ -294,7 +296,7 @@ def test_the_sheet_is_printed_true_to_scale(lump, tmp_path):
     ground = trimesh.load(out / "truth/mesh.ply").bounds[0, 1]
     # Seen from above, y up: x of the page is z of the world, and y is x.
     world = np.stack([sighting.points[:, 1], np.full(len(sighting.points), ground), sighting.points[:, 0]], 1)
-    pixels, _ = capture.sensors[0].camera.project(world)
+    pixels, _ = capture.shots[0].camera.project(world)
     assert len(pixels) > 20 and np.abs(pixels - sighting.pixels).max() < 0.5
     text = (out / "scene.xml").read_text()
     assert text.count('type="table"') == 2 and 'name="metres" value="0.001"' in text
@@ -353,10 +355,11 @@ def test_cameras_of_a_turntable_go_round_in_rings_and_none_is_below_a_table():
 
 def test_lights_that_are_said_to_be_elsewhere_are_as_seeds_say():
     cameras = [camera_at([5.0, 2, 1], [0, 0, 0]), camera_at([-3.0, 2, 4], [0, 0, 0])]
-    lights = [Light("point", camera.position, np.ones(3)) for camera in cameras]
-    one, other = (miscalibrated(cameras, lights, np.zeros(3), np.random.default_rng(5), shifted=2)[1] for _ in range(2))
-    np.testing.assert_array_equal([a.vector for a in one], [b.vector for b in other])
-    far = [np.linalg.norm(a.vector - b.vector) / np.linalg.norm(b.vector) for a, b in zip(one, lights)]
+    shots = [Shot(str(k), camera) for k, camera in enumerate(cameras)]
+    one, other = (miscalibrated(shots, np.zeros(3), np.random.default_rng(5), shifted=2) for _ in range(2))
+    np.testing.assert_array_equal([a.light.vector for a in one], [b.light.vector for b in other])
+    places = [camera.position for camera in cameras]
+    far = [np.linalg.norm(a.light.vector - b) / np.linalg.norm(b) for a, b in zip(one, places)]
     np.testing.assert_allclose(far, 0.02)
 
 
@@ -395,7 +398,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
             assert len(colours) == len(mesh.vertices) and (len(mesh.vertices) > 10_000) == smooth
             seen = colours[mesh.vertices[:, 0] > 20]
             np.testing.assert_allclose(seen, np.broadcast_to(linear, seen.shape), rtol=0.01, err_msg=name)
-    assert plugin("diffuse reflectance=vertex_color", "", True)["reflectance"]["name"] == COLOURS
+    assert parse_plugin("diffuse reflectance=vertex_color", "", True)["reflectance"]["name"] == COLOURS
 
 
 @pytest.mark.parametrize("options, message", [

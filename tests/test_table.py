@@ -14,7 +14,9 @@ from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, write_tab
 from mi_ring.photogrammetry.flash_light import FlashCalibration
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.assembly import split_tables
 from mi_ring.scene.lights import Light
 from mi_ring.system import machine
 
@@ -53,7 +55,7 @@ def write(folder, table=True, more=""):
 def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
     scene = load_capture(write(tmp_path), images=False).scene
     table = next(shape for shape in scene.shapes() if getattr(shape, "of_tables", False))
-    alone = bridge.parted(scene)[1]
+    alone = split_tables(scene)[1]
     x, y = 2 * (6 + 0.5) / 7 - 1, 2 * 0.5 / 5 - 1  # the middle of the last pixel of the first row
     place, up = TURNED @ mi.ScalarPoint3f(x, y, 0), TURNED @ mi.ScalarNormal3f(0, 0, 1)
     si = alone.ray_intersect(mi.Ray3f(mi.Point3f(place) + mi.Vector3f(up), -mi.Vector3f(up)))
@@ -68,15 +70,15 @@ def test_its_picture_has_its_first_row_at_the_bottom(tmp_path):
 @pytest.mark.parametrize("more", ["", ROOM], ids=["dark", "room"])
 def test_the_light_that_it_reflects_is_that_of_a_path_tracer(tmp_path, more):
     capture = load_capture(write(tmp_path, more=more), images=False)
-    surface = bridge.Surface(capture.scene, capture.shape)
-    rgb, coverage = bridge.draw(surface, capture.photograph(0), spp=256, indirect=True)
+    surface = Surface(capture.scene, capture.shape)
+    rgb, coverage = prediction.draw(surface, capture.photograph(0), spp=256, indirect=True)
     without = load_capture(write(tmp_path, table=False, more=more), images=False)
-    alone, same = bridge.draw(bridge.Surface(without.scene, without.shape), without.photograph(0), spp=256,
+    alone, same = prediction.draw(Surface(without.scene, without.shape), without.photograph(0), spp=256,
                               indirect=True)  # fmt: skip
     np.testing.assert_array_equal(coverage, same)  # no camera sees it
 
-    scene, sensor = mi.load_file(str(write(tmp_path, more=more)), optimize=False, parallel=False), capture.sensors[0]
-    batch = capture.photographs.select([0], sensor.size)
+    scene = mi.load_file(str(write(tmp_path, more=more)), optimize=False, parallel=False)
+    sensor, batch = scene.sensors()[0], capture.photograph(0)
     channels = [np.array(c) for c in render_path(scene, batch, sensor, 1024, 3, 5)]
     traced = np.stack(channels, -1).reshape(rgb[0].shape)
     inside = coverage[0].numpy() == 1
@@ -95,9 +97,9 @@ def test_without_interreflection_a_table_changes_nothing(tmp_path):
     pictures = []
     for table in (True, False):
         capture = load_capture(write(tmp_path, table, ROOM), images=False)
-        surface = bridge.Surface(capture.scene, capture.shape)
-        pictures.append(bridge.draw(surface, capture.photograph(0), spp=16)[0].numpy())
-        assert not bridge.parted(open_lit_scene(tmp_path / "try.xml")[0])[1]  # nor does it to `validate`
+        surface = Surface(capture.scene, capture.shape)
+        pictures.append(prediction.draw(surface, capture.photograph(0), spp=16)[0].numpy())
+        assert not split_tables(open_lit_scene(tmp_path / "try.xml")[0])[1]  # nor does it to `validate`
     np.testing.assert_allclose(*pictures, rtol=1e-5)
 
 
@@ -183,7 +185,7 @@ def test_the_table_of_a_capture_has_its_picture_where_the_table_is(kind, brightn
     root = scene_element(write_table(writer, shots, PLANE, CENTER, flash_of()))
     writer.finish(scene_bytes(root))
     writer.close()
-    _, table = bridge.parted(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False, parallel=False))
+    _, table = split_tables(mi.load_file(str(tmp_path / "capture/scene.xml"), optimize=False, parallel=False))
     across = PLANE.axes()[:2]
     below = CENTER - PLANE.height(CENTER) * UP
     points = below + np.random.default_rng(1).uniform(-4, 4, (200, 2)) @ across

@@ -77,7 +77,7 @@ def lens_capture(tmp_path):
 
 
 def test_a_scene_says_where_its_photographs_show_something(lens_capture):
-    assert len({sensor.valid for sensor in lens_capture.sensors}) == 1  # one lens, one file
+    assert len({shot.files.valid for shot in lens_capture.shots}) == 1  # one lens, one file
     rgb, clipped, _, masked, valid = lens_capture.observe([0, 1])
     assert masked.all() and valid.shape == (2, H, W) and 0.8 < valid.float().mean() < 0.99
     assert not rgb[~valid].any() and clipped[~valid].all() and not clipped[valid].any()
@@ -99,6 +99,6 @@ def test_where_a_mask_says_nothing_it_does_not_cut_the_hull(lens_capture):
     turned[:3, 3] += camera.to_world[:3, 0]
     other = Silhouette(np.full((H, W), 255, np.uint8), camera._replace(to_world=turned), "other")
     for known, left in ((None, False), (valid, True)):
-        hull = Hull([Silhouette(mask, camera, "cut", known), other, other], "test", wrong=0)
+        hull = Hull([Silhouette(mask, camera, "cut", known), other, other], "test", outliers=0)
         depth = hull.depth(torch.as_tensor(towards, dtype=torch.float32))
         assert (depth[0] > 0) == left and depth[1] > 0

@@ -12,7 +12,8 @@ from test_bridge import OFF_CAMERA, Setting, tensor
 from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import unit_for
 from mi_ring.system.machine import threads_of
 
 UNITS = [1e-12, 1e-9, 1e-6, 1e6, 1e9, 1e12]
@@ -71,7 +72,7 @@ class Alone(Setting):
 
     def __init__(self, unit):
         super().__init__(OFF_CAMERA, shadows=True, unit=unit)
-        self.surface.unit = bridge.unit_for(unit)
+        self.surface.unit = unit_for(unit)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def gradients(setting, vertices=None):
     """Pictures, and gradients [per unit] by vertices and material, of both losses together."""
     vertices = (setting.vertices if vertices is None else vertices).clone().requires_grad_()
     material = {name: value.clone().requires_grad_() for name, value in setting.material.items()}
-    rgb, alpha = bridge.render(setting.surface, setting.photographs, vertices, material, 4, 3, setting.shadows)
+    rgb, alpha = prediction.render(setting.surface, setting.photographs, vertices, material, 4, 3, setting.shadows)
     ((setting.radiance_weight * rgb).sum() + (setting.coverage_weight * alpha).sum()).backward()
     return rgb.detach(), vertices.grad * setting.unit, [value.grad for value in material.values()]
 

@@ -69,7 +69,14 @@ def run(path, *options, out="out"):
 
 def comparison(scene, sensors, k=0, depth=6, spp=4):
     pictures = path_tracing.render_both(
-        path_tracing.with_flash(scene), Photographs.of(sensors), k, sensors[k], 1, spp, depth, 32 * k
+        path_tracing.with_flash(scene),
+        Photographs.of([sensor.shot for sensor in sensors]),
+        k,
+        sensors[k],
+        1,
+        spp,
+        depth,
+        32 * k,
     )
     return renderer_agreement.compare_renderers("this", pictures)
 
@@ -225,7 +232,7 @@ def test_lamps_and_sky_of_the_scene_light_both(tmp_path):
 
 def test_pictures_of_several_launches_are_those_of_one(tmp_path, monkeypatch):
     scene, sensors = path_tracing.open_lit_scene(write(tmp_path, ELLIPSOID, *CONVEX))
-    photographs = Photographs.of(sensors)
+    photographs = Photographs.of([sensor.shot for sensor in sensors])
     one = path_tracing.render_both(scene, photographs, 0, sensors[0], 1, 4, 3, 0)
     monkeypatch.setattr(path_tracing, "LANES", 5 * 4 * WIDTH * HEIGHT)  # 5 + 5 + 5 + 1
     many = path_tracing.render_both(scene, photographs, 0, sensors[0], 1, 4, 3, 1000)
@@ -261,7 +268,7 @@ def test_p_values_are_uniform_where_there_is_no_difference(noise):
 def test_p_values_of_photometric_and_path_are_uniform(tmp_path):
     """Of a convex object's photographs, which the two see alike."""
     scene, sensors = path_tracing.open_lit_scene(write(tmp_path, ELLIPSOID, *CONVEX))
-    photographs, p = Photographs.of(sensors), []
+    photographs, p = Photographs.of([sensor.shot for sensor in sensors]), []
     for seed in range(50):
         for k in range(3):
             pictures = path_tracing.render_both(scene, photographs, k, sensors[k], 1, 4, 2, 32 * (3 * seed + k))

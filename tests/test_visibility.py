@@ -22,7 +22,7 @@ from mi_ring.metrics import surfaces
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import gltf, ply
-from mi_ring.scene.visibility import View, Visibility, seen_of
+from mi_ring.scene.visibility import MaskedCamera, Visibility, visible_points
 
 RADIUS, DISTANCE = 25.0, 70.0
 
@@ -37,7 +37,7 @@ def turned(seed, distance=DISTANCE):
 
 def view(seed=0, distance=DISTANCE, focal=(40.0, 47.0), centre=(31.5, 40.25), size=(70, 75), valid=None):
     """All of a ball of RADIUS at CENTER is within its frame, which is neither square nor centred."""
-    return View(Camera(turned(seed, distance), np.array(focal), np.array(centre), size), valid)
+    return MaskedCamera(Camera(turned(seed, distance), np.array(focal), np.array(centre), size), valid)
 
 
 def ball(level=5, scale=1.0):
@@ -71,7 +71,9 @@ def test_it_does_not_depend_on_the_unit(scale):
     camera = view(3).camera
     matrix = camera.to_world.copy()
     matrix[:3, 3] *= scale
-    seen = Visibility(scale * ball()[0], ball()[1], [View(camera._replace(to_world=matrix), None)]).of_vertices()
+    seen = Visibility(
+        scale * ball()[0], ball()[1], [MaskedCamera(camera._replace(to_world=matrix), None)]
+    ).of_vertices()
     cosine = height(view(3))
     clear = np.abs(cosine - RADIUS / DISTANCE) > 1e-3
     np.testing.assert_array_equal(seen[clear], (cosine > RADIUS / DISTANCE)[clear])
@@ -205,10 +207,10 @@ def expected(ring, s, view):
 def test_the_share_of_the_area_is_that_of_the_cap(ring):
     seen_by = view(11)
     s, faces = ring.domain.sample(4)
-    seen, unseen = seen_of(ring, s, faces, [seen_by])
+    seen, unseen = visible_points(ring, s, faces, [seen_by])
     radius = np.linalg.norm(ring.surface(s).detach().numpy() - CENTER, axis=1).mean()
     assert unseen == pytest.approx((1 + radius / DISTANCE) / 2, abs=0.01)
-    uneven = seen_of(ring, s, np.concatenate([faces, faces[seen[faces].all(1)]]), [seen_by])[1]
+    uneven = visible_points(ring, s, np.concatenate([faces, faces[seen[faces].all(1)]]), [seen_by])[1]
     assert uneven < 0.9 * unseen  # it is the area that counts, not the vertices
 
 
@@ -290,7 +292,7 @@ def test_a_fit_writes_and_says_it(small_capture, tmp_path):
     list(fitted)
     fitted.save(tmp_path / "out")
     vertices = trimesh.load(tmp_path / "out" / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
-    share = seen_of(fitted.ring, *fitted.ring.domain.sample(3), fitted.capture.views)[1]
+    share = visible_points(fitted.ring, *fitted.ring.domain.sample(3), fitted.capture.views)[1]
     assert 0.05 < share < 0.6 and 0 < np.mean(vertices["seen_0"]) < 1
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert f"<th>Seen by no photograph</th><td>{share:.1%} of the surface&#39;s area</td>" in page
@@ -321,12 +323,15 @@ def test_triangles_that_are_partly_hidden_count_in_part():
     mesh = trimesh.Trimesh(plane + plate, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], process=False)
     matrix = np.diag([-1.0, 1, -1, 1])
     matrix[2, 3] = 100
-    above = View(Camera(matrix, np.array([900.0, 900]), np.array([50.0, 50]), (100, 100)), None)
+    above = MaskedCamera(Camera(matrix, np.array([900.0, 900]), np.array([50.0, 50]), (100, 100)), None)
     points = np.random.default_rng(2).uniform([-2, -1, 0], [2, 1, 0], (2000, 3))
     normals = np.tile([0.0, 0, 1], (2000, 1))
-    seen, clear = Visibility(mesh.vertices, mesh.faces, [above]).of(points, normals), np.abs(points[:, 0]) > 0.001
+    seen, clear = (
+        Visibility(mesh.vertices, mesh.faces, [above]).of_points(points, normals),
+        np.abs(points[:, 0]) > 0.001,
+    )
     np.testing.assert_array_equal(seen[clear], (points[:, 0] < 0)[clear])
-    assert not Visibility(mesh.vertices, mesh.faces, [above]).of(points, -normals).any()
+    assert not Visibility(mesh.vertices, mesh.faces, [above]).of_points(points, -normals).any()
 
 
 def test_the_command_leaves_out_what_is_not_seen(run, capsys):

@@ -1,96 +1,168 @@
-"""A capture: the photographs, masks, cameras and lights of a scene file as tensors."""
+"""A capture: photographs with their masks, cameras and lights, and the scene that they show."""
 
 import functools
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import ArrayLike
 
-from mi_ring.capture.decoding import decode, is_linear, shade
+from mi_ring.capture import arrays
+from mi_ring.capture.observation import Observation, ObservationCache, observed
 from mi_ring.capture.pixels import Pixels
-from mi_ring.errors import InputError
-from mi_ring.geometry.camera import NoParallax, nearest_point
-from mi_ring.geometry.hull import MOST, WIDTH, Hull, Silhouette, evenly, shrink_mask, small_silhouette
-from mi_ring.images import blur, box_filter
+from mi_ring.capture.scenefile import recalibrated_xml
+from mi_ring.errors import InputError, SceneError
+from mi_ring.geometry.camera import Camera, NoParallax, nearest_point
+from mi_ring.geometry.hull import MAX_MASKS, MAX_WIDTH, Hull, Silhouette, evenly_spaced, shrink_mask, small_silhouette
+from mi_ring.images import blur
+from mi_ring.plugins import shapenet
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.scene.visibility import View
+from mi_ring.rendering.spherical_harmonics import room_of
+from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Encoding, Files, Shot
+from mi_ring.scene.visibility import MaskedCamera
+from mi_ring.system import llvm
+from mi_ring.system.files import write_file
 
-#: Of small photographs, to save decoding them again. A pixel takes up to 200 bytes: what stays tears holes in memory.
-REMEMBERED_PIXELS = 2**23
-
-SOME, COARSE = 50, 128  #: how many photographs, and pixels across them, tell how bright object and room are
-ALBEDO = 0.5  #: of an object of which nothing says how much it reflects
-LIT = 0.01  #: brightness of the background, in that of the object, from which a room is not black
-
-
-class Observation(NamedTuple):
-    """Photographs as a fit sees them, n of one size."""
-
-    rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
-    clipped: Tensor  #: (n, H, W, 3) bool: the scene is at least this bright
-    mask: Tensor  #: (n, H, W) the object's coverage in [0, 1]; 0 where there is no mask
-    masked: Tensor  #: (n,) bool: which have a mask
-    valid: Tensor | None  #: (n, H, W) bool: which pixels say something; None if all do. Others are black and clipped
-
-    def surely(self, coverage: Tensor) -> Tensor:
-        """(n, H, W) bool: where pixels are wholly object, by their masks, if they have any, and by a `coverage`."""
-        mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
-        return torch.minimum(mask, coverage) > 0.99
-
-    def to(self, device: torch.device) -> "Observation":
-        """The same on a device."""
-        return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
+SOME, COARSE = 50, 128  #: photographs, and pixels across each, by which brightness is estimated
+ALBEDO = 0.5  #: of an object, where nothing says how much it reflects
+LIT = 0.01  #: brightness of the background, in that of the object, from which a room is lit
 
 
-@dataclass
+def require_variant(what: str | Path) -> None:
+    """Raise InputError, which begins with `what`, if the current variant of Mitsuba cannot fit."""
+    if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
+        why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
+        raise InputError(f"{what}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
+
+
+@dataclass(frozen=True, eq=False)
 class Capture:
-    """What a scene file gives to a fit. `images` are the files' encoded pixels, decoded on demand by `observe`.
+    """Photographs with their masks, cameras and lights, and the scene that they show: all that a fit starts from.
 
-    Nothing that renders or fits a capture changes it. Lists of arrays may take the place of its pixels.
+    `mi_ring.load_capture` reads one from a scene file, `from_arrays` makes one without any file. It never changes;
+    `dataclasses.replace` makes another one with changed fields, for instance with other `shots`.
     """
 
-    path: Path
+    path: Path  #: the scene file; of a capture from arrays its name
+    xml: bytes  #: content of the scene file
     scene: mi.Scene
     shape: Any  #: the `shapenet`
-    sensors: list  #: the photographs
-    photographs: Photographs  #: their cameras and lights
-    shadows: bool
-    images: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W, 3) uint8, uint16 or float32 each
-    masks: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W) uint8, 0 background, 255 object
-    valid: Pixels = field(default_factory=lambda: Pixels([]))  #: (H, W) uint8, 0 where the photograph shows nothing
-    threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were not
+    shots: tuple[Shot, ...]  #: the photographs
+    room: np.ndarray | None = None  #: light of the room, as `Photographs` have it; None if it is dark
+    shadows: bool = True  #: may the object cast shadows on itself?
+    images: Pixels = field(default_factory=Pixels)  #: encoded pixels (H, W, 3) uint8, uint16 or float32; see `observe`
+    masks: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 background, 255 object
+    valid: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 where the photograph shows nothing
+    threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were given
+    #: Visual hulls by what they are made of. All captures that are made of this one by `replace` share them.
+    hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
+    _observed: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        sizes = [sensor.size for sensor in self.sensors]
-        self._decoded: dict[int, tuple] = {}  # (scale, result of `decoded`) by photograph
-        self._remembered = 0  # their pixels
-        #: Indices of the photographs of each size (width, height); one launch renders photographs of one size.
-        self.sizes = {size: np.array([i for i, s in enumerate(sizes) if s == size]) for size in dict.fromkeys(sizes)}
+    @classmethod
+    def from_arrays(
+        cls, images: Sequence[ArrayLike], masks: Sequence[ArrayLike | None] | None = None, *,
+        cameras: Sequence[Camera], lights: Sequence[Light | None] | None = None,
+        valid: Sequence[ArrayLike | None] | None = None, names: Sequence[str] | None = None,
+        center: ArrayLike | None = None, radius: float | None = None, room: ArrayLike | None = None,
+        encoding: Encoding = "auto", saturation: float = 1.0, calibrated: bool = False, name: str = "capture",
+    ) -> "Capture":  # fmt: skip
+        """A capture of photographs in arrays, without any file. The object is fitted with `cooktorrance`. ::
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("images", "masks", "valid") and not isinstance(value, Pixels):
-            value = Pixels.of(value)
-        super().__setattr__(name, value)
+            camera = mi_ring.Camera(to_world, focal, centre, (width, height))
+            light = mi_ring.Light("point", position, intensity)
+            capture = mi_ring.Capture.from_arrays(images, masks, cameras=cameras, lights=lights)
+
+        `images`: N arrays (H, W, 3), which may differ in size. uint8 is sRGB; uint16 and float32 are linear, unless
+        `encoding` is "srgb". 1.0, or the largest integer, is full scale. `saturation`: encoded value (1 = full scale)
+        from which a pixel is clipped. Arrays are not copied.
+
+        `masks`, `valid`: N arrays (H, W) of bool or of uint8 from 0 to 255, or None for a photograph without one. In a
+        mask 255 is the object; where `valid` is 0 the photograph shows nothing. Default: none.
+
+        `cameras`: N `Camera`, whose `size` is that of the image. `lights`: N `Light`, each for its own photograph; None
+        is a point light of intensity 1 at the camera. Lengths are in the units of the scene.
+
+        `names`: N different names of photographs. Default: 000, 001, …. `center` (3,), `radius`: sphere about the
+        object [scene units]. Default: estimated from masks or cameras. `room` (n, 3): light of the room that all
+        photographs share, R, G, B of its radiance in each of the first n real spherical harmonics in the axes of the
+        world; n is 1, 4, 9, 16 or 25. `calibrated`: are cameras and lights exact? `name`: begins the messages of
+        errors, and is the title of reports.
+
+        Anything else that a scene file can say of a photograph is a field of a `Shot`: `replace` the capture's `shots`.
+
+        Raises InputError, which names the argument, for whatever no fit could use.
+        """
+        require_variant(name)
+        pictures = arrays.images_of(images, encoding)
+        shots = arrays.shots_of(pictures, cameras, lights, names, encoding, saturation, calibrated)
+        own_masks, shown = arrays.masks_of(masks, pictures, "masks"), arrays.masks_of(valid, pictures, "valid")
+        files = list(map(arrays.files_of, shots, pictures, own_masks.given, shown.given))
+        xml = arrays.scene_xml(shots, files, center, radius, room)
+        scene = mi.load_string(xml.decode(), optimize=False, parallel=False)
+        shape = next(s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh))
+        capture = cls(Path(name), xml, scene, shape, shots, room_of(scene), True, Pixels.of(pictures), own_masks, shown)
+        try:
+            capture.photographs  # noqa: B018 (refuses lights that cannot be rendered)
+        except SceneError as error:
+            raise InputError(f"lights: {error}") from error
+        return capture
+
+    @property
+    def in_memory(self) -> bool:
+        """Are its photographs no files?"""
+        return any(shot.files.filename is None for shot in self.shots)
+
+    def save(self, path: str | Path) -> "Capture":
+        """Write a capture from arrays as the scene file `path`, its photographs and masks beside it.
+
+        Returns the capture of these files. Raises InputError if they cannot be written, or if the capture has a scene
+        file already.
+        """
+        path = Path(path)
+        if not self.in_memory:
+            raise InputError(f"{path}: is for a capture from arrays; this one has the scene file {self.path}")
+        shots = []
+        for k, shot in enumerate(self.shots):
+            own = arrays.files_of(shot, self.images[k], self.masks.given[k], self.valid.given[k])
+            files = Files(*(file and path.parent / file for file in own))
+            for file, pixels in zip(files, (self.images, self.masks, self.valid)):
+                if file:
+                    arrays.write_array(pixels[k], file)
+            shots.append(replace(shot, files=files))
+        xml = recalibrated_xml(self.xml, shots, self.room)
+        write_file(path, xml)
+        return replace(self, path=path, xml=xml, shots=tuple(shots))
+
+    @functools.cached_property
+    def photographs(self) -> Photographs:
+        """Cameras, lights and room as the renderer takes them. Raises SceneError for lights that cannot be rendered."""
+        return Photographs.of(self.shots, self.room)
+
+    @functools.cached_property
+    def sizes(self) -> dict[tuple[int, int], np.ndarray]:
+        """Indices of the photographs of each size (width, height); one launch renders photographs of one size."""
+        sizes = [shot.size for shot in self.shots]
+        return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
     @property
     def known(self) -> bool:
-        """Does the scene say that cameras and lights are exact?"""
-        return all(sensor.calibrated for sensor in self.sensors)
+        """Does the scene say that all cameras and lights are exact?"""
+        return all(shot.calibrated for shot in self.shots)
 
     def __len__(self) -> int:
-        return len(self.sensors)
+        return len(self.shots)
 
     @functools.cached_property
     def names(self) -> list[str]:
-        """File names of the photographs, with folders where they would not tell one from another without."""
-        files = [Path(os.path.abspath(sensor.filename)) for sensor in self.sensors]
+        """File names of the photographs, with their folders where equal names would not tell them apart."""
+        files = [Path(os.path.abspath(shot.files.filename or shot.name)) for shot in self.shots]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
             return names
@@ -102,16 +174,22 @@ class Capture:
 
     def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
         """The photographs of these indices alone."""
-        sensors = [self.sensors[k] for k in index]
         pixels = {name: getattr(self, name).part(index) for name in ("images", "masks", "valid") if self.images}
-        return replace(self, sensors=sensors, photographs=Photographs.of(sensors, self.photographs.room), **pixels)
+        return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
+
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
+        """The same photographs, with cameras and lights in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+
+        The rest of the scene (a room, a table, lamps) stays where it is: use it for small motions.
+        """
+        return replace(self, shots=tuple(shot.moved(scale, rotation, shift) for shot in self.shots))
 
     def spread(self, most: int = 200) -> list[int]:
         """Indices of at most so many photographs, evenly spread: enough to look at."""
-        return evenly(len(self), most)
+        return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Photographs `index`, at most so many at a time and all of one size: what one launch renders."""
+        """Photographs `index` in groups of at most so many, each of one size: what one launch renders."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
@@ -123,56 +201,23 @@ class Capture:
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
         """Photographs `index`, all of one size, to be rendered `scale` times smaller."""
-        return self.photographs.select(index, self.sensors[index[0]].size, scale)
+        return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
-        rgb, clipped, mask, valid = zip(*(self.decoded(k, scale) for k in index))
-        masked = torch.tensor(self.masks.part(index).given)
-        if all(v is None for v in valid):
-            return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, None)
-        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
-        return Observation(torch.stack(rgb), torch.stack(clipped), torch.stack(mask), masked, torch.stack(shown))
+        return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
-    def decoded(self, k: int, scale: int) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """One photograph of `observe`. If smaller than the file and if it fits, it is remembered, at its last scale."""
-        if k in self._decoded:
-            before, result = self._decoded[k]
-            if before == scale:
-                return result
-            self._remembered -= self._decoded.pop(k)[1][2].numel()
-        sensor = self.sensors[k]
-        image = self.images[k]
-        linear, saturated = decode(image, is_linear(sensor, image), sensor.saturation, sensor.gamma, sensor.contrast)
-        linear = linear / shade(sensor)
-        mask, own = self.masks[k], self.valid[k]
-        mask = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
-        valid = None
-        if own is not None:
-            shown = own > 127
-            linear = np.where(shown[..., None], linear, 0)
-            saturated = saturated | ~shown[..., None]  # nothing is known: the scene is at least this black
-            valid = box_filter(torch.from_numpy(shown).float()[..., None], scale)[..., 0] == 1
-        result = (
-            box_filter(torch.from_numpy(linear), scale),
-            box_filter(torch.from_numpy(saturated).float(), scale) > 0,
-            box_filter(torch.from_numpy(mask).float()[..., None] / 255, scale)[..., 0],
-            valid,
-        )
-        pixels = result[2].numel()
-        if scale > 1 and self._remembered + pixels <= REMEMBERED_PIXELS:
-            self._decoded[k] = scale, result
-            self._remembered += pixels
-        return result
+    def _observe(self, k: int, scale: int) -> Observation:
+        return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels (of all that are not black, where there are no masks).
+        """Mean linear radiance of the object's pixels; without masks, of all pixels that are not black.
 
-        Of many photographs some tell.
+        Estimated from `SOME` photographs.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):
-            side = min(self.sensors[k].size)
+            side = min(self.shots[k].size)
             rgb, _, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
@@ -182,13 +227,13 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """Is more to be seen than the object, by the photographs' masks? Then colours beside it say nothing.
+        """Do the photographs show more than the object, by their masks?
 
-        Where the room was black they say that nothing is there.
+        If so, the colours beside the object say nothing. In a black room they say that nothing is there.
         """
         shares = []
         for k in self.spread(SOME):
-            rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.sensors[k].size) // COARSE))
+            rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
             inside, outside = mask[0] > 0.99, blur(mask, 2.0)[0] < 0.01
             if valid is not None:
                 outside &= valid[0]
@@ -197,55 +242,61 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Order of magnitude of ρ: what makes a surface at `center` as bright as `exposure` under these lights.
+        """The reflectance that makes a surface at `center` as bright as `exposure` under the photographs' lights.
 
-        That of `ALBEDO` where photographs have no light of their own: what others bring nobody knows.
+        Its order of magnitude. That of `ALBEDO` where photographs have no light of their own.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:
-        """The mean direction (3,) that is up in the photographs; in the first if they were held in every way."""
-        ups = np.stack([sensor.camera.up for sensor in self.sensors])
+        """The mean direction (3,) that is up in the photographs; if they have none in common, up in the first."""
+        ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
         """The masks with their cameras, small, one for all photographs that share both; at most so many, evenly."""
-        once: dict[tuple, int] = {}
-        for k, (mask, sensor) in enumerate(zip(self.masks.readers, self.sensors)):
-            if mask is not None:
-                once.setdefault((mask, sensor.camera.to_world.tobytes()), k)
-        all_ = list(once.values())
-        chosen = [all_[i] for i in evenly(len(all_), len(all_) if most is None else most)]
         return [
-            small_silhouette(Silhouette(self.masks[k], self.sensors[k].camera, self.outline(k), self.valid[k]))
-            for k in chosen
+            small_silhouette(Silhouette(self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k]))
+            for k in self._outlined(most)
         ]
 
-    @property
-    def views(self) -> list[View]:
-        """What each photograph can show."""
-        return views_of(self.sensors, self.valid)
+    def _outlined(self, most: int | None) -> list[int]:
+        """Indices of the photographs of `silhouettes`."""
+        once: dict[tuple, int] = {}
+        for k, (mask, shot) in enumerate(zip(self.masks.readers, self.shots)):
+            if mask is not None:
+                once.setdefault((mask, shot.camera.to_world.tobytes()), k)
+        all_ = list(once.values())
+        return [all_[i] for i in evenly_spaced(len(all_), len(all_) if most is None else most)]
 
-    @functools.cached_property
+    @property
+    def views(self) -> list[MaskedCamera]:
+        """What each photograph can show."""
+        return views_of(self.shots, self.valid)
+
+    @property
     def hull(self) -> Hull | None:
-        """The visual hull of the masks, if there are any and they are seen from more than one side."""
-        silhouettes = self.silhouettes(MOST)
-        try:
-            return Hull(silhouettes, str(self.path), 0.02 if self.whole else 0.25) if silhouettes else None
-        except NoParallax:
-            return None
+        """The visual hull of the masks; None without masks, or if they are seen from one side alone."""
+        index, wrong = self._outlined(MAX_MASKS), 0.02 if self.whole else 0.25
+        key = wrong, *((self.masks.readers[k], self.valid.readers[k], self.shots[k].camera.key) for k in index)
+        if key not in self.hulls:
+            try:
+                self.hulls[key] = Hull(self.silhouettes(MAX_MASKS), str(self.path), wrong) if index else None
+            except NoParallax:
+                self.hulls[key] = None
+        return self.hulls[key]
 
     @property
     def whole(self) -> bool:
-        """Do masks show the whole object? Those that were found do not show what is in shadow."""
+        """Do masks show the whole object? Masks by brightness do not show what is in shadow."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """The file that photograph `k` has its mask from."""
-        return str(self.sensors[k].mask or self.sensors[k].filename)
+        """The file that photograph `k` has its mask from, for messages."""
+        return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
         """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
@@ -256,28 +307,28 @@ class Capture:
         return center, radius
 
 
-def views_of(sensors: Sequence, valid: Pixels) -> list[View]:
-    """What photographs can show that have these masks of what is valid, which are made small."""
+def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
+    """What photographs can show that have these masks of valid pixels, which are made small."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
-            small[reader] = shrink_mask(valid[k], WIDTH)
+            small[reader] = shrink_mask(valid[k], MAX_WIDTH)
     found = [small[reader] for reader in valid.readers]
-    return [View(sensor.camera.shrunk(scale), mask) for sensor, (mask, scale) in zip(sensors, found, strict=True)]
+    return [MaskedCamera(shot.camera.shrunk(scale), mask) for shot, (mask, scale) in zip(shots, found, strict=True)]
 
 
 def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:
     """Centre of the masks' visual hull and 1.3 times the radius of the ball of the same volume [scene units].
 
-    A start surface that is a little too large shrinks onto the object, which goes faster than growing limbs.
+    A start surface that is a little too large shrinks onto the object, which is faster than growing limbs.
     """
     center, radius = hull.ball()
     return center, 1.3 * radius
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
-    """The point that all cameras look at, and half the radius of the ball there that every photograph holds."""
-    cameras = [sensor.camera for sensor in capture.sensors]
+    """The point nearest to all optical axes, and half the radius of the ball there that every photograph holds."""
+    cameras = [shot.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])
     center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))
     half_angle = min(np.arctan(min(camera.size) / 2 / camera.focal.max()) for camera in cameras)

@@ -1,8 +1,8 @@
-"""Photographs and masks from files: encoded pixels, and the linear radiance that they mean."""
+"""Image files of a capture: their encoded pixels, and the linear radiance that these stand for."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
+from mi_ring.scene.shot import Encoding, Shot
 
 Read = TypeVar("Read")
 
@@ -17,9 +18,10 @@ Read = TypeVar("Read")
 def decode(
     image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (float32) of encoded pixels and where they are at or above `saturation`, of `image`'s shape.
+    """Linear radiance (float32) of encoded pixels, and where they are clipped (bool); both of `image`'s shape.
 
-    `gamma`, `contrast`: of the camera's curve, by which linear values are radiance to this power, `contrasted`.
+    `linear`: are the pixels linear, not sRGB? A pixel is clipped from `saturation` on. `gamma` and `contrast` are those
+    of a `Response`, which is undone.
     """
     if image.dtype == np.float32:
         value = image
@@ -33,103 +35,102 @@ def decode(
     return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
 
 
-def shade(sensor: Any, scale: int = 1) -> np.ndarray | float:
-    """What lens and gain of a photograph make of light: factors (H, W, 3) or (3,), of a picture `scale` times smaller.
-
-    1 if they leave it as it is.
-    """
-    gain = sensor.gain.astype(np.float32) if (sensor.gain != 1).any() else np.float32(1)
-    if not sensor.vignetting:
+def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
+    """Factors of radiance by lens and gain, (H, W, 3) or (3,), of a photograph `scale` times smaller; 1 if all are."""
+    gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
+    if not shot.response.vignetting:
         return gain
-    cosines = sensor.camera.shrunk(scale).cosines()
-    return (cosines[..., None] ** sensor.vignetting).astype(np.float32) * gain
+    cosines = shot.camera.shrunk(scale).cosines()
+    return (cosines[..., None] ** shot.response.vignetting).astype(np.float32) * gain
 
 
-def recorded(radiance: np.ndarray, sensor: Any, scale: int = 1) -> np.ndarray:
-    """Linear radiance (H, W, 3) as lens, gain and curve of a photograph's camera record it, `scale` times smaller."""
-    curved = (radiance * shade(sensor, scale)) ** sensor.gamma
-    return curved if sensor.contrast == 1 else contrasted(curved, sensor.contrast)
+def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
+    """The linear values that a photograph's camera records of radiance (H, W, 3), `scale` times smaller."""
+    curved = (radiance * shade(shot, scale)) ** shot.response.gamma
+    return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 
 
-def read_pixels(path: Path, field: str, sensor: Any, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32, all the bits that the file has.
+def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, C) of an image file, with all its bits: uint8, uint16 or float32.
 
-    Raises InputError if there is no such file, if it is no image or not as large as the film of `sensor`.
+    Raises InputError if there is no such file, if it is no image or not as large as the film of the photograph.
     """
-    pixels = read_by(read_image, path, field, sensor, scene)
-    require_size(pixels.shape[1::-1], path, field, sensor)
+    pixels = read_by(read_image, path, field, shot, scene)
+    require_size(pixels.shape[1::-1], path, field, shot)
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
-        what = f'photograph "{sensor.id()}", {field}'
+        what = f'photograph "{shot.name}", {field}'
         raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
 
 
-def require_header(path: Path, field: str, sensor: Any, scene: Path) -> None:
-    """Raise as `read_pixels` does, for what the first bytes of an image file tell."""
-    require_size(read_by(image_size, path, field, sensor, scene), path, field, sensor)
+def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
+    """Raise InputError as `read_pixels` does, but read the header of the file alone."""
+    require_size(read_by(image_size, path, field, shot, scene), path, field, shot)
 
 
-def read_by(read: Callable[[Path], Read], path: Path, field: str, sensor: Any, scene: Path) -> Read:
-    """What is read of a file. Raises InputError if there is none, or if it is no image."""
-    what = f'photograph "{sensor.id()}", {field}'
+def read_by(read: Callable[[Path], Read], path: Path, field: str, shot: Shot, scene: Path) -> Read:
+    """What `read` reads of a file. Raises InputError if there is none, or if it is no image."""
+    what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
         raise InputError(f"{scene}: {what}: no such file: {path}")
     with reading(f"{path}: {what}", "an image"):
         return read(path)
 
 
-def require_size(size: tuple[int, ...], path: Path, field: str, sensor: Any) -> None:
+def require_size(size: tuple[int, ...], path: Path, field: str, shot: Shot) -> None:
     """Raise InputError unless a picture is as large as the film of its photograph."""
-    if size != sensor.size:
-        found, expected = ("{} x {}".format(*size) for size in (size, sensor.size))
-        what = f'photograph "{sensor.id()}", {field}'
+    if size != shot.size:
+        found, expected = ("{} x {}".format(*size) for size in (size, shot.size))
+        what = f'photograph "{shot.name}", {field}'
         raise InputError(f"{path}: {what}: is {found} pixels, the film says {expected}")
 
 
-def read_photograph(sensor: Any, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph, without the ambient light if it says what that shows, then float32."""
-    image = read_colours(sensor, sensor.filename, "filename", scene)
-    if not sensor.ambient:
+def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, 3) of a photograph. If it has an `ambient` file, that is subtracted: they are float32."""
+    image = read_colours(shot, "filename", scene)
+    if not shot.files.ambient:
         return image
-    if (sensor.gamma, sensor.contrast) != (1, 1):
-        raise InputError(f'{scene}: photograph "{sensor.id()}", ambient: cannot be subtracted where the camera has a '
+    if (shot.response.gamma, shot.response.contrast) != (1, 1):
+        raise InputError(f'{scene}: photograph "{shot.name}", ambient: cannot be subtracted where the camera has a '
                          "curve; leave out gamma and contrast, or subtract it before")  # fmt: skip
-    pictures = [image, read_colours(sensor, sensor.ambient, "ambient", scene)]
-    (lit, clipped), (ambient, too) = (decode(p, is_linear(sensor, p), sensor.saturation) for p in pictures)
-    difference = lit - ambient  # noise about 0 and all
-    if sensor.encoding == "srgb":
+    pictures = [image, read_colours(shot, "ambient", scene)]
+    (lit, clipped), (ambient, too) = (decode(p, is_linear(shot.encoding, p), shot.saturation) for p in pictures)
+    difference = lit - ambient  # noise about 0, negative values too
+    if shot.encoding == "srgb":
         difference = linear_to_srgb(difference.clip(min=0))
     # Where either is clipped nothing is known but that it is bright.
-    return np.where(clipped | too, np.float32(sensor.saturation), difference).astype(np.float32)
+    return np.where(clipped | too, np.float32(shot.saturation), difference).astype(np.float32)
 
 
-def read_colours(sensor: Any, file: Path, field: str, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a picture; one without colours is grey, and what is transparent is black."""
-    pixels = read_pixels(file, field, sensor, scene)
-    if sensor.encoding == "linear" and pixels.dtype == np.uint8:
-        raise InputError(f'{scene}: photograph "{sensor.id()}", encoding: is linear, but {file.name} has 8 '
+def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
+    """Encoded pixels (H, W, 3) of a photograph's file; grey files have three equal colours, transparent is black."""
+    file = getattr(shot.files, field)
+    pixels = read_pixels(file, field, shot, scene)
+    if shot.encoding == "linear" and pixels.dtype == np.uint8:
+        raise InputError(f'{scene}: photograph "{shot.name}", encoding: is linear, but {file.name} has 8 '
                          "bits, as sRGB has; leave it out, or give 16 bits or EXR if it is linear indeed")  # fmt: skip
     channels = pixels.shape[2]
     rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
-    if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files have the product already
+    if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files hold colours times alpha already
         return rgb
     full = np.iinfo(pixels.dtype).max
-    linear = is_linear(sensor, pixels)
+    linear = is_linear(shot.encoding, pixels)
     radiance = decode(rgb, linear, 1.0)[0] * (pixels[:, :, -1:] / np.float32(full))
     return ((radiance if linear else linear_to_srgb(radiance)) * full + 0.5).astype(pixels.dtype)
 
 
-def is_linear(sensor: Any, pixels: np.ndarray) -> bool:
-    """Is this image linear radiance? As its photograph says, else 8-bit files are not and others are."""
-    return sensor.encoding == "linear" or (sensor.encoding == "auto" and pixels.dtype != np.uint8)
+def is_linear(encoding: Encoding, pixels: np.ndarray) -> bool:
+    """Are encoded pixels linear radiance? If the encoding is `auto`, those of 8 bits are not and all others are."""
+    return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 
-def read_mask(sensor: Any, file: Path, field: str, scene: Path) -> np.ndarray:
-    """Mask (H, W) uint8 from a file that a photograph names in a `field`; its alpha channel if it names itself."""
-    pixels = read_pixels(file, field, sensor, scene)
-    if file == sensor.filename and pixels.shape[2] not in (2, 4):
-        raise InputError(f'{file}: photograph "{sensor.id()}", {field}: is the photograph itself, which has no '
+def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
+    """Mask (H, W) uint8 from the file of this `field`. If that is the photograph itself, its alpha channel."""
+    file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
+    pixels = read_pixels(file, field, shot, scene)
+    if itself and pixels.shape[2] not in (2, 4):
+        raise InputError(f'{file}: photograph "{shot.name}", {field}: is the photograph itself, which has no '
                          "alpha channel")  # fmt: skip
-    channel = pixels[:, :, -1 if file == sensor.filename else 0]
+    channel = pixels[:, :, -1 if itself else 0]
     full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
     return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)

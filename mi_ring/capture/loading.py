@@ -1,104 +1,101 @@
-"""Opens scene files: what a fit would stumble over later is said at once."""
+"""Reads scene files, and refuses at once what a fit could not use."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.capture.brightness_masks import find_masks
-from mi_ring.capture.capture import Capture, views_of
+from mi_ring.capture.arrays import FLATTEST
+from mi_ring.capture.brightness_masks import with_masks_by_brightness
+from mi_ring.capture.capture import Capture, require_variant, views_of
 from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.errors import InputError, SceneError, require_file
 from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.edge_selection import Edges
-from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import room_of
 from mi_ring.scene.mesh_attributes import require_attributes
-from mi_ring.scene.visibility import View
+from mi_ring.scene.shot import Shot
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
-from mi_ring.system import llvm
 from mi_ring.system.progress import progress
 
-FLATTEST = 8  #: longer side of a photograph by its shorter one
-MANY = 2**31  #: pixels of all photographs, about a minute of decoding; of more the headers must do at first
+MANY = 2**31  #: pixels of all photographs, about a minute of decoding; of more only the headers are read at first
 
 
 def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
-    """Open a scene of photographs. Raises InputError, one line, for anything that a fit would stumble over later.
+    """Read a scene file of photographs. Raises InputError, one line, for anything that a fit could not use.
 
-    Without `images` only cameras and lights are read: enough to render. `masks`: those "given" by the scene; if there
-    are none, "auto" finds them by brightness where the room was dark; "none" does so even if there are.
+    Without `images` only cameras and lights are read: enough to render. `masks`: "given" takes those of the scene;
+    "auto" does, too, and if there are none finds them by brightness, where the room was dark; "none" ignores those of
+    the scene and finds them by brightness.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
         raise InputError(f"masks: is {masks}, must be one of given, auto, none")
-    if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
-        why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
-        raise InputError(f"{path}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
-    scene, sensors = open_scene(path)
+    require_variant(path)
+    scene, shots = open_scene(path)
     shapes = [s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh)]
     if len(shapes) != 1:
         raise InputError(f'{path}: shape: found {len(shapes)} <shape type="shapenet">; a fit needs exactly one')
+    shadows = getattr(scene.integrator(), "shadows", True)
+    capture = Capture(path, path.read_bytes(), scene, shapes[0], shots, room_of(scene), shadows)
     try:
         for shape in scene.shapes():
             require_attributes(shape)
         if images:
             Edges(scene)  # refuses shapes without gradients
-        photographs = Photographs.of(sensors, room_of(scene))
+        capture.photographs  # noqa: B018 (refuses lights that cannot be rendered)
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
-    shadows = getattr(scene.integrator(), "shadows", True)
     if not images:
-        return Capture(path, scene, shapes[0], sensors, photographs, shadows)
-    for sensor in sensors:
-        if FLATTEST * min(sensor.size) < max(sensor.size):
-            size = "{} x {}".format(*sensor.size)
-            raise InputError(f'{path}: photograph "{sensor.id()}", film: is {size} pixels; sides of more than '
+        return capture
+    for shot in shots:
+        if FLATTEST * min(shot.size) < max(shot.size):
+            size = "{} x {}".format(*shot.size)
+            raise InputError(f'{path}: photograph "{shot.name}", film: is {size} pixels; sides of more than '
                              f"{FLATTEST} : 1 cannot be made smaller")  # fmt: skip
-    pixels = Pixels([partial(read_photograph, s, path) for s in sensors])
-    given = masks_of(sensors, "mask", path) if masks != "none" else Pixels([None] * len(sensors))
-    valid = masks_of(sensors, "valid", path)
-    many = sum(width * height for width, height in (s.size for s in sensors)) > MANY
-    for k, sensor in enumerate(progress(sensors, "reading", unit="photograph", disable=None)):
-        if many and k:  # decoded as they are needed; the first tells what all are like
-            require_headers(sensor, path, masks)
+    pixels = Pixels(partial(read_photograph, shot, path) for shot in shots)
+    given = masks_of(shots, "mask", path) if masks != "none" else Pixels([None] * len(shots))
+    valid = masks_of(shots, "valid", path)
+    many = sum(width * height for width, height in (shot.size for shot in shots)) > MANY
+    for k, shot in enumerate(progress(shots, "reading", unit="photograph", disable=None)):
+        if many and k:  # decoded later, when they are needed; the first one shows at once what is wrong with all
+            require_headers(shot, path, masks)
         else:
             pixels[k], given[k], valid[k]
-    capture = Capture(path, scene, shapes[0], sensors, photographs, shadows, pixels, given, valid)
-    if masks != "given" and not any(given.given):
-        find_masks(capture)
-    return capture
+    capture = replace(capture, images=pixels, masks=given, valid=valid)
+    return with_masks_by_brightness(capture) if masks != "given" and not any(given.given) else capture
 
 
-def require_headers(sensor: Any, scene: Path, masks: str) -> None:
-    """Raise InputError if a file that a photograph names is none that could be decoded. `masks`: as for a capture."""
-    for field in ("filename", "mask", "valid", "ambient"):
-        file = getattr(sensor, field)
+def require_headers(shot: Shot, scene: Path, masks: str) -> None:
+    """Raise InputError if a file of a photograph cannot be decoded, by its header. `masks`: as for `load_capture`."""
+    for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
-            require_header(file, field, sensor, scene)
+            require_header(file, field, shot, scene)
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Raise InputError, one line, for most of what `load_capture` would stumble over, without decoding anything."""
-    for sensor in load_capture(path, images=False).sensors:
-        require_headers(sensor, path, masks)
+    """Raise InputError, one line, for most of what `load_capture` refuses, without decoding any photograph."""
+    for shot in load_capture(path, images=False).shots:
+        require_headers(shot, path, masks)
 
 
-def masks_of(sensors: Sequence, field: str, scene: Path) -> Pixels:
-    """The masks (H, W) that photographs name in a field; those that share a file share its pixels."""
+def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
+    """The masks (H, W) of this field of photographs; those that share a file share its pixels."""
     readers: dict[tuple, Reader] = {}
 
-    def reader(sensor: Any, file: Path | None) -> Reader | None:
-        key = file, sensor.size, file == sensor.filename
-        return readers.setdefault(key, partial(read_mask, sensor, file, field, scene)) if file else None
+    def reader(shot: Shot) -> Reader | None:
+        file = getattr(shot.files, field)
+        key = file, shot.size, file == shot.files.filename
+        return readers.setdefault(key, partial(read_mask, shot, field, scene)) if file else None
 
-    return Pixels(reader(sensor, getattr(sensor, field)) for sensor in sensors)
+    return Pixels(map(reader, shots))
 
 
 def require_scene(path: Path) -> None:
@@ -111,7 +108,7 @@ def require_scene(path: Path) -> None:
         raise InputError(f"{path}: is a photograph; give {usual}")
 
 
-def open_scene(path: Path) -> tuple[mi.Scene, list]:
+def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
     """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
     require_scene(path)
     try:
@@ -122,14 +119,22 @@ def open_scene(path: Path) -> tuple[mi.Scene, list]:
         raise InputError(f"{path}: {what}; give the XML file of a scene, in UTF-8") from error
     except RuntimeError as error:
         raise InputError(f"{path}: {reason(error)}") from error
-    sensors = [s for s in scene.sensors() if isinstance(s, photograph.Photograph)]
-    if not sensors:
+    try:
+        shots = tuple(sensor.shot for sensor in photographs_in(scene))
+    except SceneError as error:
+        raise InputError(f"{path}: {error}") from error
+    if not shots:
         raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
-    return scene, sensors
+    return scene, shots
+
+
+def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
+    """The `photograph` sensors of a scene."""
+    return [sensor for sensor in scene.sensors() if isinstance(sensor, photograph.Photograph)]
 
 
 def require_xml(path: Path) -> None:
-    """Raise InputError for what Mitsuba reads and others do not, and for what it takes to be at the origin silently."""
+    """Raise InputError for what Mitsuba alone can read, and for what it would silently place at the origin."""
     content = path.read_bytes()
     content.decode("utf-8")
     try:
@@ -147,14 +152,14 @@ def require_xml(path: Path) -> None:
                                  "out if that is at the camera")  # fmt: skip
 
 
-def load_views(path: Path) -> list[View]:
-    """What each photograph of a scene file can show, without opening it. Raises InputError if it cannot be read."""
-    _, sensors = open_scene(path)
-    return views_of(sensors, masks_of(sensors, "valid", path))
+def load_views(path: Path) -> list[MaskedCamera]:
+    """What each photograph of a scene file can show, by the file alone. Raises InputError if it cannot be read."""
+    _, shots = open_scene(path)
+    return views_of(shots, masks_of(shots, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:
-    """Sum the vertex normals of meshes whose files have none anew: one thread does so in one order, several in any."""
+    """Recompute the vertex normals of meshes whose files have none: one thread sums them always in the same order."""
     for shape in scene.shapes():
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
@@ -167,7 +172,7 @@ def recompute_normals(scene: mi.Scene) -> None:
 
 
 def reason(error: RuntimeError) -> str:
-    """What Mitsuba's parser has to say, in one line."""
+    """The message of Mitsuba's parser, in one line."""
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
         text = text.split("Error: ", 1)[-1]

@@ -5,26 +5,27 @@ from functools import partial
 
 import numpy as np
 
-#: Bytes of photographs, and as many of masks, that are kept as their files decode; the others are read each time.
+#: Bytes of decoded files that one `Pixels` keeps. What does not fit is read again each time.
 KEPT = 2**30
 
 Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """Arrays by place, each as its reader gives it; None where there is no reader. Places of one reader share an array.
+    """Arrays by index, each as its reader gives it; None where there is no reader.
 
-    Which photograph is next is drawn by lot: those that were read first are as good to keep as those that were last.
+    The same reader at several places gives one array to all of them. Its parts share what has been read so far. What
+    was read first is kept: a fit draws photographs at random, so that no other order is better.
     """
 
-    def __init__(self, readers: Iterable[Reader | None], kept: dict[Reader, np.ndarray] | None = None) -> None:
-        """`kept`: what has been read of them so far."""
-        self.readers = list(readers)
+    def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
+        """`kept`: what has been read by these readers so far."""
+        self.readers = tuple(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """Arrays that are there already."""
+        """These arrays, which are in memory."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -43,15 +44,15 @@ class Pixels(Sequence):
 
     @property
     def given(self) -> list[bool]:
-        """Which places have one; nothing is read."""
+        """Which indices have an array; nothing is read."""
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """Those of these places alone."""
+        """The arrays of these indices."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
-        """The same with others in some places."""
+        """The same with other readers at some indices."""
         several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
         left = {*several}
         return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

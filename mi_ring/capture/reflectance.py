@@ -2,36 +2,33 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
 from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
-from mi_ring.scene.mesh_attributes import attributes_of, constants
+from mi_ring.scene.mesh_attributes import attributes_of, constant_values
 from mi_ring.scene.xml_elements import load_bsdf
 
 
-def predicted_parameters(
-    scene: Path, shape: Any, ranges: dict[str, tuple[float, float]]
-) -> tuple[tuple[Parameter, ...], str]:
-    """The parameters of the shapenet's BSDF that BRDF-Net is to predict, and the BSDF that reads them, as XML.
+def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
+    """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the BSDF that reads them, as XML.
 
     `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where
-    there is none. Empty: those of the five numbers of `cooktorrance` that have no constant. Raises InputError, naming
-    what the BSDF has.
+    there is no highest. Empty: those of the five parameters of `cooktorrance` that have no constant. Raises InputError,
+    which names the parameters that the BSDF has.
     """
-    bsdf = shape.bsdf()
-    element = bsdf_element(ElementTree.parse(scene).getroot(), scene)[1]
+    scene, bsdf = capture.path, capture.shape.bsdf()
+    element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
     kind = element.get("type")
     for inner in element.iter():
         if inner.tag == "ref" or inner.get("name") == "filename":
             raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
-    textures = constants(bsdf)
+    textures = constant_values(bsdf)
     own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
     names = ", ".join([*textures, *own])
     if not ranges and kind != "cooktorrance":
@@ -75,7 +72,7 @@ def predicted_parameters(
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """What BRDF-Net's output must begin with for the parameter to begin with the mean of `value`; 0 without an end."""
+    """The output of BRDF-Net for which the parameter is the mean of `value`; 0 if there is no highest value."""
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

@@ -12,70 +12,68 @@ from numpy.typing import ArrayLike
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
-from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import COUNT, ORDER
+from mi_ring.rendering.spherical_harmonics import MAX_ORDER, PER_FRAME
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Shot
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
 
-#: Properties of plugins, Mitsuba's and ours, that name a file. A value of another one may only look like a name.
+#: Properties of plugins, Mitsuba's and ours, that name a file. The value of another property may look like a name.
 FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 
-#: What a photograph says of lens, curve and flash by one number each, and what it says by saying nothing.
-USUAL = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
+#: What a fit may refine of a photograph, beside its light: names in a scene file. `DEFAULTS` are not written.
+DEFAULTS = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
+REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *DEFAULTS}
 
-GAIN = "gain"  #: of a photograph: its only property of several numbers
 
-
-def photograph_element(
-    name: str, filename: str, camera: Camera, light: Light | None = None, mask: str | None = None,
-    encoding: str | None = None, saturation: float | None = None, valid: str | None = None, gamma: float = 1.0,
-    calibrated: bool = False, falloff: float = 0.0, vignetting: float = 0.0, contrast: float = 1.0,
-    ambient: str | None = None, gain: ArrayLike = 1.0,
-) -> Element:  # fmt: skip
-    """A `photograph` as XML. File names are as the scene has them; without a light it is at the camera."""
-    element = ElementTree.Element("sensor", type="photograph", id=name)
-    files = {"filename": filename, "mask": mask, "valid": valid, "ambient": ambient}
-    for field, value in (files | {"encoding": encoding}).items():
-        if value:
-            ElementTree.SubElement(element, "string", name=field, value=value)
+def photograph_element(shot: Shot) -> Element:
+    """A photograph as XML. Its files are named as the shot has them: make them relative to the scene file before."""
+    element = ElementTree.Element("sensor", type="photograph", id=shot.name)
+    for field, file in shot.files._asdict().items():
+        if file:
+            ElementTree.SubElement(element, "string", name=field, value=file.as_posix())
+    if shot.encoding != "auto":
+        ElementTree.SubElement(element, "string", name="encoding", value=shot.encoding)
+    camera, response = shot.camera, shot.response
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
-    if saturation is not None:
-        fields["saturation"] = saturation
-    given = dict(zip(USUAL, (gamma, contrast, falloff, vignetting, camera.distortion)))
-    fields |= {field: value for field, value in given.items() if value != USUAL[field]}
+    if shot.saturation != 1:
+        fields["saturation"] = shot.saturation
+    given = response.gamma, response.contrast, shot.falloff, response.vignetting, camera.distortion
+    fields |= {field: value for field, value in zip(DEFAULTS, given) if value != DEFAULTS[field]}
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
-    if (np.asarray(gain) != 1).any():
-        ElementTree.SubElement(element, "string", name=GAIN, value=numbers(gain))
-    if calibrated:
+    if response.gain != (1, 1, 1):
+        ElementTree.SubElement(element, "string", name="gain", value=numbers(response.gain))
+    if shot.calibrated:
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
     add_pose(element, camera.to_world)
     add_film(element, *camera.size)
-    if light:
-        element.append(emitter_element(light))
+    if shot.light:
+        element.append(emitter_element(shot.light))
     return element
 
 
 def scene_element(
-    photographs: Iterable[Element], ground: np.ndarray | None = None, up: np.ndarray | None = None,
-    metres: float | None = None, fresnel: bool = False,
+    photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
+    ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
     """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`.
 
-    `ground` (3,): a point on the table that the object stands on; `up` (3,): the table's normal, or what else is up;
-    `metres`: the length of a scene unit. None where it is not known. `fresnel`: of `cooktorrance`.
+    `center` (3,), `radius`: of the normalising sphere [scene units]; `ground` (3,): a point on the table that the
+    object stands on; `up` (3,): the table's normal, or another direction that is up; `metres`: the length of a scene
+    unit. None where they are not known. `fresnel`: of `cooktorrance`.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
     shape = ElementTree.SubElement(root, "shape", type="shapenet", id="object")
-    for tag, name, value in (("point", "ground", ground), ("vector", "up", up)):
-        if value is not None:
-            x, y, z = map(numbers, value)
+    for tag, name, vector in (("point", "center", center), ("point", "ground", ground), ("vector", "up", up)):
+        if vector is not None:
+            x, y, z = map(numbers, vector)
             ElementTree.SubElement(shape, tag, name=name, x=x, y=y, z=z)
-    if metres is not None:
-        ElementTree.SubElement(shape, "float", name="metres", value=numbers(metres))
+    for name, number in (("radius", radius), ("metres", metres)):
+        if number is not None:
+            ElementTree.SubElement(shape, "float", name=name, value=numbers(number))
     bsdf = ElementTree.SubElement(shape, "bsdf", type="cooktorrance")
     if fresnel:
         ElementTree.SubElement(bsdf, "boolean", name="fresnel", value="true")
@@ -113,9 +111,9 @@ def emitter_element(light: Light) -> Element:
 
 
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
-    """A camera as Mitsuba's `perspective`, whose clipping planes hold points (n, 3) between them.
+    """A camera as Mitsuba's `perspective`, without distortion. Points (n, 3) lie between its clipping planes.
 
-    Its pixels are square, so that it may have more or fewer rows, and it has no distortion.
+    Its pixels are square: it has more or fewer rows where those of the camera are not.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)
@@ -152,29 +150,24 @@ def numbers(values: ArrayLike) -> str:
 
 
 def recalibrated_xml(
-    scene: bytes, sensors: Sequence, room: np.ndarray | None = None, frames: Collection[str] | None = None,
+    scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
     lamps: Iterable[Light] | None = None,
 ) -> bytes:  # fmt: skip
-    """A scene file whose photographs have the cameras, lights and curves of these, by name; unnamed ones in order.
+    """A scene file whose photographs have the cameras, lights and responses of `shots`, by name; unnamed ones in order.
 
-    `room`: the light of their room, as `mi_ring.rendering.spherical_harmonics` has it; `frames`: axes that it has, even
-    without light, by default those of the rooms that the scene file has; `lamps`: point lights and distant ones that
-    light all photographs, by default those of the scene file.
+    `room`: light of the room, as `mi_ring.rendering.spherical_harmonics` has it; `frames`: axes in which a `room` is
+    written even if it is black, by default those of the file's rooms; `lamps`: point lights and distant ones that light
+    all photographs, by default those of the file.
     """
     root = ElementTree.fromstring(scene)
-    for old, k in photographs_of(root, sensors):
-        sensor = sensors[k]
-        new = photograph_element(
-            "", "", sensor.camera, Lights.of([sensor])[0], gamma=sensor.gamma, contrast=sensor.contrast,
-            falloff=sensor.cone, vignetting=sensor.vignetting, gain=sensor.gain,
-        )  # fmt: skip
-        fields = {child.get("name"): child for child in new if child.tag in ("float", "string", "transform")}
-        for child in list(old):
+    for element, k in photographs_of(root, shots):
+        new = photograph_element(shots[k])
+        for child in list(element):
             known = f".//emitter[@id='{child.get('id')}']"
             lit = child.tag == "emitter" or (child.tag == "ref" and root.find(known) is not None)
-            if lit or child.get("name") in {*USUAL, GAIN, *fields}:
-                old.remove(child)
-        old.extend([*fields.values(), *new.findall("emitter")])
+            if lit or child.get("name") in REFINED:
+                element.remove(child)
+        element.extend(child for child in new if child.tag == "emitter" or child.get("name") in REFINED)
     if lamps is not None:
         for emitter in [e for e in root.findall("emitter") if e.get("type") in ("point", "directional")]:
             root.remove(emitter)
@@ -189,10 +182,10 @@ def recalibrated_xml(
     return scene_bytes(root)
 
 
-def remasked_xml(scene: bytes, sensors: Sequence, masks: Mapping[int, str]) -> bytes:
-    """A scene file of the photographs `sensors`, some of which, by index, have these masks; names relative to it."""
+def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
+    """A scene file of these photographs with other masks for some: files relative to it, by a photograph's index."""
     root = ElementTree.fromstring(scene)
-    for element, k in photographs_of(root, sensors):
+    for element, k in photographs_of(root, shots):
         if k in masks:
             for old in element.findall("string[@name='mask']"):
                 element.remove(old)
@@ -200,30 +193,30 @@ def remasked_xml(scene: bytes, sensors: Sequence, masks: Mapping[int, str]) -> b
     return scene_bytes(root)
 
 
-def photographs_of(root: Element, sensors: Sequence) -> list[tuple[Element, int]]:
-    """The photographs of a scene file, each with the index of its sensor: by name; unnamed ones in order."""
+def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
+    """The photographs of a scene file, each with its index in `shots`: by name; unnamed ones in order."""
     elements = root.findall(".//sensor[@type='photograph']")
-    named = {sensor.id(): k for k, sensor in enumerate(sensors)}
-    numbered = zip(elements, range(len(sensors)), strict=True)
+    named = {shot.name: k for k, shot in enumerate(shots)}
+    numbered = zip(elements, range(len(shots)), strict=True)
     return [(element, named.get(element.get("id", ""), k)) for element, k in numbered]
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """The light of a room as XML: what is fixed in the world, and what is in the camera, where there is something.
+    """The light of a room (BASIS, 3) as XML: the part fixed in the world and the part fixed in the camera.
 
-    `frames`: of rooms that there were; they are kept, even without light.
+    A black part is left out, unless its axes are among `frames`.
     """
-    world, camera = room[:COUNT], np.vstack([np.zeros_like(room[:1]), room[COUNT:]])
-    # What is alike from all sides is of both.
+    world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
+    # Light that is the same from all sides can be written in either.
     if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
-        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[COUNT:])])
+        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[PER_FRAME:])])
     parts = {"world": world, "camera": camera}
     return [room_element(frame, part) for frame, part in parts.items() if part.any() or frame in frames]
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """A `room` as XML: `harmonics` (COUNT, 3), or fewer, in the axes of the world or of the camera."""
-    orders = [(order + 1) ** 2 for order in range(2, ORDER + 1)]
+    """A `room` as XML: `harmonics` (PER_FRAME, 3), or fewer rows, in the axes of the world or of the camera."""
+    orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
     ElementTree.SubElement(element, "string", name="frame", value=frame)
@@ -232,7 +225,7 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:
-    """Rewrite the names of files that are relative to the folder `source` to be relative to another."""
+    """Rewrite names of files that are relative to the folder `source`: make them relative to another folder."""
     for element in root.iter("string"):
         if element.get("name") not in FILES:
             continue
@@ -241,35 +234,35 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
             element.set("value", relative_to(folder.resolve(), file.resolve()))
 
 
-def fitted_scene_xml(source: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """The scene file `source` with the fitted object and its `bsdf`, file names rewritten to be relative to `folder`.
+def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
+    """The scene file `path` with the fitted object and its `bsdf`, its names of files made relative to `folder`.
 
-    Raises InputError for a scene that cannot be rewritten, and for a shapenet that a fit has no use for.
+    Raises InputError for a scene that cannot be rewritten, and for a shapenet that no fit can start from.
     """
-    tree = ElementTree.parse(source)
-    old_bsdf, _ = bsdf_element(tree.getroot(), source)
-    move_names(tree.getroot(), source.parent, folder)
-    shape = next(e for e in tree.iter("shape") if e.get("type") == "shapenet")
+    root = ElementTree.parse(path).getroot()
+    old_bsdf, _ = bsdf_element(root, path)
+    move_names(root, path.parent, folder)
+    shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
     for element in list(shape):
         if element.get("name") == "to_world":
-            raise InputError(f"{source}: shapenet, to_world: is for finished fits; remove it to fit anew")
+            raise InputError(f"{path}: shapenet, to_world: is for finished fits; remove it to fit anew")
         if element.get("name") in ("weights", "subdivisions", *FOR_FITS):
             shape.remove(element)
     shape.remove(old_bsdf)
     shape.append(ElementTree.fromstring(bsdf))
     ElementTree.SubElement(shape, "integer", name="subdivisions", value=str(subdivisions))
     ElementTree.SubElement(shape, "string", name="weights", value="ring.pt")
-    return scene_bytes(tree.getroot())
+    return scene_bytes(root)
 
 
-def bsdf_element(root: Element, scene: Path) -> tuple[Element, Element]:
-    """The shapenet's <bsdf>, or its <ref> to one, and the BSDF meant, in the XML of a scene.
+def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
+    """The shapenet's <bsdf>, or its <ref> to one, and the BSDF meant, in the XML of the scene file `path`.
 
-    Raises InputError if there is none, and where a part of the scene is not in the file.
+    Raises InputError if there is none, and where a part of the scene is in another file.
     """
     for tag in ("include", "default", "path"):
         if root.find(f".//{tag}") is not None:
-            raise InputError(f"{scene}: <{tag}>: a fit needs a scene without it; write out what it stands for")
+            raise InputError(f"{path}: <{tag}>: a fit needs a scene without it; write out what it stands for")
     shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
     known = {e.get("id"): e for e in root.iter("bsdf")}
     for child in shape:
@@ -277,4 +270,4 @@ def bsdf_element(root: Element, scene: Path) -> tuple[Element, Element]:
             return child, child
         if child.tag == "ref" and child.get("id") in known:
             return child, known[child.get("id")]
-    raise InputError(f'{scene}: shapenet: has no <bsdf>; add for instance <bsdf type="cooktorrance"/>')
+    raise InputError(f'{path}: shapenet: has no <bsdf>; add for instance <bsdf type="cooktorrance"/>')

@@ -1,4 +1,4 @@
-"""Ray: where many fits run at a time, on this machine or on those of a cluster."""
+"""Many fits at a time with Ray, on this machine or on a cluster."""
 
 import contextlib
 import os
@@ -11,32 +11,30 @@ from mi_ring.collection.jobs import Job
 from mi_ring.errors import InputError
 from mi_ring.system.optional import keeping_handlers, need
 
-STORE = 80 * 2**20  #: bytes of Ray's object store, about the least that it takes: fits give each other nothing
-POLL = 1.0  #: seconds between looks at what goes on
+OBJECT_STORE = 80 * 2**20  #: bytes of Ray's object store, about the least that Ray takes: fits share no data
+POLL = 1.0  #: seconds between looks at the fits
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What a fit is given, and how many run at a time."""
+    """What each fit gets, and how many fits run at a time."""
 
     workers: int
-    cpus: int  #: of each fit, and its threads
+    cpus: int  #: cores and threads of each fit
     gpus: float
-    memory: float  #: of each fit [GiB]; 0: not asked for
-    address: str | None  #: of a cluster that is there already; None: Ray is started here, and ended with the batch
+    memory: float  #: of each fit [GiB]; 0: no limit
+    address: str | None  #: of a running cluster; None: start Ray here and stop it after the batch
 
 
 @contextlib.contextmanager
-def cluster(resources: Resources) -> Iterator[Any]:
-    """Ray, while it is needed. Raises InputError if it is not installed, not reached, or has no room for a fit."""
+def ray_cluster(resources: Resources) -> Iterator[Any]:
+    """Ray, started or connected. Raises InputError if it is missing or unreachable, or if no machine has room."""
     ray = need("ray", "mi-ring batch")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"address": resources.address, "log_to_driver": False, "logging_level": "ERROR"}
     if resources.address is None:
-        options |= {
-            "address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
-            "object_store_memory": STORE,
-        }  # fmt: skip
+        options |= {"address": "local", "num_cpus": resources.workers * resources.cpus, "include_dashboard": False,
+                    "object_store_memory": OBJECT_STORE}  # fmt: skip
     try:
         with keeping_handlers():
             ray.init(**options)
@@ -44,10 +42,10 @@ def cluster(resources: Resources) -> Iterator[Any]:
         where = f"--address: {resources.address}" if resources.address else "mi-ring batch"
         raise InputError(f"{where}: Ray cannot be reached or started ({error}); see `ray status`") from error
     try:
-        asked = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": resources.memory * 2**30}
+        needed = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": resources.memory * 2**30}
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(all(node.get(name, 0) >= amount for name, amount in asked.items()) for node in nodes):
-            most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in asked}
+        if not any(all(node.get(name, 0) >= amount for name, amount in needed.items()) for node in nodes):
+            most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in needed}
             raise InputError(f"--cpus, --gpus, --memory: no machine has room for a fit; they have {most['CPU']:g} "
                              f"processor cores, {most['GPU']:g} GPUs, {most['memory'] / 2**30:.3g} GiB")  # fmt: skip
         yield ray
@@ -55,17 +53,16 @@ def cluster(resources: Resources) -> Iterator[Any]:
         ray.shutdown()
 
 
-def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, look: Callable[[], None]) -> None:
-    """Fit them all, given with their fingerprints; what became of each is in its record. `look` is called now and then.
+def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, on_poll: Callable[[], None]) -> None:
+    """Fit all jobs, given with their fingerprints. The record of each job has its outcome.
 
-    A worker of Ray that dies is replaced, and the fit that it had goes on from its last checkpoint.
+    `on_poll` is called about once a second. Ray replaces a worker that dies; its fit resumes from the last checkpoint.
     """
-    with cluster(resources) as ray:
+    with ray_cluster(resources) as ray:
         fit = ray.remote(fit_to_the_end).options(
             num_cpus=resources.cpus, num_gpus=resources.gpus, memory=resources.memory * 2**30 or None, max_retries=-1
         )
-        waiting = list(jobs)
-        running: dict[Any, Job] = {}
+        waiting, running = list(jobs), dict[Any, Job]()
         while waiting or running:
             while waiting and len(running) < resources.workers:
                 job = waiting.pop(0)
@@ -75,8 +72,8 @@ def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, look: C
                 job = running.pop(reference)
                 try:
                     ray.get(reference)
-                except (ray.exceptions.RayError, OSError, InputError) as error:  # of the worker, not of the fit
+                except (ray.exceptions.RayError, OSError, InputError) as error:  # the worker failed, not the fit
                     message = str(error).strip().splitlines()[-1:] or [type(error).__name__]
                     with contextlib.suppress(InputError):
-                        job.note(replace(job.record, state="failed", message=message[0]))
-            look()
+                        job.save(replace(job.record, state="failed", message=message[0]))
+            on_poll()

@@ -1,4 +1,4 @@
-"""A scene to be fitted among many, and how far its fit is, as files beside the results tell."""
+"""Jobs: scenes to fit. A record beside the results says how far the fit of each is."""
 
 import contextlib
 import hashlib
@@ -13,65 +13,65 @@ from mi_ring.output.results import read_log
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import quoted, read_json, write_file
 
-RECORDS = "batch"  #: folder beside the results with a record of each fit and with what it has printed
+RECORDS = "batch"  #: folder beside the results: the record and the printed output of each fit
 CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
 
 
 @dataclass(frozen=True)
 class Record:
-    """How far the fit of a scene is."""
+    """How far the fit of a job is."""
 
     state: str = "waiting"  #: waiting, running, interrupted, failed or done
-    fingerprint: str = ""  #: of what it is the fit of
-    message: str = ""  #: why it failed
-    tries: int = 0  #: how often it was begun since it got any further
-    iteration: int = 0  #: at the beginning of the last try
-    since: float = 0.0  #: when the fit of this fingerprint was begun first; what is older in the folder is another's
-    done: str = ""  #: fingerprint of the results that were there last, which another fit that fails leaves there
-    written: int = 0  #: when their ring.pt was, in nanoseconds
+    fingerprint: str = ""  #: of the job that is being fitted
+    message: str = ""  #: why the fit failed
+    tries: int = 0  #: starts since the fit last made progress
+    iteration: int = 0  #: at the start of the last try
+    since: float = 0.0  #: time of the first start for this fingerprint; older files in the folder are of another fit
+    done: str = ""  #: fingerprint of the results in the folder; a later fit that fails leaves them there
+    written: int = 0  #: modification time of their ring.pt [ns]
 
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, the folder of its results, and options of `mi_ring.fit`; the first two paths are absolute."""
+    """A scene, the folder of its results, and options of `mi_ring.fit`. The two paths are absolute."""
 
     scene: Path
     folder: Path
     options: tuple[str, ...] = ()
-    place: Path = Path()  #: the folder that paths in `options` are relative to
+    cwd: Path = Path()  #: paths in `options` are relative to this folder
 
     @property
     def name(self) -> str:
-        """Of the results."""
+        """Name of the results folder."""
         return self.folder.name
 
     @property
     def output(self) -> Path:
-        """The file with what its fit has printed."""
+        """File with the printed output of the fit."""
         return self.folder.parent / RECORDS / f"{self.name}.txt"
 
     @property
     def record(self) -> Record:
-        """What was written last; that of a fit that waits, if it cannot be read."""
+        """The last record; that of a waiting job if there is none or if it cannot be read."""
         with contextlib.suppress(TypeError):
             return Record(**read_json(self.output.with_suffix(".json")))
         return Record()
 
-    def note(self, record: Record) -> Record:
-        """Write a record, and return it."""
+    def save(self, record: Record) -> Record:
+        """Write a record and return it."""
         path = self.output.with_suffix(".json")
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, json.dumps(asdict(record)))
         return record
 
     def fingerprint(self) -> str:
-        """Of the options, of the scene file, and of all files that one of either names."""
+        """Hash of the options, the scene file, and all files that either of them names."""
         result = hashlib.blake2b(repr(self.options).encode(), digest_size=16)
-        with contextlib.suppress(OSError):  # the fit says what is wrong with it
+        with contextlib.suppress(OSError):  # the fit reports what is wrong with the scene file
             text = self.scene.read_bytes()
             result.update(text)
             named = {self.scene.parent / word for word in quoted(text)}
-            given = (self.place / (option.partition("=")[2] or option) for option in self.options)
+            given = (self.cwd / (option.partition("=")[2] or option) for option in self.options)
             for file in sorted({*named, *given}):
                 with contextlib.suppress(OSError):
                     if file.is_file():
@@ -79,46 +79,42 @@ class Job:
         return result.hexdigest()
 
     def has_checkpoint(self, since: float) -> bool:
-        """Can its fit, begun at a time `since`, go on from one?"""
-        return any(written(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
+        """Is there a checkpoint that is not older than a time `since`?"""
+        return any(modified(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
 
     def iteration(self, since: float = 0.0) -> int:
-        """The last that its log has; 0 if there is none of a fit begun at a time `since`."""
+        """Last iteration in log.jsonl; 0 if the log is missing or older than a time `since`."""
         with contextlib.suppress(OSError, KeyError, TypeError):
-            if written(self.folder / "log.jsonl") / 1e9 >= since:
+            if modified(self.folder / "log.jsonl") / 1e9 >= since:
                 return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
         return 0
 
     @property
     def progress(self) -> str:
-        """How far a fit that is running is, in words."""
-        planned = ""
+        """How far a running fit is, as text."""
+        planned: list[str] = []
         with contextlib.suppress(OSError):
-            said = re.findall(r"iteration \d+/(\d+)", self.output.read_text(errors="replace"))
-            planned = f" of {said[-1]}" if said else ""
+            planned = re.findall(r"iteration \d+(/\d+)", self.output.read_text(errors="replace"))
         iteration = self.iteration(self.record.since)
-        return f"iteration {iteration}{planned}" if iteration else "begins"
+        return f"iteration {iteration}{''.join(planned[-1:]).replace('/', ' of ')}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
-        """Are there results, of what the scene and its options still are?"""
-        record, ring = self.record, written(self.folder / "ring.pt")
+        """Are there complete results for this fingerprint?"""
+        record, ring = self.record, modified(self.folder / "ring.pt")
         there = ring and (self.folder / "report.html").is_file()
         return bool(there) and (record.done, record.written) == (fingerprint, ring)
 
 
-def written(path: Path) -> int:
-    """When a file was, in nanoseconds; 0 if there is none."""
+def modified(path: Path) -> int:
+    """Modification time of a file [ns]; 0 if there is no such file."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
 
 
-def jobs_of(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene.
-
-    Raises InputError if one is no file, if two have the same name, or if results would go onto a scene.
-    """
+def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
+    """A job for each scene. Raises InputError for a missing file, equal names, and results that overwrite a scene."""
     jobs: dict[str, Job] = {}
     for scene in scenes:
         require_file(scene, "the XML file of a scene")

@@ -1,285 +1,216 @@
-"""The experiments: each is a list of runs, and what columns and figure are made of them."""
+"""The experiments: the runs of each, and the columns and the figure that are made of them."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mi_ring.errors import InputError
 from mi_ring.experiments import measures, plots, published
-from mi_ring.experiments.experiment import Asked, Column, Experiment, Run
-from mi_ring.experiments.recipes import DiligentObject, Part, Perturbed, own
+from mi_ring.experiments.datasets import DiligentObject, PerturbedCameras, Subset
+from mi_ring.experiments.experiment import Column, Experiment, ExperimentOptions, Run
+from mi_ring.experiments.selection import datasets, one_mesh, path_traced, require_no_materials, short_name
 from mi_ring.experiments.single_view import SingleView
-from mi_ring.experiments.sources import captures, one_mesh, require_no_materials, short, traced
 
-DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: where its photographs are to be had
-WRONG = 0.5  #: of cameras in table 3: [deg], and [% of the distance]
+DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: site of the two data sets
+POSE_ERROR = 0.5  #: of cameras in table 3 [deg], and [% of the distance]
 VIEWS = 5, 10, 15, 25, 35, 50
-BANDS = 6  #: of the stripes
-#: Of rising gloss, and those of the stripes, where no others are given.
+BANDS = 6  #: number of stripes
+#: Default materials of `specularity`, by rising gloss, and of `stripes`.
 GLOSSY = tuple(f"principled base_color=0.5,0.25,0.12 roughness={r} specular=0.6" for r in (0.7, 0.5, 0.3))
 STRIPED = ("principled base_color=0.55,0.1,0.08 roughness=0.3 specular=0.6", "diffuse reflectance=0.2,0.35,0.5")
 
 NORMALS = {"normal_mean": Column("normals, mean °"), "normal_median": Column("median °")}
-DEPTHS = {"depth_mean": Column("depth, mean %", 3), "depth_median": Column("median %", 3)}
+DEPTH = {"depth_mean": Column("depth, mean %", 3)}
+DEPTHS = {**DEPTH, "depth_median": Column("median %", 3)}
 PHOTOGRAPHS = {"psnr_input": Column("PSNR, input dB", 1), "psnr_novel": Column("novel dB", 1)}
 FLAWS = {"inside_out": Column("inside out %", 3), "crossing": Column("crossing %", 3)}
 TIME = {"seconds": Column("fit s", 0)}
-USUAL = {**NORMALS, **DEPTHS, **PHOTOGRAPHS, **TIME}
-SHAPE = {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **FLAWS, **TIME}
-CAPTURES = "folders of captures with scene.xml and truth/mesh.ply"
+ACCURACY = {**NORMALS, **DEPTHS, **PHOTOGRAPHS, **TIME}
+SHAPE = {**NORMALS, **DEPTH, **FLAWS, **TIME}
+MATERIAL = {"slice_error": Column("BRDF slices, relative error %", 1)}
+NORMAL_ERROR = "normal_mean", "error of normals, mean [°]"
+
+ListRuns = Callable[[ExperimentOptions], list[Run]]
 
 
-def seeded(runs: Sequence[Run], asked: Asked) -> list[Run]:
-    """Each run once for each seed. Its name is the same whatever others there are."""
-    many = len(asked.seeds) > 1
-
-    def own_seed(run: Run, seed: int) -> Run:
-        labels = {**run.labels, **({"seed": seed} if many else {})}
-        name = f"{run.name}-{seed}" if seed else run.name
-        return replace(run, name=name, labels=labels, changes={**run.changes, "seed": seed})
-
-    return [own_seed(run, seed) for run in runs for seed in asked.seeds]
+def each_dataset(**fields: Any) -> ListRuns:
+    """A run for each dataset. `fields`: of `Run`."""
+    return lambda options: [Run(d.name, d, {"capture": d.name}, **fields) for d in datasets(options)]
 
 
-def require_one_seed(asked: Asked, name: str) -> None:
-    """Raise InputError for several seeds, where no row could be the mean."""
-    if len(asked.seeds) > 1:
-        raise InputError(f"--seeds: are several; {name} takes one; give one")
+def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> ListRuns:
+    """A run for each dataset and each value of a label. `settings`: by value; `quick`: values for --quick."""
+
+    def list_runs(options: ExperimentOptions) -> list[Run]:
+        values = [*settings] if not (options.quick and quick) else quick
+        return [Run(f"{d.name}-{value}".replace(", ", "-").replace(" ", ""), d, {"capture": d.name, label: value},
+                    settings[value]) for d in datasets(options) for value in values]  # fmt: skip
+
+    return list_runs
 
 
-def varied(asked: Asked, label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> list[Run]:
-    """Each capture by each of some settings, of which --quick takes some."""
-    chosen = quick if asked.quick and quick else settings
-    return seeded([
-        Run(f"{recipe.name}-{key}".replace(", ", "-").replace(" ", ""), recipe,
-            {"capture": recipe.name, label: key}, settings[key])
-        for recipe in captures(asked) for key in chosen
-    ], asked)  # fmt: skip
-
-
-def table1(asked: Asked) -> list[Run]:
-    """Each capture."""
-    return seeded([Run(r.name, r, {"capture": r.name}) for r in captures(asked)], asked)
-
-
-def table2(asked: Asked) -> list[Run]:
-    """Each object of DiLiGenT-MV; those that are not there fail."""
-    require_no_materials(asked)
-    if len(asked.data) != 1:
+def table2(options: ExperimentOptions) -> list[Run]:
+    """Each object of DiLiGenT-MV that the paper has or that DATA has. Those that are not in DATA fail."""
+    require_no_materials(options)
+    if len(options.data) != 1:
         raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
                          f"from its authors: {DILIGENT}/mv")  # fmt: skip
-    root = asked.data[0] / "mvpmsData" if (asked.data[0] / "mvpmsData").is_dir() else asked.data[0]
+    root = options.data[0] / "mvpmsData" if (options.data[0] / "mvpmsData").is_dir() else options.data[0]
     folders = {folder.name.removesuffix("PNG"): folder for folder in sorted(root.glob("*PNG"))}
     if not any((folder / "Calib_Results.mat").is_file() for folder in folders.values()):
-        raise InputError(f"{asked.data[0]}: has no mvpmsData/bearPNG/Calib_Results.mat or the like; give the folder of "
-                         "DiLiGenT-MV as it is unpacked")  # fmt: skip
-    names = [str(row["object"]) for row in published.TABLE2]
-    return seeded([
-        Run(name, DiligentObject(f"diligent-{name}", folders.get(name, root / f"{name}PNG"), name == "bear"),
-            {"object": name}, measure=measures.in_millimetres)
-        for name in sorted({*names, *folders})
-    ], asked)  # fmt: skip
-
-
-def table3(asked: Asked) -> list[Run]:
-    """Each capture with poses that are exact, wrong, and wrong but refined."""
+        raise InputError(f"{options.data[0]}: has no mvpmsData/bearPNG/Calib_Results.mat or the like; give the folder "
+                         "of DiLiGenT-MV as it is unpacked")  # fmt: skip
     runs = []
-    for recipe in captures(asked):
-        for seed in asked.seeds:
-            wrong = Perturbed(f"{recipe.name}-wrong-{seed}", recipe, WRONG, seed)
-            for cameras, source, refine in (
-                ("exact", recipe, "none"), ("wrong", wrong, "none"), ("refined", wrong, "cameras"),
-            ):  # fmt: skip
-                seeds = {"seed": seed} if len(asked.seeds) > 1 else {}
-                runs.append(Run(f"{recipe.name}-{cameras}-{seed}", source,
-                                {"capture": recipe.name, "cameras": cameras, **seeds},
-                                {"refine": (refine,), "seed": seed}, measures.aligned))  # fmt: skip
+    for name in sorted({*(str(row["object"]) for row in published.TABLE2), *folders}):
+        source = folders.get(name, root / f"{name}PNG")
+        dataset = DiligentObject.of(options.captures / f"diligent-{name}", source, name == "bear")
+        runs.append(Run(name, dataset, {"object": name}, measure=measures.in_millimetres))
     return runs
 
 
-def specularity(asked: Asked) -> list[Run]:
+def table3(options: ExperimentOptions) -> list[Run]:
+    """Each dataset with exact cameras, with wrong ones, and with wrong ones that are refined."""
+    runs = []
+    for exact in datasets(options):
+        for seed in options.seeds:
+            wrong = PerturbedCameras.of(options.captures / f"{exact.name}-wrong-{seed}", exact, POSE_ERROR, seed)
+            label = {"seed": seed} if len(options.seeds) > 1 else {}
+            for cameras, dataset, refine in (
+                ("exact", exact, "none"), ("wrong", wrong, "none"), ("refined", wrong, "cameras"),
+            ):  # fmt: skip
+                labels = {"capture": exact.name, "cameras": cameras, **label}
+                changes = {"refine": (refine,), "seed": seed}
+                runs.append(Run(f"{exact.name}-{cameras}-{seed}", dataset, labels, changes, measures.aligned))
+    return runs
+
+
+def specularity(options: ExperimentOptions) -> list[Run]:
     """One mesh of each material."""
-    mesh = one_mesh(asked)
-    materials = asked.materials or (GLOSSY[::2] if asked.quick else GLOSSY)
-    names = [short(material) for material in materials]
-    if len({*names}) < len(names):  # what differs is among the parameters that are left out
+    mesh = one_mesh(options)
+    materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
+    names = [short_name(material) for material in materials]
+    if len({*names}) < len(names):  # they differ in parameters that short names leave out
         names = list(materials)
-    recipes = [traced(asked, mesh, m, f"gloss-{mesh.stem if mesh else 'pot'}-{short(m)}") for m in materials]
-    return seeded([Run(recipe.folder_in(Path()).name, recipe, {"material": called}, measure=measures.with_slices)
-                   for recipe, called in zip(recipes, names)], asked)  # fmt: skip
+    traced = [path_traced(options, mesh, m, f"gloss-{mesh.stem if mesh else 'pot'}-{short_name(m)}")
+              for m in materials]  # fmt: skip
+    return [Run(dataset.scene.parent.name, dataset, {"material": name}, measure=measures.with_slices)
+            for dataset, name in zip(traced, names)]  # fmt: skip
 
 
-def stripes(asked: Asked) -> list[Run]:
+def stripes(options: ExperimentOptions) -> list[Run]:
     """One mesh of two materials."""
-    mesh, materials = one_mesh(asked), asked.materials or STRIPED
+    mesh, materials = one_mesh(options), options.materials or STRIPED
     if len(materials) != 2:
         raise InputError(f"--materials: are {len(materials)}, stripes need two")
-    first, second = materials
-    name = f"stripes-{mesh.stem if mesh else 'pot'}-{short(first)}-{short(second)}"
-    recipe = traced(asked, mesh, first, name, second=second, bands=BANDS)
-    labels = {"materials": f"{short(first)} and {short(second)}"}
-    return seeded([Run(recipe.folder_in(Path()).name, recipe, labels, measure=measures.with_slices)], asked)
+    first, second = map(short_name, materials)
+    name = f"stripes-{mesh.stem if mesh else 'pot'}-{first}-{second}"
+    dataset = path_traced(options, mesh, materials[0], name, second=materials[1], bands=BANDS)
+    labels = {"materials": f"{first} and {second}"}
+    return [Run(dataset.scene.parent.name, dataset, labels, measure=measures.with_slices)]
 
 
-def views(asked: Asked) -> list[Run]:
-    """Each capture by so many of its photographs."""
-    return seeded([
-        Run(f"{recipe.name}-{count}", Part(f"{recipe.name}-part-{count}", recipe, count),
-            {"capture": recipe.name, "views": count})
-        for recipe in captures(asked) for count in counts(asked, recipe.photographs)
-    ], asked)  # fmt: skip
+def views(options: ExperimentOptions) -> list[Run]:
+    """Each dataset with several numbers of photographs, up to all."""
+    runs = []
+    for source in datasets(options):
+        fewer = {count for count in (VIEWS[:1] if options.quick else VIEWS) if count < source.photographs}
+        for count in sorted(fewer | {source.photographs}):
+            dataset = Subset.of(options.captures / f"{source.name}-part-{count}", source, count)
+            runs.append(Run(f"{source.name}-{count}", dataset, {"capture": source.name, "views": count}))
+    return runs
 
 
-def counts(asked: Asked, most: int) -> list[int]:
-    """Of photographs to take from so many."""
-    return sorted({count for count in (VIEWS[:1] if asked.quick else VIEWS) if count < most} | {most})
-
-
-def genus(asked: Asked) -> list[Run]:
-    """Each capture from a sphere and from a hull."""
-    starts = {"sphere": {"domain": "sphere"}, "hull": {"domain": "hull"}}
-    return varied(asked, "start", starts)
-
-
-def ablation(asked: Asked) -> list[Run]:
-    """The ring and ResNets from a sphere, and the ring from a hull, as fits usually begin."""
-    sphere = {"domain": "sphere", "steps": 3}
-    networks: dict[Any, dict[str, Any]] = {
-        "ring, T = 3": sphere,
-        "resnet, T = 3": {**sphere, "shape_net": "resnet"},
-        "wide-resnet, T = 3": {**sphere, "shape_net": "wide-resnet"},
-        "resnet, T = 20": {**sphere, "shape_net": "resnet", "steps": 20},
-        "ring, hull": {"domain": "hull"},
-    }
-    return varied(asked, "network", networks, list(networks)[:2])
-
-
-def encoding(asked: Asked) -> list[Run]:
-    """Each capture by each encoding."""
-    encodings: dict[Any, dict[str, Any]] = {
-        "linear, 16": {},
-        "linear, 5": {"frequencies": 5},
-        "octaves, 5": {"encoding": "octaves", "frequencies": 5},
-        "octaves, 10": {"encoding": "octaves", "frequencies": 10},
-        "none": {"encoding": "none"},
-    }
-    return varied(asked, "encoding", encodings, ("linear, 16", "octaves, 5", "none"))
-
-
-def steps(asked: Asked) -> list[Run]:
-    """Each capture by so many Euler steps."""
-    return varied(asked, "T", {t: {"steps": t} for t in (1, 2, 3, 5, 10, 20, 40)}, (1, 3, 10))
-
-
-def swap(asked: Asked) -> list[Run]:
-    """Two captures or more from a sphere."""
-    if not asked.data:
-        require_no_materials(asked)
-    require_one_seed(asked, "swap")
-    recipes = captures(asked) if asked.data else [own(), traced(asked, None, GLOSSY[-1])]
-    if len(recipes) < 2:
+def swap(options: ExperimentOptions) -> list[Run]:
+    """Two datasets or more, from a sphere."""
+    if not options.data:
+        require_no_materials(options)
+    found = datasets(options)
+    if not options.data:
+        found.append(path_traced(options, None, GLOSSY[-1]))
+    if len(found) < 2:
         raise InputError("DATA: is one capture; swap exchanges the materials of two or more")
-    return [Run(r.name, r, {"capture": r.name}, {"domain": "sphere", "seed": asked.seeds[0]}) for r in recipes]
+    return [Run(d.name, d, {"capture": d.name}, {"domain": "sphere", "seed": options.seeds[0]}) for d in found]
 
 
-def resolution(asked: Asked) -> list[Run]:
-    """Each capture, sampled at several levels."""
-    require_one_seed(asked, "resolution")
-    return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.by_level) for r in captures(asked)], asked)
+def single(options: ExperimentOptions) -> list[Run]:
+    """Each object of DiLiGenT, seen from one side."""
+    require_no_materials(options)
+    if not options.data:
+        raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "
+                         f"says; get them from its authors: {DILIGENT}/single")  # fmt: skip
+    runs = []
+    for file in options.data:
+        dataset = SingleView.of(options.captures / f"single-{file.stem}", file)
+        dataset.read()
+        runs.append(Run(file.stem, dataset, {"object": file.stem}, measure=measures.single_view_normals))
+    return runs
 
 
-def timing(asked: Asked) -> list[Run]:
-    """Each capture, looked at in the course of its fit."""
-    require_one_seed(asked, "timing")
-    return seeded([Run(r.name, r, {"capture": r.name}, measure=measures.course, watched=True)
-                   for r in captures(asked)], asked)  # fmt: skip
-
-
-def single(asked: Asked) -> list[Run]:
-    """Each object that is seen from one side."""
-    require_no_materials(asked)
-    if not asked.data:
-        raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/paper.md says; "
-                         f"get them from its authors: {DILIGENT}/single")  # fmt: skip
-    recipes = [SingleView(f"single-{file.stem}", file) for file in asked.data]
-    for recipe in recipes:
-        recipe.read()
-    return seeded([Run(r.file.stem, r, {"object": r.file.stem}, measure=measures.normals_from_one_side)
-                   for r in recipes], asked)  # fmt: skip
-
-
-_ERROR = "normal_mean", "error of normals, mean [°]"
-_MATERIAL = {"slice_error": Column("BRDF slices, relative error %", 1)}
+SPHERE = {"domain": "sphere", "steps": 3}
+NETWORKS: dict[Any, dict[str, Any]] = {
+    "ring, T = 3": SPHERE,
+    "resnet, T = 3": {**SPHERE, "shape_net": "resnet"},
+    "wide-resnet, T = 3": {**SPHERE, "shape_net": "wide-resnet"},
+    "resnet, T = 20": {**SPHERE, "shape_net": "resnet", "steps": 20},
+    "ring, hull": {"domain": "hull"},
+}
+ENCODINGS: dict[Any, dict[str, Any]] = {
+    "linear, 16": {}, "linear, 5": {"frequencies": 5}, "octaves, 5": {"encoding": "octaves", "frequencies": 5},
+    "octaves, 10": {"encoding": "octaves", "frequencies": 10}, "none": {"encoding": "none"},
+}  # fmt: skip
+STEPS: dict[Any, dict[str, Any]] = {t: {"steps": t} for t in (1, 2, 3, 5, 10, 20, 40)}
 
 EXPERIMENTS = {
     "table1": Experiment(
-        "The paper's table 1: accuracy on captures with measured materials.", table1, USUAL,
-        plots.bars(_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"), ("psnr_novel", "novel [dB]")),
-        published=published.TABLE1, data=f"{CAPTURES}, or meshes",
-    ),
+        "The paper's table 1: accuracy on captures with measured materials.", each_dataset(), ACCURACY,
+        plots.bars(NORMAL_ERROR, ("depth_mean", "error of depth, mean [% of the diagonal]"),
+                   ("psnr_novel", "novel [dB]")),
+        published=published.TABLE1),
     "table2": Experiment(
-        "DiLiGenT-MV: normals and depths of pixels that see both surfaces; Chamfer distance of what any photograph "
-        "shows, the mean of both directions, to the other surface and not to points of it.",
-        table2,
-        {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
-        plots.bars(_ERROR, ("depth_mm", "error of depth, mean [mm]")), published=published.TABLE2,
-        mean_over="object", data="the folder of DiLiGenT-MV",
-    ),
+        "DiLiGenT-MV. Errors of normals and depth where a pixel sees both surfaces. Chamfer distance: mean distance of "
+        "points of one surface from the other surface, mean of both directions, only of parts that a photograph shows.",
+        table2, {**NORMALS, "depth_mm": Column("depth, mean mm"), "chamfer_mm": Column("Chamfer mm"), **TIME},
+        plots.bars(NORMAL_ERROR, ("depth_mm", "error of depth, mean [mm]")), "the folder of DiLiGenT-MV",
+        published.TABLE2, mean_over="object"),
     "table3": Experiment(
         "The paper's table 3: poses wrong by 0.5° and 0.5 % of the distance, and refined; after rigid alignment.",
-        table3,
-        {**NORMALS, "depth_mean": DEPTHS["depth_mean"], **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
-        plots.bars(_ERROR, ("turned", "what is left of cameras' turns [°]")), published=published.TABLE3,
-        data=f"{CAPTURES}, or meshes",
-    ),
+        table3, {**NORMALS, **DEPTH, **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
+        plots.bars(NORMAL_ERROR, ("turned", "rotation error of the cameras [°]")), published=published.TABLE3),
     "specularity": Experiment(
         "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
-        specularity, {**USUAL, **_MATERIAL}, plots.slices, data="one mesh",
-    ),
+        specularity, {**ACCURACY, **MATERIAL}, plots.slices, "one mesh"),
     "stripes": Experiment(
         "Two materials in stripes: normals, and whether each place has the right one.", stripes,
-        {**USUAL, **_MATERIAL, "right_material": Column("right material %", 1)}, plots.pictures, data="one mesh",
-    ),
+        {**ACCURACY, **MATERIAL, "right_material": Column("right material %", 1)}, plots.pictures, "one mesh"),
     "views": Experiment(
-        "Accuracy by the number of photographs.", views, USUAL,
-        plots.curves(("views", "photographs"), _ERROR), data=f"{CAPTURES}, or meshes",
-    ),
+        "Accuracy by number of photographs.", views, ACCURACY, plots.curves(("views", "photographs"), NORMAL_ERROR)),
     "ablation": Experiment(
-        "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.", ablation,
-        SHAPE, plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), _ERROR),
-        data=f"{CAPTURES}, or meshes",
-    ),
+        "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.",
+        each_setting("network", NETWORKS, quick=list(NETWORKS)[:2]), SHAPE,
+        plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), NORMAL_ERROR)),
     "encoding": Experiment(
-        "Positional encodings: linear frequencies, powers of two, none.", encoding, {**USUAL, **FLAWS},
-        plots.bars(_ERROR, ("psnr_novel", "novel [dB]")), data=f"{CAPTURES}, or meshes",
-    ),
+        "Positional encodings: linear frequencies, powers of two, none.",
+        each_setting("encoding", ENCODINGS, quick=("linear, 16", "octaves, 5", "none")), {**ACCURACY, **FLAWS},
+        plots.bars(NORMAL_ERROR, ("psnr_novel", "novel [dB]"))),
     "steps": Experiment(
-        "Steps of the flow, the paper's T.", steps, {**USUAL, **FLAWS},
-        plots.curves(("T", "T"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
-    ),
+        "Steps of the flow, the paper's T.", each_setting("T", STEPS, quick=(1, 3, 10)), {**ACCURACY, **FLAWS},
+        plots.curves(("T", "T"), NORMAL_ERROR, logarithmic=True)),
     "genus": Experiment(
-        "An object with a handle, from a sphere and from the masks' visual hull.", genus,
-        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures,
-        data=f"{CAPTURES}, or meshes",
-    ),
+        "An object with a handle, from a sphere and from the masks' visual hull.",
+        each_setting("start", {name: {"domain": name} for name in ("sphere", "hull")}),
+        {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures),
     "swap": Experiment(
-        "Materials exchanged between fits from one domain, the sphere.", swap, USUAL, plots.swapped,
-        data=f"two or more {CAPTURES}, or meshes",
-    ),
+        "Materials exchanged between fits from one domain, the sphere.", swap, ACCURACY, plots.swapped,
+        f"two or more {Experiment.data}", one_seed=True),
     "resolution": Experiment(
-        "One fit, sampled at several levels: the networks are functions.", resolution,
+        "One fit, sampled at several levels: the networks are functions.", each_dataset(measure=measures.by_level),
         {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
-        plots.curves(("vertices", "vertices"), _ERROR, logarithmic=True), data=f"{CAPTURES}, or meshes",
-    ),
+        plots.curves(("vertices", "vertices"), NORMAL_ERROR, logarithmic=True), one_seed=True),
     "timing": Experiment(
-        "The error of normals in the course of a fit.", timing,
-        {"iteration": Column("iteration", 0), **TIME, **NORMALS, "depth_mean": DEPTHS["depth_mean"]},
-        plots.curves(("seconds", "fit [s]"), _ERROR), data=f"{CAPTURES}, or meshes",
-    ),
+        "The error of normals during a fit.", each_dataset(measure=measures.course, watched=True),
+        {"iteration": Column("iteration", 0), **TIME, **NORMALS, **DEPTH},
+        plots.curves(("seconds", "fit [s]"), NORMAL_ERROR), one_seed=True),
     "single": Experiment(
         "DiLiGenT's photographs from one side: errors of normals, 90° where the camera misses the surface.", single,
         {**NORMALS, "missed": Column("missed %"), **TIME}, plots.pictures,
-        data=".npz files of DiLiGenT's photographs from one side",
-    ),
+        ".npz files of DiLiGenT's photographs from one side"),
 }  # fmt: skip

@@ -1,173 +1,146 @@
-"""Performs an experiment: makes what it needs, fits, measures, writes table and figure after each run."""
+"""Runs an experiment: prepares datasets, fits, measures, and writes table and figure after each run."""
 
 import io
 import json
 import sys
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import torch
-
 from mi_ring.capture.loading import load_capture
 from mi_ring.collection.fits import fit_to_the_end
-from mi_ring.collection.jobs import Job, Record, written
+from mi_ring.collection.jobs import Job, Record, modified
 from mi_ring.errors import InputError
-from mi_ring.experiments.experiment import NOT_RUN, Asked, Experiment, Made, Outcome, Row, Run, require_distinct
-from mi_ring.experiments.measures import COURSE, POINTS, evaluated
+from mi_ring.experiments.experiment import NOT_RUN, Experiment, ExperimentOptions, Outcome, Row, Run
+from mi_ring.experiments.measures import COURSE, POINTS, evaluated, surface_errors
 from mi_ring.experiments.tables import csv_text, headings, markdown, table_of
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.light_selection import choose_lighting
 from mi_ring.metrics.evaluation import rounded
-from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
-from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.system.command import interrupted, one_line
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.machine import threads_of
 from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
 
-NUMBERS = "numbers.json"  #: of a run, in the folder of its results: what was measured of which fit
-RETRIES = 1  #: of a fit that is killed without getting any further
+NUMBERS = "numbers.json"  #: in the results folder of a run: the rows, and what they were measured from
+RETRIES = 1  #: of a fit that is killed without making progress
 
 
-def perform(experiment: Experiment, asked: Asked, out: Path, only: Collection[str] = (), said: str = "") -> int:
-    """Make, measure and show all runs, or `only` some, in out/runs/; returns how many failed.
+def run_experiment(
+    experiment: Experiment, options: ExperimentOptions, out: Path, only: Collection[str] = (), command_line: str = ""
+) -> int:
+    """Perform all runs, or `only` those with these names. Returns how many failed; the others do not stop for them.
 
-    A run that fails does not stop the others; table.csv, table.md and figure.png are there after each that is new. What
-    is done already, of the same files and settings, is not made again. `said`: how it was called, for the table.
-
-    Raises InputError for what is wrong with all of it, before any work.
+    Results are in out/runs/; table.csv, table.md and figure.png are written after each run. Results of the same files
+    and settings are not computed again. Raises InputError before any work if options are wrong for all runs.
     """
-    runs = experiment.runs(asked)
-    require_distinct(runs)
+    runs = experiment.runs(options)
     if unknown := set(only) - {run.name for run in runs}:
         raise InputError(f"--only: has {min(unknown)}, must be of {', '.join(run.name for run in runs)}")
     for run in runs:
-        run.config(asked)
+        run.config(options)
     outcomes = [Outcome(run) for run in runs]
     for k, run in enumerate(runs):
         wanted = not only or run.name in only
         if wanted:
             print(f"{k + 1} of {len(runs)}: {run.name}", flush=True)
-        outcomes[k] = attempted(run, asked, out, wanted)
-        if outcomes[k].failed not in ("", NOT_RUN):
-            print(f"{run.name}: failed: {outcomes[k].failed}", flush=True)
-        if (wanted and not outcomes[k].old) or k == len(runs) - 1:
-            show(experiment, outcomes, out, said)
+        outcome = outcomes[k] = try_run(run, options, out, wanted)
+        if outcome.failed not in ("", NOT_RUN):
+            print(f"{run.name}: failed: {outcome.failed}", flush=True)
+        if (wanted and not outcome.old) or k == len(runs) - 1:
+            write_table_and_figure(experiment, outcomes, out, command_line)
     return sum(outcome.failed not in ("", NOT_RUN) for outcome in outcomes)
 
 
-def attempted(run: Run, asked: Asked, out: Path, wanted: bool = True) -> Outcome:
-    """Make and measure one run; one that is not `wanted` only if its fit is there. Whatever goes wrong is its own."""
+def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True) -> Outcome:
+    """Fit and measure one run. An error is its outcome. A run that is not `wanted` is measured if its fit exists."""
     try:
-        captures, folder = out.parent / "captures" / asked.size, out.resolve() / "runs" / run.name
-        scene = run.recipe.made(captures) if wanted else run.recipe.place(captures)
-        made = Made(folder, scene, run.recipe.truth(captures), captures, asked)
-        job = Job(scene.resolve(), folder, run.options(asked))
+        if wanted:
+            run.dataset.prepare()
+        folder = out.resolve() / "runs" / run.name
+        job = Job(run.dataset.scene.resolve(), folder, run.fit_options(options))
         fingerprint = job.fingerprint()
         done = job.is_done(fingerprint)
         if not done:
             if not wanted:
                 return Outcome(run)
             print(f"fitting: {folder}", flush=True)
-            job.note(replace(job.record, tries=0))  # interrupts of the user's are no deaths
-            record = (
-                watched(run, job, fingerprint, made)
-                if run.watched
-                else fit_to_the_end(job, fingerprint, RETRIES, threads(asked), tell)
-            )
+            job.save(replace(job.record, tries=0))  # a user may interrupt as often as he likes
+            if run.watched:
+                record = fit_and_watch(run, job, fingerprint, options)
+            else:
+                threads = ("--threads", str(options.threads)) if options.threads else ()
+                record = fit_to_the_end(
+                    job, fingerprint, RETRIES, threads, lambda line: print(f"  {line}", file=sys.stderr, flush=True)
+                )
             if record.state != "done":
                 return Outcome(run, failed=record.message)
-        return Outcome(run, made, measured(run, made), "", done)
-    except Exception as error:  # of libraries, too: the other runs are worth more
+        return Outcome(run, folder, measure_run(run, folder, options), "", done)
+    except Exception as error:  # of libraries, too: the other runs go on
         if interrupted():
             raise
         if not wanted:
             return Outcome(run)
         if not isinstance(error, InputError):
             traceback.print_exc(file=sys.stderr)
-        return Outcome(run, failed=reason(error))
+        return Outcome(run, failed=one_line(str(error)) or type(error).__name__)
 
 
-def reason(error: Exception) -> str:
-    """What has gone wrong, in one line, as tables need it."""
-    return one_line(str(error)) or type(error).__name__
-
-
-def tell(line: str) -> None:
-    """What a fit says, where progress is said."""
-    print(f"  {line}", file=sys.stderr, flush=True)
-
-
-def threads(asked: Asked) -> tuple[str, ...]:
-    """As an option of fits, whose results it does not change."""
-    return ("--threads", str(asked.threads)) if asked.threads else ()
-
-
-def measured(run: Run, made: Made) -> list[Row]:
-    """The rows of a finished fit; those of before if it is the same."""
-    measure: Callable[[Run, Made], list[Row]] = run.measure or evaluated
-    of = {"measure": measure.__name__, "spp": made.asked.spp, "written": written(made.folder / "ring.pt"),
-          "compared": [[str(file.resolve()), written(file)] for file in run.recipe.compared(made.captures)],
+def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
+    """The rows of a finished fit. They are read from `NUMBERS` if nothing has changed since they were measured."""
+    measure = run.measure or evaluated
+    of = {"measure": measure.__name__, "spp": options.spp, "written": modified(folder / "ring.pt"),
+          "compared": [[str(file.resolve()), modified(file)] for file in run.dataset.truth_files],
           "exactly": installed("igl")}  # fmt: skip
-    before = read_json(made.folder / NUMBERS)
+    before = read_json(folder / NUMBERS)
     if not (isinstance(before, dict) and before.get("of") == of):
-        before = {"of": of, "rows": rounded(measure(run, made))}
-        write_file(made.folder / NUMBERS, json.dumps(before, indent=1))
+        before = {"of": of, "rows": rounded(measure(run, folder, options))}
+        write_file(folder / NUMBERS, json.dumps(before, indent=1))
     return before["rows"]
 
 
-def watched(run: Run, job: Job, fingerprint: str, made: Made) -> Record:
-    """Fit in this process, and write what the errors of normals and depth were in its course."""
-    mesh, truth = load_true_mesh(made.truth / "mesh.ply")
+def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
+    """Fit in this process. Writes the errors of normals and depth at `POINTS` times during the fit."""
     rows: list[Row] = []
 
-    def look(it: Iteration) -> None:
+    def measure(it: Iteration) -> None:
         if it.number * POINTS // fit.iterations > len(rows):
-            s, faces = fit.ring.domain.sample(fit.config.subdivisions)
-            with torch.no_grad():
-                vertices = fit.ring.surface(s.to(fit.device)).cpu().numpy()
-            diagonal = float(np.linalg.norm(mesh.extents))
-            numbers, _ = compare_surfaces(fit.capture, scene_of(vertices, faces), truth, diagonal)
-            rows.append({"iteration": it.number, "seconds": fit.seconds, **numbers})
+            _, numbers = surface_errors(run, fit.capture, fit.ring, *fit.ring.domain.sample(fit.ring.subdivisions))
+            rows.append({"iteration": it.number, "seconds": fit.course.seconds, **numbers})
 
-    with threads_of(made.asked.threads):
-        config = run.config(made.asked)
-        fit = Fit(load_capture(made.scene, masks=config.masks), config, callbacks=[look])
+    with threads_of(options.threads):
+        config = run.config(options)
+        capture = load_capture(run.dataset.scene, masks=config.masks)
+        fit = Fit(capture, config, callbacks=[measure], lighting=choose_lighting(capture, config))
         for _ in progress(fit, "iterations", total=fit.iterations):
             pass
         fit.save(job.folder)
     write_file(job.folder / COURSE, json.dumps(rows))
-    ring = written(job.folder / "ring.pt")
-    return job.note(replace(job.record, state="done", done=fingerprint, written=ring))
+    ring = modified(job.folder / "ring.pt")
+    return job.save(replace(job.record, state="done", done=fingerprint, written=ring))
 
 
-def show(experiment: Experiment, outcomes: list[Outcome], out: Path, said: str) -> None:
-    """Write table.csv, table.md and, unless it cannot be drawn, figure.png of what there is."""
+def write_table_and_figure(experiment: Experiment, outcomes: list[Outcome], out: Path, command_line: str) -> None:
+    """Write table.csv, table.md and figure.png. If no run is done, or if drawing fails, there is no figure."""
     rows = table_of(experiment, outcomes)
     names = headings(experiment, outcomes, rows)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "table.csv", csv_text(names, rows))
-    write_file(out / "table.md", markdown(experiment, names, rows, said))
-    if picture := drawn(experiment, outcomes, out / "figure.png"):
-        write_file(out / "figure.png", picture)
+    write_file(out / "table.md", markdown(experiment, names, rows, command_line))
+    file, buffer, content = out / "figure.png", io.BytesIO(), b""
+    if not all(outcome.failed for outcome in outcomes):
+        try:
+            figure = experiment.figure([outcome for outcome in outcomes if outcome.failed != NOT_RUN])
+            figure.savefig(buffer, format="png", dpi=120)
+            content = buffer.getvalue()
+        except Exception as error:  # the results of one run may be broken: the other runs go on
+            if interrupted():
+                raise
+            print(f"{file}: cannot be drawn: {one_line(str(error)) or type(error).__name__}", flush=True)
+    if content:
+        write_file(file, content)
     else:
-        (out / "figure.png").unlink(missing_ok=True)  # of other runs
-
-
-def drawn(experiment: Experiment, outcomes: list[Outcome], file: Path) -> bytes:
-    """The figure as a PNG; nothing if no run is done, or if it cannot be drawn, which is said."""
-    if all(outcome.failed for outcome in outcomes):
-        return b""
-    ran, buffer = [outcome for outcome in outcomes if outcome.failed != NOT_RUN], io.BytesIO()
-    try:
-        experiment.figure(ran).savefig(buffer, format="png", dpi=120)
-    except Exception as error:  # of one run's results, for instance: the other runs are worth more
-        if interrupted():
-            raise
-        print(f"{file}: cannot be drawn: {reason(error)}", flush=True)
-        return b""
-    return buffer.getvalue()
+        file.unlink(missing_ok=True)  # it shows other runs

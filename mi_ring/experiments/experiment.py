@@ -1,34 +1,28 @@
-"""What an experiment is: runs, each a fit of a capture by changed settings, and what is shown of them."""
+"""What an experiment is: a list of runs, each a fit of a dataset, and the table and figure of their results."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from mi_ring.collection.jobs import RECORDS
 from mi_ring.errors import InputError
-from mi_ring.experiments.recipes import Recipe
+from mi_ring.experiments.datasets import Dataset
 from mi_ring.fitting.config import Config
 
-NOT_RUN = "not run"  #: by --only
+NOT_RUN = "not run"  #: why a run that --only leaves out has no results
 
-Row = dict[str, Any]  #: of a table: what it is of, and numbers
+Row = dict[str, Any]  #: of a table: labels and numbers, by name
 
-#: What --quick changes of the preset `fast`: what a fit takes is then mostly to begin, and to write its report.
-QUICK: dict[str, Any] = {
-    "iterations": 60,
-    "levels": (3, 4),
-    "widths": (64, 128),
-    "shares": (0.7, 0.3),
-    "subdivisions": 4,
-}
+#: What --quick changes of the preset `fast`. A fit then takes little longer than its start and its report.
+QUICK = {"iterations": 60, "levels": (3, 4), "widths": (64, 128), "shares": (0.7, 0.3), "subdivisions": 4}
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the user asks of an experiment."""
+class ExperimentOptions:
+    """The options of `mi-ring paper` that apply to every experiment."""
 
     data: tuple[Path, ...] = ()
     materials: tuple[str, ...] = ()
@@ -37,16 +31,17 @@ class Asked:
     quick: bool = False
     threads: int = 0
     variant: str = "llvm_ad_rgb"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Of all fits, beside those of the preset."""
-        return dict(QUICK) if self.quick else {}
+    out: Path = Path("out/paper")  #: folder of all experiments
 
     @property
     def size(self) -> str:
-        """Of captures that are made: quick, fast or full."""
+        """Size of the captures that experiments make: quick, fast or full."""
         return "quick" if self.quick else "fast" if self.preset == "fast" else "full"
+
+    @property
+    def captures(self) -> Path:
+        """Folder of the captures that experiments make."""
+        return self.out / "captures" / self.size
 
     @property
     def spp(self) -> int:
@@ -54,51 +49,54 @@ class Asked:
         return 4 if self.quick else 16
 
 
-class Made(NamedTuple):
-    """A finished fit, to be measured."""
-
-    folder: Path  #: of its results
-    scene: Path
-    truth: Path  #: folder of mesh.ply
-    captures: Path  #: folder of those that experiments make
-    asked: Asked
-
-
 @dataclass(frozen=True)
 class Run:
-    """A fit of an experiment."""
+    """One fit of an experiment."""
 
-    name: str  #: of the folder of its results
-    recipe: Recipe  #: of its capture
-    labels: Row  #: what the table says of it before its numbers
-    changes: Mapping[str, Any] = field(default_factory=dict)  #: settings of `Config`
-    #: Rows of the table that are made of it: one, or one for each of several resolutions or times.
-    measure: Callable[["Run", Made], list[Row]] | None = None
-    watched: bool = False  #: is the fit looked at in its course? Then it cannot go on where it stopped
+    name: str  #: of the results folder
+    dataset: Dataset
+    labels: Row  #: first columns of its rows in the table
+    changes: Mapping[str, Any] = field(default_factory=dict)  #: fields of `Config` that differ from the preset
+    #: (run, results folder, options) ↦ rows of the table; None: `measures.evaluated`.
+    measure: Callable[["Run", Path, ExperimentOptions], list[Row]] | None = None
+    watched: bool = False  #: measure the surface during the fit, too; such a fit cannot be resumed
 
-    def config(self, asked: Asked) -> Config:
-        """Its settings. Raises InputError for what `Config` does not take."""
-        return Config.preset(asked.preset, **{**asked.settings, **self.changes})
+    def config(self, options: ExperimentOptions) -> Config:
+        """The settings of the fit. Raises InputError for values that `Config` rejects."""
+        return Config.preset(options.preset, **self.settings(options))
 
-    def options(self, asked: Asked) -> tuple[str, ...]:
-        """The same as options of `mi-ring fit`."""
-        return ("--preset", asked.preset, "--variant", asked.variant, *words({**asked.settings, **self.changes}))
+    def settings(self, options: ExperimentOptions) -> dict[str, Any]:
+        """All settings that differ from the preset."""
+        return {**(QUICK if options.quick else {}), **self.changes}
+
+    def fit_options(self, options: ExperimentOptions) -> tuple[str, ...]:
+        """The settings as options of `mi-ring fit`."""
+        words = ["--preset", options.preset, "--variant", options.variant]
+        for name, value in self.settings(options).items():
+            option = f"--{name.replace('_', '-')}"
+            if isinstance(value, bool):
+                words.append(option if value else f"--no-{option[2:]}")
+            elif isinstance(value, Mapping):
+                words += [w for key, item in value.items() for w in (f"{option}.{key.replace('_', '-')}", str(item))]
+            else:
+                words += [option, *map(str, value if isinstance(value, tuple | list) else [value])]
+        return tuple(words)
 
 
 @dataclass
 class Outcome:
-    """What has become of a run."""
+    """The result of a run."""
 
     run: Run
-    made: Made | None = None  #: None unless it is done
+    folder: Path = Path()  #: of the results
     rows: Sequence[Row] = ()
     failed: str = NOT_RUN  #: why there are no rows; empty if there are
-    old: bool = False  #: was its fit there already?
+    old: bool = False  #: was the fit there before?
 
 
 @dataclass(frozen=True)
 class Column:
-    """Of a table."""
+    """A column of a table."""
 
     heading: str
     digits: int = 2  #: after the point
@@ -106,36 +104,35 @@ class Column:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One of the paper's, or of ours in its spirit."""
+    """A table and a figure, of the paper or like those of the paper."""
 
     about: str  #: one sentence
-    runs: Callable[[Asked], list[Run]]
-    columns: Mapping[str, Column]  #: by the names of numbers; all else that rows have are labels
+    list_runs: Callable[[ExperimentOptions], list[Run]]  #: without seeds, unless a run sets its own
+    columns: Mapping[str, Column]  #: by names of numbers; all other entries of rows are labels
     figure: Callable[[list[Outcome]], Figure]  #: of all runs that are done or have failed
-    data: str  #: what DATA must be
-    published: Sequence[Row] = ()  #: rows beside ours
-    mean_over: str = "seed"  #: label over which further rows have means, beside those over seeds
+    data: str = "folders of captures with scene.xml and truth/mesh.ply, or meshes"  #: what DATA must be
+    published: Sequence[Row] = ()
+    mean_over: str = "seed"  #: label; the table has means over it, beside those over seeds
+    one_seed: bool = False  #: are several seeds refused, because no row could be a mean?
+
+    def runs(self, options: ExperimentOptions) -> list[Run]:
+        """All runs, one for each seed. Raises InputError if DATA or --materials are wrong, or for equal names."""
+        runs = seeded(self.list_runs(options), options.seeds)
+        names = [run.name for run in runs]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise InputError(f"DATA: two runs would both be called {twice}; rename a capture, leave out what is given "
+                             "twice, or give them one by one")  # fmt: skip
+        if RECORDS in names:
+            raise InputError(f"DATA: a run would be called {RECORDS}, as the folder of records is; rename the capture")
+        return runs
 
 
-def words(settings: Mapping[str, Any]) -> list[str]:
-    """Settings as options of `mi-ring fit`."""
-    result: list[str] = []
-    for name, value in settings.items():
-        option = f"--{name.replace('_', '-')}"
-        if isinstance(value, bool):
-            result.append(option if value else f"--no-{option[2:]}")
-        elif isinstance(value, Mapping):
-            result += [w for key, weight in value.items() for w in (f"{option}.{key.replace('_', '-')}", str(weight))]
-        else:
-            result += [option, *map(str, value if isinstance(value, tuple | list) else [value])]
+def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
+    """Each run with each seed, unless it sets its own. Names do not depend on which other seeds there are."""
+    result = []
+    for run in runs:
+        for seed in [None] if "seed" in run.changes else seeds:
+            changes = run.changes if seed is None else {**run.changes, "seed": seed}
+            labels = {**run.labels, "seed": seed} if seed is not None and len(seeds) > 1 else run.labels
+            result.append(replace(run, name=f"{run.name}-{seed}" if seed else run.name, labels=labels, changes=changes))
     return result
-
-
-def require_distinct(runs: Sequence[Run]) -> None:
-    """Raise InputError if two runs would have the same folder, or one that of their records."""
-    names = [run.name for run in runs]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"DATA: two runs would both be called {twice}; rename a capture, leave out what is given "
-                         "twice, or give them one by one")  # fmt: skip
-    if RECORDS in names:
-        raise InputError(f"DATA: a run would be called {RECORDS}, as the folder of records is; rename the capture")

@@ -1,4 +1,4 @@
-"""Figures of experiments, of what their runs have found."""
+"""Figures of experiments."""
 
 import functools
 import textwrap
@@ -8,71 +8,71 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.experiments.brdf_slices import ANGLES
 from mi_ring.experiments.experiment import Outcome, Row
-from mi_ring.experiments.measures import errors_from_one_side
+from mi_ring.experiments.measures import normal_errors
 from mi_ring.experiments.single_view import SingleView
-from mi_ring.experiments.slices import ANGLES
 from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.surfaces import hits, load_true_mesh
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.material_edits import MaterialOptions, dress
+from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
-WIDTH = 256  #: of pictures, at most [px]
-SPP = 16  #: of theirs
-WORST = 20.0  #: error of normals that is drawn brightest [deg]
+WIDTH = 256  #: greatest width of pictures [px]
+SPP = 16  #: samples per pixel of pictures
+WORST = 20.0  #: error of normals at the bright end of the colour map [deg]
 
-Drawing = Callable[[list[Outcome]], Figure]
+Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """The labels of a run `but` one, of those whose words say little by themselves with their names."""
+    """The labels of a run, except the label `but`. Numbers stand behind the names of their labels."""
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 
-def of_done(draw: Drawing) -> Drawing:
-    """A figure of the runs that are done, and a line that names those that have failed."""
+def of_finished(plot: Plot) -> Plot:
+    """A plot of the runs that are done, with a line that names those that have failed."""
 
-    @functools.wraps(draw)
-    def noted(ran: list[Outcome]) -> Figure:
-        figure = draw([outcome for outcome in ran if not outcome.failed])
-        if failed := [title_of(outcome) for outcome in ran if outcome.failed]:
+    @functools.wraps(plot)
+    def annotated(outcomes: list[Outcome]) -> Figure:
+        figure = plot([outcome for outcome in outcomes if not outcome.failed])
+        if failed := [title_of(outcome) for outcome in outcomes if outcome.failed]:
             figure.supxlabel(textwrap.fill(f"failed: {'; '.join(failed)}", 50), fontsize=8)
         return figure
 
-    return noted
+    return annotated
 
 
-def bars(*columns: tuple[str, str]) -> Drawing:
-    """A diagram for each of some columns, (name, heading) each, a bar for each run, or a word that it has none."""
+def bars(*columns: tuple[str, str]) -> Plot:
+    """Bar charts of columns (name, heading), a bar for each run. Instead of a missing number there is a word."""
 
-    def draw(ran: list[Outcome]) -> Figure:
-        figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(ran)), layout="constrained")
+    def plot(outcomes: list[Outcome]) -> Figure:
+        figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(outcomes)), layout="constrained")
         for axes, (name, heading) in zip(np.ravel(figure.subplots(1, len(columns), sharey=True)), columns):
-            for place, outcome in enumerate(ran):
+            for place, outcome in enumerate(outcomes):
                 value = outcome.rows[0].get(name, "") if outcome.rows else "failed"
                 if isinstance(value, str) or not np.isfinite(value):
                     axes.text(0, place, f" {value}".replace("nan", "NaN"), va="center")
                 else:
                     axes.barh(place, value, color="steelblue")
-            axes.set(xlabel=heading, ylim=(len(ran) - 0.5, -0.5))
-            axes.set_yticks(range(len(ran)), [title_of(outcome) for outcome in ran])
-            axes.set_xlim(left=0)
+            axes.set(xlabel=heading, xlim=(0, None), ylim=(len(outcomes) - 0.5, -0.5))
+            axes.set_yticks(range(len(outcomes)), [title_of(outcome) for outcome in outcomes])
         return figure
 
-    return draw
+    return plot
 
 
-def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Drawing:
-    """One number over another, (name, heading) each, a line for those runs whose other labels are the same."""
+def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Plot:
+    """Column y over column x, (name, heading) each. Runs whose other labels are equal share a line."""
 
-    @of_done
-    def draw(done: list[Outcome]) -> Figure:
+    @of_finished
+    def plot(outcomes: list[Outcome]) -> Figure:
         figure = Figure(figsize=(6, 4), layout="constrained")
         axes = figure.subplots()
         lines = dict[str, list[Row]]()
-        for outcome in done:
+        for outcome in outcomes:
             lines.setdefault(title_of(outcome, x[0]), []).extend({**outcome.run.labels, **r} for r in outcome.rows)
         for title, rows in lines.items():
             points = sorted((row[x[0]], row[y[0]]) for row in rows)
@@ -82,16 +82,15 @@ def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) ->
         axes.legend()
         return figure
 
-    return draw
+    return plot
 
 
-@of_done
-def slices(done: list[Outcome]) -> Figure:
-    """BRDFs by the angle from the normal, found and true, light and camera at one place: of each run the median."""
-    figure = Figure(figsize=(4 * len(done), 3.6), layout="constrained")
-    for axes, outcome in zip(np.ravel(figure.subplots(1, len(done), squeeze=False)), done):
-        assert outcome.made
-        with np.load(outcome.made.folder / "slices.npz") as arrays:
+@of_finished
+def slices(outcomes: list[Outcome]) -> Figure:
+    """For each run the median BRDF by the angle from the normal, true and fitted, light and camera at one place."""
+    figure = Figure(figsize=(4 * len(outcomes), 3.6), layout="constrained")
+    for axes, outcome in zip(np.ravel(figure.subplots(1, len(outcomes), squeeze=False)), outcomes):
+        with np.load(outcome.folder / "slices.npz") as arrays:
             for name, style in (("truth", "-"), ("found", "--")):
                 for channel, colour in enumerate(("firebrick", "seagreen", "royalblue")):
                     axes.plot(np.degrees(ANGLES), arrays[name][:, channel], style, color=colour)
@@ -100,32 +99,44 @@ def slices(done: list[Outcome]) -> Figure:
     return figure
 
 
-@of_done
-def pictures(done: list[Outcome]) -> Figure:
-    """Of each run a photograph, what the fit predicts for it, and the error of its normals."""
-    heads = "photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"
-    return grid([(title_of(outcome), three_pictures(outcome)) for outcome in done], heads)
-
-
-@of_done
-def swapped(done: list[Outcome]) -> Figure:
-    """Every shape with every material, each shape in a row."""
+@of_finished
+def pictures(outcomes: list[Outcome]) -> Figure:
+    """For each run its first photograph, the prediction of the fit, and the error of its normals."""
     rows = []
-    for shape in done:
-        assert shape.made
+    for outcome in outcomes:
+        folder, dataset = outcome.folder, outcome.run.dataset
+        picture, scale = predicted(outcome, load_fit(folder))
+        capture = load_capture(dataset.scene)
+        observed = linear_to_srgb(capture.observe([0], scale).rgb[0].numpy()).clip(0, 1)
+        if isinstance(dataset, SingleView):
+            error = normal_errors(outcome.run, folder)[0]
+        else:
+            photograph = capture.photograph(0, scale)
+            found, true = (hits(load_true_mesh(place / "mesh.ply")[1], photograph) for place in (folder, dataset.truth))
+            error = np.degrees(np.arccos(np.clip((found[2] * true[2]).sum(1), -1, 1)))
+            error = np.where(found[0] & true[0], error, np.where(found[0] ^ true[0], 90.0, np.nan))
+            error = error.reshape(observed.shape[:2])
+        rows.append((title_of(outcome), [observed, picture, error]))
+    return grid(rows, ["photograph", "fit", f"error of normals, yellow: {WORST:.0f}° or more"])
+
+
+@of_finished
+def swapped(outcomes: list[Outcome]) -> Figure:
+    """Every shape with every material. Shapes are rows, materials are columns."""
+    rows = []
+    for shape in outcomes:
         cells = []
-        for material in done:
-            assert material.made
-            ring = load_fit(shape.made.folder)
+        for material in outcomes:
+            ring = load_fit(shape.folder)
             if material is not shape:
-                dress(ring, MaterialOptions(material=material.made.folder))
+                edit_material(ring, MaterialOptions(material=material.folder))
             cells.append(predicted(shape, ring)[0])
         rows.append((title_of(shape), cells))
-    return grid(rows, [f"material: {title_of(outcome)}" for outcome in done])
+    return grid(rows, [f"material: {title_of(outcome)}" for outcome in outcomes])
 
 
 def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> Figure:
-    """Pictures (H, W, 3) or (H, W), a row each with a title."""
+    """A table of pictures (H, W, 3) and error maps (H, W) [deg]. `rows`: title, pictures; `heads`: of the columns."""
     figure = Figure(figsize=(2.6 * len(heads), 2.7 * len(rows)), layout="constrained")
     for line, (title, images) in zip(figure.subplots(len(rows), len(heads), squeeze=False), rows):
         for axes, image in zip(line, images):
@@ -137,29 +148,13 @@ def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> 
     return figure
 
 
-def three_pictures(outcome: Outcome) -> list[np.ndarray]:
-    """As `pictures` shows them, of the first photograph."""
-    assert outcome.made
-    made = outcome.made
-    picture, scale = predicted(outcome, load_fit(made.folder))
-    capture = load_capture(made.scene)
-    observed = linear_to_srgb(capture.observe([0], scale).rgb[0].numpy())
-    if isinstance(outcome.run.recipe, SingleView):
-        return [observed.clip(0, 1), picture, errors_from_one_side(outcome.run, made)[0]]
-    photograph = capture.photograph(0, scale)
-    meshes = made.folder / "mesh.ply", made.truth / "mesh.ply"
-    found, true = (hits(load_true_mesh(mesh)[1], photograph) for mesh in meshes)
-    error = np.degrees(np.arccos(np.clip((found[2] * true[2]).sum(1), -1, 1)))
-    error = np.where(found[0] & true[0], error, np.where(found[0] ^ true[0], 90.0, np.nan))
-    return [observed.clip(0, 1), picture, error.reshape(observed.shape[:2])]
-
-
 def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
-    """What the first photograph shows by a fit, sRGB (H, W, 3), and by what it is made smaller."""
-    assert outcome.made
-    capture = load_capture(outcome.made.folder / "scene.xml", images=False)
-    scale = -(-capture.sensors[0].size[0] // WIDTH)
-    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    """Prediction of the first photograph, sRGB (H, W, 3), and the factor by which it is smaller than the photograph."""
+    capture = load_capture(outcome.folder / "scene.xml", images=False)
+    scale = -(-capture.shots[0].size[0] // WIDTH)
+    surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
-    rgb, _ = bridge.draw(surface, capture.photograph(0, scale), SPP, shadows=capture.shadows, indirect=ring.indirect)
+    rgb, _ = prediction.draw(
+        surface, capture.photograph(0, scale), SPP, shadows=capture.shadows, indirect=ring.indirect
+    )
     return linear_to_srgb(rgb[0].numpy()).clip(0, 1), scale

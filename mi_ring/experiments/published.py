@@ -1,6 +1,6 @@
-"""Figures that others have published, to be shown beside ours."""
+"""Published numbers, which tables show beside ours."""
 
-PAPER = "paper"  #: who says so: Cheng et al., One Ring to Rule Them All, ICCV 2021
+PAPER = "paper"  #: Cheng et al., One Ring to Rule Them All, ICCV 2021
 
 _COLUMNS = "normal_mean", "normal_median", "depth_mean", "depth_median", "psnr_input", "psnr_novel"
 
@@ -18,16 +18,14 @@ TABLE1 = [
     }.items()
 ]  # fmt: skip
 
-#: DiLiGenT-MV: normals [°] and depth [mm].
+#: Table 2, DiLiGenT-MV: normals [°] and depth [mm].
 TABLE2 = [
     {"object": name, "by": PAPER, "normal_mean": normal, "depth_mm": depth}
-    for name, normal, depth in (
-        ("bear", 4.42, 0.75), ("buddha", 12.08, 0.67), ("cow", 4.21, 0.77), ("pot2", 6.63, 0.58),
-        ("reading", 7.61, 0.58),
-    )
+    for name, normal, depth in (("bear", 4.42, 0.75), ("buddha", 12.08, 0.67), ("cow", 4.21, 0.77),
+                                ("pot2", 6.63, 0.58), ("reading", 7.61, 0.58))
 ]  # fmt: skip
 
-#: Table 3: the bunny with a poor calibration; of which photographs the PSNR is, it does not say.
+#: Table 3: the bunny with a poor calibration. The paper does not say of which photographs the PSNR is.
 TABLE3 = [
     {"capture": "bunny", "cameras": "wrong", "by": PAPER, "normal_mean": 10.3, "depth_mean": 1.34, "psnr_novel": 25.6},
     {"capture": "bunny", "cameras": "refined", "by": PAPER, "normal_mean": 6.60, "depth_mean": 0.65,

@@ -1,63 +1,65 @@
-"""DiLiGenT's photographs from one side as a capture."""
+"""DiLiGenT's photographs of one camera as a dataset."""
 
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
-from mi_ring.collection.jobs import written
+from mi_ring.collection.jobs import modified
 from mi_ring.errors import InputError, require_file
-from mi_ring.experiments.recipes import Recipe, filled
+from mi_ring.experiments.datasets import CachedDataset
 from mi_ring.foreign import load_npz
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import write_image
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import write_file
 
-DISTANCE = 1500.0  #: from a single camera, which does not say how far away the object is [mm]
-AXES = np.array([-1.0, 1.0, -1.0])  #: from x right, y up, z back to Mitsuba's camera
-SINGLE = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: arrays, dimensions
+DISTANCE = 1500.0  #: assumed, from the camera to the object [mm]; one camera does not determine it
+TO_MITSUBA = np.array([-1.0, 1.0, -1.0])  #: factors of x right, y up, z back that make them Mitsuba's camera axes
+DIMENSIONS = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: of the arrays
+MANUAL = "docs/how-to/paper.md"  #: describes these arrays
 
 
 @dataclass(frozen=True)
-class SingleView(Recipe):
+class SingleView(CachedDataset):
     """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
 
-    It has `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z to
-    the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; the same axes, 0 where none is known) and `K` (3, 3).
+    Its arrays: `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z
+    to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; same axes, 0 where unknown) and `K` (3, 3).
     """
 
     file: Path
 
     def read(self) -> dict[str, np.ndarray]:
-        """The arrays. Raises InputError if one is missing."""
+        """The arrays. Raises InputError if one is missing or of another shape."""
         require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
         arrays = load_npz(self.file)
-        for name, dimensions in SINGLE.items():
+        for name, dimensions in DIMENSIONS.items():
             if name not in arrays or arrays[name].ndim != dimensions:
-                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see docs/paper.md")
+                raise InputError(f"{self.file}: has no array {name} of {dimensions} dimensions; see {MANUAL}")
         if (kind := arrays["pixels_uint16"].dtype) != np.uint16:
-            raise InputError(f"{self.file}: pixels_uint16: is of {kind}, must be of uint16, linear; see docs/paper.md")
+            raise InputError(f"{self.file}: pixels_uint16: is of {kind}, must be of uint16, linear; see {MANUAL}")
         mask, lights = arrays["mask"], len(arrays["pixels_uint16"])
         shapes = {"pixels_uint16": (lights, int((mask > 0).sum()), 3), "light_dir": (lights, 3),
                   "light_int": (lights, 3), "normal_gt": (*mask.shape, 3), "K": (3, 3)}  # fmt: skip
         for name, shape in shapes.items():
             if arrays[name].shape != shape:
                 raise InputError(f"{self.file}: {name}: is of shape {arrays[name].shape}, must be {shape} by mask and "
-                                 "number of photographs; see docs/paper.md")  # fmt: skip
+                                 f"number of photographs; see {MANUAL}")  # fmt: skip
         return arrays
 
-    def compared(self, captures: Path) -> list[Path]:
+    @property
+    def truth_files(self) -> list[Path]:
         return [self.file]
 
-    def make(self, captures: Path) -> Path:
-        of = {"file": str(self.file.resolve()), "written": written(self.file)}
-        return filled(self.folder_in(captures), self.write, of)
+    def origin(self) -> dict[str, Any]:
+        return {"file": str(self.file.resolve()), "written": modified(self.file)}
 
     def write(self, folder: Path) -> None:
-        """As a scene with 16-bit photographs, the camera at the origin looking along z, 1.5 m from the object."""
+        """A scene of 16-bit photographs. The camera is at the origin, looks along z, and is 1.5 m from the object."""
         data = self.read()
         mask, K = data["mask"] > 0, data["K"]
         height, width = mask.shape
@@ -72,13 +74,9 @@ class SingleView(Recipe):
             image[mask] = pixels
             file = f"images/{k:03}.png"
             write_image(image, folder / file)
-            light = Light("directional", -AXES * to_light, np.asarray(rgb, float))
-            elements.append(photograph_element(f"{k:03}", file, camera, light, "mask.png"))
-        root = scene_element(elements)
-        place = DISTANCE * (centre - np.argwhere(mask).mean(0)[::-1]) / focal
-        shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
-        x, y = map(str, place)
-        ElementTree.SubElement(shape, "point", name="center", x=x, y=y, z=str(DISTANCE))
+            light = Light("directional", -TO_MITSUBA * to_light, np.asarray(rgb, float))
+            files = Files(Path(file), Path("mask.png"))
+            elements.append(photograph_element(Shot(f"{k:03}", camera, light, files=files)))
+        middle = DISTANCE * np.append((centre - np.argwhere(mask).mean(0)[::-1]) / focal, 1)
         radius = np.sqrt(mask.sum() / np.pi) * DISTANCE / focal[0]
-        ElementTree.SubElement(shape, "float", name="radius", value=str(radius))
-        write_file(folder / "scene.xml", scene_bytes(root))
+        write_file(folder / "scene.xml", scene_bytes(scene_element(elements, middle, radius)))

@@ -1,5 +1,5 @@
-"""The fit: where it starts, its stages, the terms of its loss, the loop, and a whole session with its checkpoints.
+"""The fit: problem, model, schedule, sampler, renderer, loss, optimisation, and a session with checkpoints.
 
-May import: mitsuba, numpy, scipy, torch, cv2, trimesh, tqdm; images, output, capture, rendering, objects, scene, nets,
-geometry, system.
+May import: mitsuba, numpy, scipy, torch, cv2, trimesh, tqdm; images, output, calibration, capture, rendering, objects,
+scene, nets, geometry, system.
 """

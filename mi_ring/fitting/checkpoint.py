@@ -1,4 +1,4 @@
-"""Checkpoints: what `--resume` needs, and whether it still fits the files that a fit was started with."""
+"""Checkpoints: what `--resume` needs, and whether the files of the fit are still the same."""
 
 import contextlib
 import hashlib
@@ -14,15 +14,15 @@ from mi_ring.system.files import is_sealed, relative_to, write_state
 from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
-BEFORE = "checkpoint.before.pt"  #: the one before it, in case that it is damaged
-FORMAT = 4  #: of checkpoints; others are refused
+BEFORE = "checkpoint.before.pt"  #: the one before it, in case it is damaged
+FORMAT = 5  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
-    """The state a fit stopped at; if its checkpoint is damaged, that of the one before, of which a line is printed.
+    """The content of a checkpoint; of the one before it, with a printed line, if it is damaged.
 
-    Raises InputError if there is none or if it was made with other settings.
+    Raises InputError if there is none, or if it was made with other settings.
     """
     path = folder / NAME
     try:
@@ -43,7 +43,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
                          f"on with the version that wrote it, or {ADVICE}")  # fmt: skip
     if found != FORMAT or not all(isinstance(part, dict) for part in parts):
         raise InputError(f"{path}: holds no checkpoint; {ADVICE}")
-    known = Config().settings() | state["settings"]  # what is newer than the checkpoint was as it is by default
+    known = Config().settings() | state["settings"]  # newer settings had their defaults
     known["weights"] = WEIGHTS | known["weights"]
     known, asked, default = (by_option(settings) for settings in (known, config.settings(), Config().settings()))
     differing = []
@@ -58,7 +58,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
 
 
 def by_option(settings: dict) -> dict:
-    """Settings as there are options for them: one for each weight."""
+    """Settings with one entry for each weight, as on the command line."""
     weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
     return {name: value for name, value in settings.items() if name != "weights"} | weights
 
@@ -73,13 +73,13 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
-    """The fit that a checkpoint is of. Raises InputError if it does not hold one, or if its files have changed."""
+    """The fit of a checkpoint. Raises InputError if it holds none, or if its files have changed."""
     require_same_files(state, capture, config, folder)
     try:
         fit = Fit(capture, config, state=state["fit"])
-        if not (0 <= fit.iteration <= fit.iterations and 0 <= fit.seconds < math.inf):
-            raise ValueError(f"iteration {fit.iteration} after {fit.seconds} s")
-        for entry in fit.log:
+        if not (0 <= fit.iteration <= fit.iterations and 0 <= fit.course.seconds < math.inf):
+            raise ValueError(f"iteration {fit.iteration} after {fit.course.seconds} s")
+        for entry in fit.course.log:
             _ = entry["iteration"], entry["seconds"]
     except InputError:
         raise
@@ -89,22 +89,22 @@ def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
-    """Write what `--resume` needs, and keep what was there before; `files` are the `digests` of the capture's.
+    """Write a checkpoint and keep the one before. `files`: `digests` of the capture's files.
 
     Raises InputError if it cannot be written.
     """
-    state = {"format": FORMAT, "settings": fit.config.settings(), "files": files, "fit": fit.state()}
+    state = {"format": FORMAT, "settings": fit.problem.config.settings(), "files": files, "fit": fit.state()}
     path = folder / NAME
     whole = False
     with contextlib.suppress(OSError):  # there is none, or it cannot be read
-        whole = is_sealed(path.read_bytes())  # what is damaged must not replace what is not
+        whole = is_sealed(path.read_bytes())  # a damaged file must not replace a good one
     write_state(state, path, folder / BEFORE if whole else None)
 
 
 def digests(capture: Capture, config: Config) -> dict[str, str]:
-    """What tells one file from another, of all that a fit reads but textures: by name, relative to the scene."""
+    """Hashes of all files that a fit reads, except textures, by their name relative to the scene."""
     files = {capture.path, capture.shape.domain_file}
-    files |= {file for s in capture.sensors for file in (s.filename, s.mask, s.valid, s.ambient)}
+    files |= {file for shot in capture.shots for file in shot.files}
     if isinstance(config.domain, tuple):
         files.add(Path(config.domain[1]))
     return {relative_to(capture.path.parent, file): digest(file) for file in files if file}

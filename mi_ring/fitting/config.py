@@ -1,20 +1,27 @@
-"""What the user chooses of a fit: one frozen dataclass, whose docstrings are the command's help."""
+"""The settings of a fit: what a user sets, tuning and ablation, three frozen dataclasses that `Config` unites.
 
+The docstrings of the fields are the help of `mi-ring fit`. In them each line of the source is a line of the help.
+"""
+
+import contextlib
 import dataclasses
 import json
 import math
+import reprlib
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 from mi_ring.errors import InputError
+from mi_ring.version import __version__
 
-#: Weights of the default terms of the loss; what is not given of `Config.weights` is one of these.
+#: Weights of the default terms of the loss. `Config.weights` has these where nothing else is given.
 WEIGHTS = {
     "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03,
-    "normal_variation": 0.0, "material_variation": 0.0, "material_rank": 0.0,
+    "normal_variation": 0.0, "material_rank": 0.0,
 }  # fmt: skip
-
 
 #: What `Config.refine` may have.
 Unknown = Literal[
@@ -22,116 +29,141 @@ Unknown = Literal[
     "curve", "contrast", "scale", "ambient", "lamps", "masks",
 ]  # fmt: skip
 
+#: Entries of config.json that are no settings of a fit: what it is of, where its results go, what computes it.
+TASK = {"scene", "out", "resume", "preset", "minutes", "variant", "threads"}
+
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    """The settings of a fit: all that defines its result but the photographs.
+class Common:
+    """What a user sets."""
 
-    Raises InputError for what is out of range. `Config.preset` gives settings that go together.
-    """
-
-    domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
-    """The surface that is deformed. hull: the visual hull of the masks; mesh FILE: a closed mesh, in scene units; auto:
-    the scene's own if it names one, else the hull, or the sphere where there are no masks to make one of."""
-    masks: Literal["auto", "given", "none"] = "auto"
-    """Which masks the command reads photographs with, as `load_capture` does from Python. given: those of the scene,
-    if any; auto: the same, but if it has none the object is what is brighter than a dark room; none: as if it had none,
-    which finds them in a dark room, too; --weights.mask 0 does without any."""
     light: Literal["capture", "environment", "turntable", "lamps", "auto"] = "capture"
-    """What lights the object. capture: the lights that the scene says. Else they are unknown: environment: light from
-    everywhere, fixed in the world; turntable: the same, fixed in the camera; lamps: one to three, fixed in the world,
-    as coarse fits find them; auto: what explains the photographs best in coarse fits."""
-    seed: int = 0
-    """Random seed."""
-    iterations: int = 460
-    """Number of iterations, shared out among the stages. From a hull or a mesh it is fewer, see --shares; under an
-    unknown environment 15 % more, while the surface stands still."""
-    levels: tuple[int, ...] = (4, 5, 6)
-    """Icosphere level of each stage: 10 · 4^level + 2 vertices."""
-    widths: tuple[int, ...] = (128, 256, 512)
-    """Width of the photographs in each stage, at most [px]."""
-    shares: tuple[float, ...] = (0.45, 0.46, 0.09)
-    """Share of the iterations of each stage. A hull or a mesh is near the object already: from there two thirds of the
-    first stage are exchanged for 40 % as many iterations of the second, which take about as long."""
-    batch: int = 8
-    """Photographs per iteration."""
-    steps: int = 3
-    """Steps of the flow, the paper's T: Euler's, unless --solver says otherwise."""
-    solver: Literal["euler", "midpoint", "rk4", "dopri5"] = "euler"
-    """How the flow is integrated. midpoint, rk4: steps of second and fourth order, of two and four velocities each;
-    dopri5: as many steps as a tolerance asks for, by the package torchdiffeq."""
-    shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """ring: the paper's flow, one velocity field for all steps. To compare, as many blocks with weights of their own,
-    which is no flow: resnet: narrow ones, of as many parameters together; wide-resnet: of the ring's width."""
-    encoding: Literal["linear", "octaves", "none"] = "linear"
-    """Positional encoding of both networks. linear: frequencies 1, 2, 3, …; octaves: 1, 2, 4, 8, …; none: none."""
-    frequencies: int = 16
-    """How many frequencies the encoding has."""
-    material_at: Literal["domain", "surface"] = "domain"
-    """What BRDF-Net is a function of: points of the start surface, or, to compare, of the deformed one."""
-    resample: bool = True
-    """Have the vertices at other points of the start surface in each iteration? The sphere is randomly rotated."""
-    spp: int = 1
-    """Samples per pixel."""
-    loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
-    """How predicted and observed radiance are compared. l2: squared differences, the paper's; l1: absolute ones, which
-    few pixels that no surface explains do not rule; log: of logarithms, for what is dark; l1+log: the mean of both."""
-    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Parameters of the scene's BSDF to predict, each with its lowest and highest value (inf: none), for instance
-    base_color 0 1 roughness 0.05 1. Default: the five numbers of cooktorrance."""
-    shadows: bool = True
-    """Is a point lit only if it sees its photograph's light, while fitting? The scene's own lamps cast shadows in any
-    case, and pictures of the result follow the scene's integrator."""
-    indirect: bool = True
-    """Add interreflection to the predictions. The lights' intensities must be true, else it is wrong or left out."""
-    weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
-    """Weight of each term of the loss; 0 switches a term off. rgb: colours; mask: silhouettes; velocity: how smooth the
-    flow is, the paper's lambda; calibration: how far what is refined is from what the scene says; settling: how
-    much the material varies, at the end under an unknown environment. Priors, off by default: normal_variation: edges
-    rather than curves; material_variation: patches of one material each; material_rank: mixtures of few basis
-    materials."""
-    velocity_decay: float = 0.03
-    """The weight of the regulariser falls exponentially to this share: strong at first, which keeps the surface smooth
-    while it finds its place, weak at the end, for details. It is held back while the surface crosses itself, and while
-    much of the light is unexplained."""
-    laplacian_scale: float = 0.01
-    """The paper's alpha: how much the regulariser smoothes the velocity field."""
-    blur: float = 0.06
-    """Blur of the mask loss at the start, as a share of the photograph's width; it shrinks to a pixel."""
-    optimizer: Literal["muon", "adam"] = "muon"
-    """muon: Muon for the hidden weights, Adam for the rest. adam: Adam for all."""
-    learning_rate: float = 3e-3
-    """Learning rate of Adam."""
-    muon_rate: float = 3e-2
-    """Learning rate of Muon."""
-    decay: float = 0.1
-    """The learning rates fall exponentially to this share; those of cameras to a half."""
-    precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Precision of matrix products, of networks and of Muon. auto: bfloat16 where that is faster (processors with AMX,
-    AMD's from Zen 4 on with PyTorch 2.10 or newer, newer GPUs). Muon's are never in one that is slower."""
-    subdivisions: int = 6
-    """Level of the mesh that is written."""
+    """Which light the object was photographed in.
+    capture: the light that the scene file says.
+    environment: unknown light from all sides, fixed in the world. turntable: the same, but fixed to the camera.
+    lamps: one to three unknown lamps, fixed in the world.
+    auto: coarse fits choose the one that explains the photographs best."""
     refine: tuple[Unknown, ...] = ("auto",)
-    """What else is unknown. cameras: their places and directions; focal, principal: focal length and principal point of
-    each lens; distortion: how much each lens bends lines, its first radial one; light: where a flash is that moves with
-    the camera, else the place or direction of each light; power: strength and colour of the light, photograph by
-    photograph; gain: how much each photograph records of it, by exposure and white balance; falloff: how much less a
-    flash shines to the sides; vignetting: how much darker the lens is toward the borders; curve: one exponent of the
-    camera's, for all; contrast: how steep the S of a curve as of film is; scale: the power of all lights together, by
-    interreflection; ambient: the light of the room, which is the same for all, fixed in the world, or in the camera if
-    the scene has a `room` in its axes, as that of a turntable has; lamps: places and strengths of the scene's point and
-    directional emitters, which light all photographs; masks: the object's outlines in the photographs,
-    found anew about the surface at half and at three quarters of the fit. auto: light (of a flash that moves with the
-    camera what is beside the lens, not how far ahead), power (unless gain is given) and ambient (unless it is
-    subtracted), and scale where lights cannot be as strong as the scene says; under an unknown light, or where
-    photographs have none of their own, gain, and ambient unless lamps light them; nothing if the scene says that it is
-    calibrated. none: nothing."""
+    """What the fit corrects besides surface and material, starting from what the scene file says.
+    auto: light, power and ambient, and scale if it is needed; gain and ambient if the light is unknown.
+    none: nothing.
+    cameras: position and direction of each camera.
+    focal, principal: focal length and principal point of each lens.
+    distortion: first radial distortion coefficient of each lens.
+    light: position of a flash that moves with the camera; else position or direction of each light.
+    power: strength and colour of the light of each photograph.
+    gain: exposure and white balance of each photograph; not together with power.
+    falloff: how much weaker a flash is to its sides.
+    vignetting: how much darker a lens is towards its borders.
+    curve, contrast: exponent of the camera's response curve, and steepness of its S.
+    scale: strength of all lights together, from interreflection.
+    ambient: light of the room.
+    lamps: position and strength of the scene's own point and directional emitters.
+    masks: outlines of the object, found again in the middle of the fit and at three quarters."""
+    masks: Literal["auto", "given", "none"] = "auto"
+    """Which masks are used.
+    given: those of the scene, if it has any. auto: the same, otherwise what is brighter than a dark room.
+    none: the scene's masks are ignored, the object is what is brighter than a dark room.
+    Use --weights.mask 0 to fit without any mask."""
+    domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
+    """The surface that the fit deforms. The result has as many handles as this surface.
+    hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
+    auto: the domain that the scene names, otherwise the hull, otherwise a sphere."""
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Which parameters of the scene's BSDF are predicted, each with its lowest and highest value (inf: no limit).
+    Use it for another BSDF than cooktorrance, for example: base_color 0 1 roughness 0.05 1"""
     holdout: int = 0
-    """Keep one photograph of so many out of the fit, from the middle of the first so many on: by 8 the fifth, the
-    thirteenth, and so on. What is refined for all must explain them better than before, else it is put back.
-    0: none."""
+    """Keep every n-th photograph out of the fit, to test the result on them. 0: fit all.
+    For example, 8 keeps out the fifth, the thirteenth, and so on.
+    If what --refine finds for all photographs together explains them no better, it is undone."""
+    iterations: int = 460
+    """Number of iterations, all stages together. More iterations take longer and give finer detail.
+    A fit from a hull or a mesh takes fewer, a fit under an unknown environment 15 % more."""
+    seed: int = 0
+    """Random seed. Use several to see how much results vary by chance."""
     deterministic: bool = False
-    """The same result bit for bit on the same machine, on one thread."""
+    """Give the same result bit for bit, on the same machine. The fit then has one thread."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """How fine and how fast the fit is. Presets set most of these."""
+
+    levels: tuple[int, ...] = (4, 5, 6)
+    """Level of the mesh in each stage. Level n has about 10 · 4^n vertices."""
+    widths: tuple[int, ...] = (128, 256, 512)
+    """Largest width of the photographs in each stage [px]. Wider photographs are reduced."""
+    shares: tuple[float, ...] = (0.45, 0.46, 0.09)
+    """Share of the iterations that each stage gets.
+    A fit from a hull or a mesh skips two thirds of the first stage, and gives the second 40 % of what is skipped."""
+    subdivisions: int = 6
+    """Level of the mesh that is written at the end. mi-ring export writes other levels later."""
+    batch: int = 8
+    """Photographs per iteration. More make an iteration slower and less noisy."""
+    steps: int = 3
+    """Euler steps of the flow, the paper's T. Time and memory of the flow grow with it."""
+    spp: int = 1
+    """Samples per pixel of predicted photographs. More make an iteration slower and less noisy."""
+    weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
+    """Weight of each term of the loss; 0 switches it off.
+    rgb: colours of the photographs.
+    mask: silhouettes.
+    velocity: smoothness of the flow, the paper's lambda.
+    calibration: distance of what --refine finds from what the scene file says.
+    settling: variation of the material in the last stage, under an unknown environment.
+    normal_variation: prior for flat faces and sharp edges.
+    material_rank: prior for mixtures of few basis materials."""
+    velocity_decay: float = 0.03
+    """Share of --weights.velocity that is left at the end of the fit.
+    A small share gives finer detail. In a short fit it lets the surface fold over."""
+    laplacian_scale: float = 0.01
+    """How much the term velocity penalises high frequencies of the flow, the paper's alpha."""
+    learning_rate: float = 3e-3
+    """Learning rate of Adam at the start."""
+    muon_rate: float = 3e-2
+    """Learning rate of Muon at the start."""
+    decay: float = 0.1
+    """Share of the learning rates that is left at the end. Those of cameras fall to a half."""
+    precision: Literal["auto", "bfloat16", "float32"] = "auto"
+    """Number format of matrix products. auto: bfloat16 where this machine computes it faster than float32.
+    Use float32 to compare results of different machines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablation:
+    """Parts of the method that can be replaced or left out, to measure what they are worth."""
+
+    shadows: bool = True
+    """Trace shadows of the photographs' lights during the fit.
+    Without them the surface is wrong where lights are not at their cameras."""
+    indirect: bool = True
+    """Predict light that bounces between surfaces. Leave it out if the intensities of the lights are wrong."""
+    loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
+    """How predicted and observed colours are compared.
+    l2: squared differences, as in the paper. l1: absolute differences, less sensitive to outliers.
+    log: differences of logarithms, for dark surfaces. l1+log: the mean of both."""
+    optimizer: Literal["muon", "adam"] = "muon"
+    """muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all, as in the paper."""
+    shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
+    """The network that deforms the domain. ring: the paper's flow, with the same velocity field in all steps.
+    resnet: a block of its own for each step, with as many weights in all. wide-resnet: blocks as wide as the ring."""
+    encoding: Literal["linear", "octaves", "none"] = "linear"
+    """Positional encoding of both networks.
+    linear: frequencies 1, 2, 3, … octaves: 1, 2, 4, 8, … none: no encoding."""
+    frequencies: int = 16
+    """Number of frequencies of the encoding."""
+    resample: bool = True
+    """Move the vertices to other points of the domain in each iteration, so that the networks see all of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Ablation, Tuning, Common):
+    """The settings of a fit: all that defines its result except the photographs.
+
+    Its fields are those of `mi_ring.fitting.config.Common`, `mi_ring.fitting.config.Tuning` and
+    `mi_ring.fitting.config.Ablation`. `Config.preset` gives settings that go together. Raises InputError for a value
+    out of range.
+    """
 
     def __post_init__(self) -> None:
         def require(condition: bool, name: str, what: str) -> None:
@@ -158,10 +190,8 @@ class Config:
             require(getattr(self, name) >= 1, name, "at least 1")
         require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
         require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
-        require(self.shape_net == "ring" or self.solver == "euler", "solver", f"euler for --shape-net {self.shape_net}")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
-        for name in ("blur", "laplacian_scale"):
-            require(0 <= getattr(self, name) < math.inf, name, "0 or more")
+        require(0 <= self.laplacian_scale < math.inf, "laplacian_scale", "0 or more")
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
@@ -178,9 +208,9 @@ class Config:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Config":
-        """The settings of a preset, `fast`, `default`, `fine` or `paper`, but for these changes.
+        """The settings of a preset, `fast`, `default`, `fine` or `paper`, with these changes.
 
-        Of `weights` only those that are given change. Raises InputError for another name.
+        `weights` changes only the weights that it names. Raises InputError for a preset that does not exist.
         """
         if name not in PRESETS:
             raise InputError(f"preset: is {name}, must be one of {', '.join(PRESETS)}")
@@ -189,14 +219,69 @@ class Config:
             settings["weights"] = PRESETS[name].get("weights", {}) | changes["weights"]
         return cls(**settings)
 
+    @staticmethod
+    def load(path: str | Path) -> "Config":
+        """The settings of an earlier fit, from its results folder or from the config.json in it.
+
+        A setting without an entry has its default. Raises InputError, which names file and field, for an entry that is
+        no setting, and for a value that the setting cannot have.
+        """
+        path = Path(path)
+        path = path / "config.json" if path.is_dir() else path
+        advice = "give the results folder of a fit, or its config.json"
+        try:
+            entries = json.loads(path.read_bytes())
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: is not JSON; {advice}") from error
+        if not isinstance(entries, dict):
+            raise InputError(f"{path}: holds no settings; {advice}")
+        kinds, settings = {f.name: f.type for f in dataclasses.fields(Config)}, {}
+        for name, value in entries.items():
+            if name in TASK:
+                continue
+            if name not in kinds:
+                raise InputError(f"{path}: {name}: is no setting of mi_ring {__version__}; remove it")
+            try:
+                settings[name] = of_type(kinds[name], value)
+            except (ValueError, OverflowError):  # a whole number beyond what a float can be
+                raise InputError(f"{path}: {name}: is {reprlib.repr(value)}, which this setting cannot be; see "
+                                 "mi-ring fit --help-all") from None  # fmt: skip
+        try:
+            return Config(**settings)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
     def settings(self) -> dict:
         """All settings as plain data."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(Config)}
         return json.loads(json.dumps(values, default=str))
 
 
+def of_type(kind: Any, value: Any) -> Any:
+    """A value of JSON as a setting of this type. Raises ValueError if it cannot be one."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        for one in inner:
+            with contextlib.suppress(ValueError):
+                return of_type(one, value)
+    elif origin is tuple and isinstance(value, list):
+        kinds = repeat(inner[0], len(value)) if inner[-1] is ... else inner
+        return tuple(of_type(one, item) for one, item in zip(kinds, value, strict=True))
+    elif origin is dict and isinstance(value, dict):
+        return {name: of_type(inner[1], item) for name, item in value.items()}
+    elif kind is Path and isinstance(value, str):
+        return Path(value)
+    elif kind is float and type(value) in (int, float):
+        return float(value)
+    elif type(value) is kind or (origin is Literal and value in inner):
+        return value
+    raise ValueError(value)
+
+
 def as_typed(value: Any) -> str:
-    """A setting's value as the command line has it, more or less."""
+    """A setting's value about as one types it on the command line."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

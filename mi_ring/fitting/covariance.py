@@ -1,34 +1,33 @@
-"""How sure a fit is of what it has refined besides surface and material, these taken as they are.
+"""Standard deviations of the unknowns of calibration, with surface and material fixed.
 
-Least squares around what was found: how the photographs would change with each unknown, beside how far predictions are
-from them, gives the covariance ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 8.1, there called
-dispersion).
+Least squares at the solution: how the photographs change with each unknown, together with the errors of the
+predictions, gives the covariance ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 8.1).
 """
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mi_ring.fitting.calibration import UNKNOWNS, Calibration
-from mi_ring.fitting.terms import perceived
-from mi_ring.rendering import bridge
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.fitting.losses import perceived
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.renderer import Renderer
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
 
-if TYPE_CHECKING:
-    from mi_ring.fitting.fit import Fit
-
-WIDTH, SPP = 96, 8  #: of the pictures that are compared
-RECORDED = "curve", "contrast", "vignetting"  #: what changes nothing of the light that reaches the camera
-STEP = 0.2  #: of the unknowns, to either side, in their priors' standard deviations
-BLOCK = 8  #: pixels across which errors are taken to go together
+COMPARED_WIDTH, SPP = 96, 8  #: largest width [px] and samples per pixel of the pictures that are compared
+STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
+BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
 
-class Entries:
-    """Where the unknowns of a calibration have their place in one vector."""
+class Layout:
+    """The place of each unknown's numbers in one vector."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.first, self.count = calibration, {}, 0
@@ -36,138 +35,152 @@ class Entries:
             self.first[name] = self.count
             self.count += getattr(calibration, name).numel()
 
-    def rows(self, name: str, index: np.ndarray) -> list[np.ndarray]:
-        """Which rows of an unknown are those of each photograph."""
-        lens = dict.fromkeys(("focal", "principal", "distortion"), self.calibration.lens)
-        shared = lens | {"light": self.calibration.place}
-        if name in shared:
-            return [shared[name][index].numpy()]
-        if name in UNKNOWNS["lamps"]:  # all of them light all photographs
-            return [np.full_like(index, k) for k in range(len(getattr(self.calibration, name)))]
-        return [index if getattr(self.calibration, name).ndim else np.zeros_like(index)]
-
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """Name, component and place (n,) of all that photographs depend on."""
+        """Name, component and places (n,) of all numbers that photographs depend on."""
         result = []
-        for name in self.calibration.widths:
-            unknown = getattr(self.calibration, name)
-            components = unknown.shape[1] if unknown.ndim == 2 else 1
-            for row in self.rows(name, index):
-                first = self.first[name] + components * row
-                result += [(name, k, first + k) for k in range(components)]
+        for name, unknown in self.calibration.unknowns.items():
+            for row in unknown.rows(self.calibration.rig, index):
+                first = self.first[name] + unknown.components * row
+                result += [(name, k, first + k) for k in range(unknown.components)]
         return result
 
 
 @torch.no_grad()
-def deviations(fit: "Fit") -> dict[str, np.ndarray]:
-    """Standard deviation of each unknown of `fit.calibration` in its own unit, shaped like it; not of the room's light.
+def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
+    """Standard deviation of each unknown in its own unit, shaped like it; without the room's light.
 
-    The surface must have been shown.
+    `level`: of the surface.
     """
-    calibration = fit.calibration
+    calibration = model.calibration
     assert calibration is not None
-    entries = Entries(calibration)
-    if not entries.count:
+    layout = Layout(calibration)
+    if not layout.count:
         return {}
-    colours, outlines = Equations(entries.count), Equations(entries.count)
-    for index in fit.capture.together(fit.fitted):
-        scale = -(-fit.capture.sensors[index[0]].size[0] // WIDTH)
-        compare(fit, calibration, index, scale, entries, colours, outlines)
-    calibration.relight(fit.surface)  # as it was
-    precision = np.eye(entries.count) + colours.information() + outlines.information()
+    surface = renderer.showing(model, level)
+    colours, silhouettes = Equations(layout.count), Equations(layout.count)
+    for index in problem.capture.together(problem.fitted):
+        scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
+        compare(Comparison(problem, model, surface, index, scale), layout, colours, silhouettes)
+    calibration.relight(surface)  # as it was
+    precision = np.eye(layout.count) + colours.information() + silhouettes.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
     return {
-        name: width * spread[entries.first[name] :][: getattr(calibration, name).numel()]
+        name: width * spread[layout.first[name] :][: getattr(calibration, name).numel()]
         .reshape(getattr(calibration, name).shape)
         for name, width in calibration.widths.items()
     }  # fmt: skip
 
 
 class Equations:
-    """The normal equations of all photographs, and the variance of what they leave unexplained."""
+    """Normal equations of all photographs, and the variance of their errors."""
 
     def __init__(self, count: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
 
-    def add(self, slopes: Tensor, error: Tensor, telling: Tensor, places: np.ndarray) -> None:
-        """One photograph: how (K, H, W, C) it changes with the unknowns at `places` (K,), what is unexplained of it.
+    def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
+        """Add a photograph: its derivatives (K, H, W, C) by the numbers at `places` (K,), and its `error` (H, W, C).
 
-        `error` (H, W, C); `telling` (H, W): where.
+        `counted` (H, W) bool: pixels that count.
         """
-        slopes = slopes[:, telling].flatten(1).double()
+        slopes = slopes[:, counted].flatten(1).double()
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
         height, width, channels = error.shape
-        error = torch.where(telling[..., None], error, 0.0).double()
+        error = torch.where(counted[..., None], error, 0.0).double()
         error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
         blocks = error.unfold(0, BLOCK, BLOCK).unfold(1, BLOCK, BLOCK).sum((-2, -1))
         self.squares += float(blocks.square().sum())
-        self.pixels += channels * int(telling.sum())
+        self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """How precisely these photographs say what the unknowns are: (N, N)."""
+        """The information matrix (N, N) of these photographs."""
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 
-def compare(
-    fit: "Fit", calibration: Calibration, index: np.ndarray, scale: int, entries: Entries, colours: Equations,
-    outlines: Equations,
-) -> None:  # fmt: skip
-    """Photographs `index`, all of one size, with their predictions, at what was found and beside it."""
-    seen = fit.capture.observe(index, scale)
-    photographs = fit.capture.selected(index, scale)
-    room = calibration.roomlight().cpu()
-    # Where it is the only light it is part of what moves.
-    photographs = replace(photographs, room=room.double().numpy() if photographs.dark else None)
+@dataclass(frozen=True)
+class Comparison:
+    """Photographs `index` of one size, `scale` times smaller, with what the model predicts for them."""
 
-    def calibrated() -> Photographs:
-        calibration.relight(fit.surface)
-        return bridge.calibrated(photographs, [tensor.to(fit.device) for tensor in calibration.scaled(scale)])
+    problem: Problem
+    model: Model
+    surface: Surface
+    index: np.ndarray
+    scale: int
 
-    def direct() -> tuple[Tensor, Tensor]:
-        shadows = fit.config.shadows and fit.capture.shadows
-        return bridge.draw(fit.surface, calibrated(), SPP, shadows=shadows, in_the_way=False)
+    def photographs(self) -> Photographs:
+        """Cameras and lights with the current values of the unknowns, and the room's light if it is the only one."""
+        calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
+        calibration.relight(self.surface)
+        room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
+        views = [tensor.to(self.problem.device) for tensor in calibration(self.scale)]
+        return prediction.calibrated(replace(photographs, room=room), views)
 
-    lit, coverage = direct()
-    bounced, roomlight = torch.zeros_like(lit), torch.zeros_like(lit)
-    if fit.ring.indirect or room.any():
-        around = bridge.surroundings(fit.surface, calibrated(), coverage.to(fit.device), 1, spp=SPP,
-                                     indirect=fit.ring.indirect, room=calibration.room.which)  # fmt: skip
-        bounced = around.interreflection.cpu() if fit.ring.indirect else bounced
-        added = around.in_the_way if photographs.dark else around.room
-        roomlight = added(room.to(fit.device)).cpu() if room.any() else roomlight
+    @property
+    def calibration(self) -> Calibration:
+        """The unknowns."""
+        assert self.model.calibration is not None
+        return self.model.calibration
+
+    def direct(self) -> tuple[Tensor, Tensor]:
+        """Radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
+        shadows = self.problem.config.shadows and self.problem.capture.shadows
+        return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
+
+    def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
+        """Radiance (n, H, W, 3) by interreflection and by the room's light."""
+        ring, calibration = self.model.ring, self.calibration
+        bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
+        room = calibration.room_harmonics()
+        if ring.indirect or room.any():
+            photographs = self.photographs()
+            around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
+                                         indirect=ring.indirect, harmonics=calibration.room.which)  # fmt: skip
+            bounced = around.interreflection.cpu() if ring.indirect else bounced
+            added = around.occlusion if photographs.dark else around.room_light
+            room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
+        return bounced, room_light
+
+
+def compare(at: Comparison, layout: Layout, colours: "Equations", silhouettes: "Equations") -> None:
+    """Add photographs to the equations: their errors, and their derivatives by central differences."""
+    problem, calibration, index = at.problem, at.calibration, at.index
+    seen = problem.capture.observe(index, at.scale)
+    lit, coverage = at.direct()
+    bounced, room_light = at.other(lit, coverage)
 
     def picture(lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0) -> Tensor:
-        light = gain * (lit + bounced + roomlight)
-        return perceived(calibration.recorded(light, index, scale), fit.exposure, "log")
+        light = gain * (lit + bounced + room_light)
+        return perceived(calibration.recorded(light, index, at.scale), problem.exposure, "log")
 
-    slopes, unknowns = [], entries.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
-    for name, k, places in unknowns:
-        sides = []
-        for step in (STEP, -STEP):
-            factor = float(np.exp(step * calibration.widths[name]))
-            if name in ("power", "gain"):  # not by its unknowns, whose mean does not count
-                colour = torch.ones(3)
-                colour[k] = factor
-                by_lights = name == "power"
-                rgb = picture(lit * colour, bounced * colour) if by_lights else picture(lit, gain=colour)
-                sides.append((rgb, coverage))
-            elif name == "scale":
-                sides.append((picture(lit, bounced / factor), coverage))
-            else:
-                unknown = getattr(calibration, name)
-                found = unknown.detach().clone()
-                unknown.view(-1)[torch.from_numpy(np.unique(places - entries.first[name]))] += step
-                rgb, covered = (lit, coverage) if name in RECORDED else direct()
-                sides.append((picture(rgb), covered))
-                unknown.copy_(found)
+    def beside(name: str, k: int, places: np.ndarray, step: float) -> tuple[Tensor, Tensor]:
+        """Picture and coverage with component `k` of an unknown changed by a step."""
+        factor, changes = float(np.exp(step * calibration.widths[name])), calibration.unknowns[name].changes
+        colour = torch.ones(3)
+        colour[k] = factor
+        if changes == "light":  # not by the unknown itself, whose mean does not count
+            return picture(lit * colour, bounced * colour), coverage
+        if changes == "gain":
+            return picture(lit, gain=colour), coverage
+        if changes == "indirect":
+            return picture(lit, bounced / factor), coverage
+        tensor = getattr(calibration, name)
+        found = tensor.detach().clone()
+        tensor.view(-1)[torch.from_numpy(np.unique(places - layout.first[name]))] += step
+        rgb, covered = (lit, coverage) if changes == "recording" else at.direct()
+        result = picture(rgb), covered
+        tensor.copy_(found)
+        return result
+
+    slopes, unknowns = [], layout.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
+    for unknown in unknowns:
+        sides = beside(*unknown, STEP), beside(*unknown, -STEP)
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
     changing, covering = (torch.stack(part) for part in zip(*slopes))
     own = np.stack([places for *_, places in unknowns], 1)
-    error, off = picture(lit) - perceived(seen.rgb, fit.exposure, "log"), coverage - seen.mask
+    error, off = picture(lit) - perceived(seen.rgb, problem.exposure, "log"), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
-    outlined = (covering.abs().amax(0) > 0) | (off != 0)  # beside and amid the object nothing can be wrong
+    outlined = (covering.abs().amax(0) > 0) | (off != 0)  # where nothing can be wrong, pixels do not count
     for n in range(len(index)):
         colours.add(changing[:, n], error[n], surely[n], own[n])
-        if seen.masked[n] and fit.capture.threshold is None:
-            outlines.add(covering[:, n, ..., None], off[n, ..., None], (known & outlined)[n], own[n])
+        if seen.masked[n] and problem.capture.threshold is None:
+            silhouettes.add(covering[:, n, ..., None], off[n, ..., None], (known & outlined)[n], own[n])

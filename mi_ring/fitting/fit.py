@@ -1,349 +1,198 @@
-"""The loop of a fit: sample the domain, deform, render, weigh, step."""
+"""A fit: sample, deform, render, compare, step (paper, section 3)."""
 
-import math
+import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import Calibration, overall, refined_of
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.covariance import deviations
-from mi_ring.fitting.indirect_average import Averages
-from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.light_selection import lighting_of
-from mi_ring.fitting.lighting import AMBIGUOUS, Lighting, frames, lit, smoothed
-from mi_ring.fitting.mask_refinement import REDRAWN, find_outlines, with_outlines
-from mi_ring.fitting.nan_guard import Caution
-from mi_ring.fitting.optimizers import optimizers_of
-from mi_ring.fitting.other_light import with_surroundings
-from mi_ring.fitting.powers import Looker, lookers_of
-from mi_ring.fitting.processes import current
-from mi_ring.fitting.restraint import Restraint
-from mi_ring.fitting.rounds import Rounds
-from mi_ring.fitting.schedule import stages_of
+from mi_ring.fitting.course import Course
+from mi_ring.fitting.iteration import Context, Iteration
+from mi_ring.fitting.lighting import AMBIGUOUS, Lighting
+from mi_ring.fitting.mask_refinement import find_masks, with_masks
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.optimisation import Optimisation
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.regulariser_strength import RegulariserStrength
+from mi_ring.fitting.renamed import FIT, Renamed
+from mi_ring.fitting.renderer import Renderer
+from mi_ring.fitting.result import result_of
+from mi_ring.fitting.sampler import Sampler
+from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.start import require_settings, starting_ring
-from mi_ring.fitting.state import restore, state_of
-from mi_ring.fitting.summary import summary
-from mi_ring.fitting.terms import Term, default_terms
-from mi_ring.fitting.validation import confirm, kept_out
-from mi_ring.geometry.domain import Sphere
+from mi_ring.fitting.terms import Loss, TermLike
+from mi_ring.fitting.validation import validate
 from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.shape_net import Flow
-from mi_ring.objects.ring_file import ring_of
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_of, ring_state
 from mi_ring.output import results
-from mi_ring.rendering import bridge
-from mi_ring.system.machine import autocast, device, release_memory
+from mi_ring.output.fit_result import FitResult
+from mi_ring.system.machine import release_memory
 
-LOG_EVERY = 5  #: iterations between entries of the log
-#: Names that `Iteration.entry` has.
-RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
-UNSEEING = set(default_terms) - {"rgb", "mask"}  #: terms that look at no photograph
-RAMP = 0.05  #: over how much of a fit refinement sets in
-
-TermLike = Term | Callable[[Iteration], Tensor | None]
+PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: parts of a fit with a state of their own
 
 
-class Fit:
-    """A reconstruction in progress: networks, optimisers, random numbers and how far it is. ::
+class Fit(Renamed):
+    """A reconstruction in progress. ::
 
         for it in Fit(capture, Config.preset("fast")):
             print(it.number, it.loss)
 
-    `networks`: (Shape-Net, BRDF-Net), others than the paper's, which are trained in place, as
-    `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet` say. `terms`: of the loss, by name, each a
-    `Term` or a function of an `Iteration`; by default `default_terms`. `callbacks` are called with each `Iteration`
-    when it is done. `state`: what `state()` of an interrupted fit gave, to go on from there. `lighting`: what lights
-    the photographs, where that is known better than `Config.light` says.
+    `networks`: (Shape-Net, BRDF-Net) to train instead of the paper's, see `Flow` and `MaterialNet`. `terms`: of the
+    loss, by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks` are called with
+    each `Iteration` when it is done. `lighting`: what `choose_lighting` returned; needed unless the scene's own lights
+    are used. `state`: what `state()` of an interrupted fit returned, to continue it. A deterministic fit needs
+    `mi_ring.system.machine.set_threads(1)` beforehand.
 
-    A deterministic fit needs `mi_ring.system.machine.set_threads(1)` beforehand.
-
-    Raises InputError where capture, settings, terms and networks do not go together.
+    Raises InputError if capture, settings, terms and networks do not go together.
     """
+
+    RENAMED = FIT
 
     def __init__(
         self, capture: Capture, config: Config | None = None, networks: tuple[Flow, MaterialNet] | None = None,
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
-        state: dict | None = None, lighting: Lighting | None = None,
+        state: dict[str, Any] | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
-        self.given = capture  #: as it was handed in, for another fit: `capture` is lit as this one takes it to be
-        self.config: Config = config or Config()
-        given = default_terms if terms is None else terms
-        self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
-        self.callbacks = list(callbacks)
-        self.processes = current()  #: that share out the photographs of each iteration
-        if reserved := self.terms.keys() & RESERVED:
-            raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
-        if not any(self.weight_of(name) for name in self.terms.keys() - UNSEEING):
-            raise InputError("weights: no term compares the surface with the photographs; give rgb or mask one above 0")
-        require_settings(capture, self.config)
+        config = config or Config()
+        self.loss, self.callbacks = Loss(terms, config.weights), list(callbacks)
+        require_settings(capture, config)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
-        if unknown := set(self.config.weights) - set(default_terms) - set(self.terms):
-            raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
-        self.held_out = kept_out(capture, self.config.holdout)
-        self.fitted = np.setdiff1d(np.arange(len(capture)), self.held_out)  #: all other photographs
-        if self.config.deterministic:
+        lighting = Lighting(*state["lighting"]) if state else lighting or Lighting.of(capture, config)
+        if config.deterministic:
             recompute_normals(capture.scene)
-        lighting = Lighting(*state["lighting"]) if state else lighting  # under which `capture` is
-        began = time.perf_counter()
-        self.lighting = lighting or self.processes.told(lighting_of(capture.part(self.fitted), self.config, Fit))
-        self.seconds = time.perf_counter() - began  #: that iterations, and coarse fits before them, have taken
-        #: `environment`: harmonics of what the scene says of one, if it says so.
-        self.capture, scene, self.environment = smoothed(lit(capture, self.lighting))
-        capture = self.capture
-        chosen = replace(self.config, light=self.lighting.kind)
-        self.random = torch.Generator().manual_seed(self.config.seed)
-        torch.manual_seed(self.config.seed)
-        seen = capture.part(self.fitted) if len(self.held_out) else capture
-        self.exposure = seen.exposure()
-        self.ring = ring_of(state["ring"]) if state else starting_ring(seen, chosen, self.exposure, networks)
-        regularised = self.terms.get("velocity") is default_terms["velocity"] and self.config.weights["velocity"]
-        if regularised and not hasattr(self.ring.shape_net, "velocity"):
-            raise InputError(f"networks: {type(self.ring.shape_net).__name__}: has no velocity, which the term of that "
-                             "name needs; give it one, or the term the weight 0")  # fmt: skip
-        #: Of the light it gets, how much the object reflects: more than all where the intensities are not true.
-        self.albedo = math.pi * seen.reflectance(self.ring.center.cpu().numpy(), self.exposure)
-        self.device = device()
-        self.ring.to(self.device)
-        self.shaping_parameters = [p for p in self.ring.shape_net.parameters() if p.requires_grad]
-        self.surface = bridge.Surface(scene, capture.shape, self.ring)
-        self.optimizers = optimizers_of(self.ring, self.config, self.device)
-        self.near = not isinstance(self.ring.domain, Sphere)  #: does it start near the object?
-        self.calibration: Calibration | None = None
-        self.lookers: list[Looker] = []  #: optimisers that see iterations
-        if refined := refined_of(seen, chosen, self.albedo):
-            power, center = overall(refined, self.albedo), self.ring.center.cpu().numpy()
-            self.calibration = Calibration(capture, refined, center, self.exposure, power, self.fitted,
-                                           frames(capture, self.lighting), bool(self.lighting.lamps),
-                                           ahead="light" in self.config.refine)  # fmt: skip
-            self.lookers = lookers_of(self.calibration, self.near, self.terms)
-            self.optimizers += [*self.calibration.optimizers(), *self.lookers]
-            self.calibration.room.to(self.device)
-        settling = self.lighting.kind in AMBIGUOUS and self.weight_of("settling") > 0
-        self.stages_by = partial(stages_of, near=self.near, settling=settling)  #: of settings
-        self.stages = self.stages_by(self.config)
-        self.iterations = self.stages[-1].last
-        self.autocast = autocast(self.config.precision, self.device)
-        #: Masks that were found anew, as `mi_ring.fitting.mask_refinement` has them.
-        self.outlines: dict[int, Tensor] = {}
-        self.iteration = 0
-        self.log: list[dict] = []  #: an `Iteration.entry` of every fifth iteration and of the last
-        self.restraint, self.averages = Restraint(), Averages()
-        self.rounds = Rounds(capture, self.fitted)
-        self.confirmed: dict = {}  #: what `confirm` found when the fit was done
+        self.problem = Problem.of(capture, config, lighting)
+        torch.manual_seed(config.seed)
+        ring = ring_of(state["ring"]) if state else starting_ring(self.problem, networks)
+        self.loss.require_velocity(ring.shape_net)
+        self.model = Model(self.problem, ring.to(self.problem.device))
+        settling = lighting.kind in AMBIGUOUS and self.loss.weight("settling") > 0
+        self.plan: Callable[[Config], Schedule] = lambda config: Schedule.of(config, self.model.starts_near, settling)
+        self.schedule = self.plan(config)
+        self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, ring)
+        self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
+        self.regulariser, self.course = RegulariserStrength(), Course()
+        self.capture = self.problem.capture  #: with the masks that are used now
         if state:
-            restore(self, state)
-        fitted = [self.ring, self.calibration] if self.calibration else [self.ring]
-        self.caution = Caution(fitted, self.optimizers, state and state["caution"])
-        self.settle()
+            self.restore(copy.deepcopy(state))
+        self.optimisation.settle(self.schedule, self.iteration)
 
     def __iter__(self) -> Iterator[Iteration]:
-        """The iterations that are left, each as it is done."""
+        """The iterations that are left, each when it is done."""
         while self.iteration < self.iterations:
             yield self.step()
 
-    def step(self) -> Iteration:
-        """One iteration: sample the domain, deform, render, weigh, step.
+    def run(self) -> FittedObject:
+        """Run all iterations that are left. Returns the fitted object."""
+        for _ in self:
+            pass
+        return self.ring
 
-        Raises InputError if the fit diverges, RuntimeError if there is no iteration left.
-        """
+    def step(self) -> Iteration:
+        """One iteration. Raises InputError if the fit diverges, RuntimeError if no iteration is left."""
         if self.iteration >= self.iterations:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
-        if "masks" in self.config.refine and self.iteration in [int(p * self.shaping) for p in REDRAWN]:
-            self.take_outlines(self.processes.by_first(lambda: find_outlines(self)))
-        it = self.predict()
-        loss = self.weigh(it)
-        for optimizer in self.lookers:
-            optimizer.look(it)
-        self.descend(it, loss)
-        self.follow_power()
-        it.detach()
-        self.restraint.note(it, self.shaping)
-        self.iteration += 1
-        self.settle()
-        if self.iteration == it.stage.last:
-            release_memory()  # what comes next has other sizes
-        self.seconds += time.perf_counter() - started
-        if it.number == self.iterations and len(self.held_out):
-            self.confirmed = confirm(self)
-        if it.number % LOG_EVERY == 0 or it.number == self.iterations:
-            self.log.append(it.entry())
-        for callback in self.callbacks:
-            callback(it)
+        if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
+            self.refine_masks()
+        batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
+        observation = self.sampler.observe(self.problem, self.capture, batch)
+        prediction = self.renderer.predict(self.problem, self.model, batch)
+        it = Iteration(batch, observation, prediction, self.context())
+        loss = self.loss(it)
+        self.optimisation.step(loss, it)
+        it.prediction = prediction.detached()
+        self.regulariser.note(it)
+        self.course.iteration += 1
+        self.optimisation.settle(self.schedule, self.iteration)
+        self.course.seconds += time.perf_counter() - started
+        self.finish(it)
         return it
 
-    @property
-    def shaping(self) -> int:
-        """How many iterations shape the surface, before it stands still."""
-        return self.stages[-1].first if self.stages[-1].settles else self.iterations
+    def finish(self, it: Iteration) -> None:
+        """Validate after the last iteration, log, and call the callbacks."""
+        last = it.number == self.iterations
+        if it.number == it.stage.last:
+            release_memory()  # what comes next has other sizes
+        if last and len(self.problem.held_out):
+            self.course.validation = validate(self.problem, self.model, self.renderer, self.schedule.final_level)
+        self.course.record(it, self.optimisation.learning_rate, self.regulariser, last)
+        for callback in self.callbacks:
+            callback(it)
+
+    def context(self) -> Context:
+        """What terms and solvers may know at this iteration."""
+        config, problem = self.problem.config, self.problem
+        return Context(config, self.capture, self.model, self.schedule, problem.exposure, problem.lighting.plain > 0,
+                       self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
+
+    def refine_masks(self) -> None:
+        """Find masks anew."""
+        parts = self.capture, self.problem, self.model, self.renderer, self.schedule.final_level
+        self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
+        self.capture = with_masks(self.problem.capture, self.course.masks)
 
     @property
-    def progress(self) -> float:
-        """Share of these that are done."""
-        return min(1.0, self.iteration / self.shaping)
+    def ring(self) -> FittedObject:
+        """The fitted object."""
+        return self.model.ring
 
-    def settle(self) -> None:
-        """Have the surface stand still if that is due, and the light be what photographs say from then on."""
-        last = self.stages[-1]
-        for parameter in self.shaping_parameters:  # which in the end may learn again, in another fit
-            parameter.requires_grad_(not (last.settles and last.first <= self.iteration < last.last))
-        if last.settles and self.iteration == last.first and self.calibration:
-            self.calibration.room.forget()
-            self.caution.keep()  # not to go back to what is forgotten
+    @property
+    def iteration(self) -> int:
+        """Number of iterations that are done."""
+        return self.course.iteration
 
-    def predict(self) -> Iteration:
-        """Sample the domain, deform it, choose photographs and render them."""
-        config, number = self.config, self.iteration
-        stage = next(s for s in self.stages if number < s.last)
-        s, faces = self.ring.domain.sample(stage.level, self.random if config.resample else None)
-        s = s.to(self.device)
-        points = self.processes.share(len(s))
-        with self.autocast():
-            vertices, material = self.ring(s[points.part])
-        vertices, *parameters = points.joined([vertices, *material.values()])
-        material = self.lighting.shared(dict(zip(material, parameters)), self.progress)
-
-        everything, size = self.rounds.draw(config.batch, self.random)
-        share = self.processes.share(len(everything))
-        index, scale = everything[share.part], -(-size[0] // stage.width)
-        seen = self.processes.together(lambda: self.capture.observe(index, scale)).to(self.device)
-        photographs = replace(self.capture.photographs.select(index, size, scale), before=share.part.start)
-        self.surface.set_faces(faces)
-        calibration = [t.to(self.device) for t in self.calibration.scaled(scale)] if self.calibration else []
-        if self.calibration:
-            photographs = self.calibration.as_found(photographs, calibration)
-        predicted, coverage = bridge.render(
-            self.surface, photographs, vertices, material, spp=config.spp, seed=self.new_seed(),
-            shadows=config.shadows and self.capture.shadows, calibration=calibration,
-            lamps=self.calibration.lamp_tensors() if self.calibration else [],
-        )  # fmt: skip
-        predicted = with_surroundings(self, predicted, coverage, photographs, seen, everything, scale, share)
-        if self.calibration:
-            predicted = self.calibration.recorded(predicted, index, scale)
-        return Iteration(
-            self, number + 1, self.progress, stage, s, faces, vertices, material, index, scale, photographs,
-            *seen, predicted, coverage, everything, share,
-        )  # fmt: skip
-
-    def take_outlines(self, outlines: dict[int, Tensor]) -> None:
-        """Go on with these masks, where there are any, instead of those of the capture."""
-        if outlines:
-            self.outlines = self.outlines | outlines
-            self.capture = with_outlines(self.capture, outlines)
-
-    def follow_power(self) -> None:
-        """The reflectance takes along what the fit has found of the power of the lights together."""
-        if self.calibration and "scale" in self.calibration.refined:
-            net, first = self.ring.brdf_net, self.albedo / self.calibration.first_power / math.pi
-            net.set_parameters(net.bsdf_parameters, first * self.calibration.reflecting)
-
-    def new_seed(self) -> int:
-        """For the renderer."""
-        return int(torch.randint(2**31, (), generator=self.random))
-
-    def weight_of(self, name: str) -> float:
-        """Of a term, before its schedule; 0 if there is none of that name."""
-        return self.config.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
-
-    def weigh(self, it: Iteration) -> Tensor:
-        """This process's share of the weighted sum of the terms; the iteration gets that and each term of all.
-
-        A term is a mean over photographs, or the same in all processes: its sum by their shares is that of all.
-        """
-        loss, values = torch.zeros((), device=self.device), dict.fromkeys(self.terms, (0.0, 0.0))
-        for name, term in self.terms.items():
-            weight = self.weight_of(name)
-            value = term.function(it) if weight else None
-            if value is None:
-                continue
-            if not isinstance(value, Tensor) or value.ndim:
-                raise InputError(f"terms: {name}: must give a scalar tensor or None, not {type(value).__name__} "
-                                 f"{tuple(getattr(value, 'shape', ()))}")  # fmt: skip
-            it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
-            values[name] = float(value.detach()), 1.0
-            loss = loss + it.weights[name] * value
-        loss = loss * it.share.weight
-        found = torch.tensor([*values.values(), (float(loss.detach()), 1.0)], dtype=torch.double)
-        found[:-1, 0] *= it.share.weight
-        *told, (it.loss, _) = self.processes.sum(found).tolist()
-        it.terms = {name: value for name, (value, times) in zip(values, told) if times}
-        return loss
-
-    def descend(self, it: Iteration, loss: Tensor) -> None:
-        """The backward pass and a step of the optimisers; none if the loss or its gradient is not finite.
-
-        Nor if no term had anything to say: masks alone, and photographs of which none has one.
-        """
-        if not it.terms:
-            return
-        for optimizer in self.optimizers:
-            optimizer.zero_grad()
-        if self.processes.count > 1:
-            loss = loss + 0 * it.vertices.sum()  # whose backward pass waits for that of the others
-        if loss.requires_grad:
-            with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit keeps its state by thread
-                loss.backward()
-        self.processes.sum_gradients([p for o in self.optimizers for group in o.param_groups for p in group["params"]])
-        clip = torch.nn.utils.clip_grad_norm_
-        # Shape-Net's are clipped lest it diverges, BRDF-Net's only measured.
-        norm = clip(self.ring.shape_net.parameters(), 1.0) + clip(self.ring.brdf_net.parameters(), torch.inf)
-        others = [p.grad for p in self.calibration.parameters() if p.grad is not None] if self.calibration else []
-        # The renderer may swallow a NaN on the way back.
-        healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
-        for optimizer in self.optimizers:
-            for group in optimizer.param_groups:
-                begun = self.caution.factor * min(1.0, max(0.0, (it.progress - group.get("start", -1.0)) / RAMP))
-                group["lr"] = group["initial_lr"] * group.get("decay", self.config.decay) ** it.progress * begun
-            if healthy:
-                optimizer.step()
-        if not self.caution.note(healthy):
-            option = "--muon-rate" if self.config.optimizer == "muon" else "--learning-rate"
-            raise InputError(f"{self.capture.path}: diverged at iteration {self.iteration}; try a lower {option}")
-
-    def summary(self, refined: Capture) -> dict:
-        """What was refined besides surface and material, as `mi_ring.fitting.summary` has it; the surface is shown.
-
-        `refined`: the capture with all of it, as `calibrated` gives it.
-        """
-        return summary(self, refined, deviations(self))
+    @property
+    def iterations(self) -> int:
+        """Number of all iterations."""
+        return self.schedule.iterations
 
     def calibrated(self) -> Capture:
-        """The capture with cameras, lights and curve as refined by now; the surface is lit so, too."""
-        if not self.calibration:
-            return self.capture
-        self.calibration.relight(self.surface)
-        return self.calibration.applied(self.capture)
+        """The capture with cameras, lights and response as refined so far."""
+        return self.model.calibrated(self.capture)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
-        """What photograph `k` of the capture should look like by now: (H, W, 3) linear radiance.
+        """The current prediction of photograph `k`: (H, W, 3) linear radiance, at most `width` pixels wide.
 
-        At most `width` pixels wide, of the surface at a `level`. It changes nothing of the fit; but not from within a
-        term, for whose backward pass the renderer keeps what it rendered.
+        `level`: of the surface. Not to be called from within a term of the loss: the renderer keeps the picture of the
+        iteration for its backward pass.
         """
-        self.surface.show(self.ring, *self.ring.domain.sample(level))
-        photograph = self.calibrated().photograph(k, -(-self.capture.sensors[k].size[0] // width))
-        rgb, _ = bridge.draw(self.surface, photograph, spp, shadows=self.capture.shadows, indirect=self.ring.indirect)
-        return rgb[0].numpy()
+        return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
+
+    def result(self) -> FitResult:
+        """What the results are made of: `mi_ring.output` writes them."""
+        return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
+                         list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
     def save(self, folder: str | Path) -> None:
-        """Write the results into a folder: `ring.pt`, `mesh.ply`, `scene.xml`, `report.html`, as `mi_ring.fit` does.
+        """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and more into a folder; move earlier results aside.
 
-        Earlier results there are moved aside.
-
-        Raises InputError if they cannot be written, ValueError for networks that are not registered.
+        Raises InputError if a file cannot be written, ValueError for networks that are not registered.
         """
-        results.save_fit(Path(folder), self)
+        results.save(Path(folder), self.result())
 
-    def state(self) -> dict:
-        """What another `Fit` of the same capture needs to go on from here, for `torch.save`."""
-        return state_of(self)
+    def state(self) -> dict[str, Any]:
+        """What another `Fit` of the same capture needs to continue, for `torch.save`."""
+        return copy.deepcopy({  # the next iteration changes it
+            "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
+            "calibration": self.model.calibration and self.model.calibration.state_dict(),
+            "course": vars(self.course), **{name: getattr(self, name).state() for name in PARTS},
+        })  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from the `state()` of a fit with the same ring and lighting."""
+        if self.model.calibration:
+            self.model.calibration.load_state_dict(state["calibration"])
+        for name in PARTS:
+            getattr(self, name).restore(state[name])
+        self.course = Course(**state["course"])
+        self.capture = with_masks(self.problem.capture, self.course.masks)

@@ -1,73 +1,73 @@
-"""Coarse fits, which find out what lights the photographs."""
+"""Light selection: coarse fits find out what lights the photographs."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
+from mi_ring.calibration.unknowns import OWN_LIGHTS, UNKNOWNS
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.covariance import RECORDED
-from mi_ring.fitting.lighting import Lighting, exposures, moved, require_unknown, unlit
-from mi_ring.rendering.spherical_harmonics import COUNT, directions_of, harmonics_in
+from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.lighting import Lighting, exposures, moved, require_compatible, unlit
+from mi_ring.fitting.problem import held_out_photographs
+from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
-if TYPE_CHECKING:
-    from mi_ring.fitting.fit import Fit
-
-#: Settings of a trial: those that decide alike, whatever the fit's own are.
+#: Settings of a coarse fit. They do not depend on those of the fit, so that the choice does not either.
 COARSE: dict[str, Any] = {
     "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0,
     **{name: getattr(Config(), name) for name in (
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip
-LAST = 12  #: iterations of a trial that tell how well it explains the photographs
-ALIKE = 1.1  #: times that lights may differ in strength without a word
-#: What the scene says is believed unless another light leaves less of its error than this. An environment that is fixed
-#: in the camera looks much like a flash.
+LAST = 12  #: last iterations of a coarse fit whose mean error counts
+ALIKE = 1.1  #: ratio of the lights' strengths above which the user is told
+#: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
+#: An environment fixed in the camera looks much like a flash.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
-FEWER = 1.1  #: Fewer lamps are believed that leave no more of the error of the best than this.
-PLAIN = 1.2  #: One material is believed at first if it leaves no more of the error of many than this.
-LOOSE = 0.35  #: progress at which the material may vary, where it has been taken to be one
-FAINT = 0.1  #: the least strength of a lamp to begin with, by the first
-ROWS = 16  #: of a map of the directions in which lamps are sought
+FEWER = 1.1  #: the fewest lamps are chosen whose error is at most this factor of the least
+PLAIN = 1.2  #: one material at first is chosen if its error is at most this factor of that of a varying one
+LOOSE = 0.35  #: progress at which one material begins to vary
+FAINT = 0.1  #: least initial strength of a lamp, relative to the first
+ROWS = 16  #: of the map of directions in which lamps are searched
+RECORDING = {unknown.option for unknown in UNKNOWNS.values() if unknown.changes == "recording"}  #: options of it
 
 
-def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> Lighting:
-    """What `Config.light` asks for; what is to be found out coarse fits tell, made by `trial`.
+def choose_lighting(capture: Capture, config: Config) -> Lighting:
+    """The lighting that `Config.light` asks for. Coarse fits find unknown lights; they take minutes.
 
-    Raises InputError where nothing lights the object, and for what does not go together.
+    Raises InputError if nothing lights the object, and if capture and settings do not go together.
     """
-    require_unknown(capture, config)
     if config.light == "capture":
-        return Lighting("capture")
+        return Lighting.of(capture, config)
+    require_compatible(capture, config)
+    held_out = held_out_photographs(capture, config.holdout)
+    capture = capture.part(np.setdiff1d(np.arange(len(capture)), held_out))
     exposed = exposures(capture)
     if exposed.max() > ALIKE * exposed.min():
         print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
               "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
-    trials = Trials(capture, config, trial)
+    trials = Trials(capture, config)
     if config.light in ("environment", "turntable"):
         found = Lighting(config.light)
     elif config.light == "lamps":
         found = trials.lamps()
     else:
         likely = [Lighting("environment"), Lighting("turntable")]
-        if math.isfinite(trials.left(likely[0])):  # by which lamps are sought
+        if math.isfinite(trials.error(likely[0])):  # it tells where lamps are
             likely.insert(1, trials.brightest(1))
         if not unlit(capture):
-            own = trials.left(Lighting("capture"))
-            likely = [one for one in likely if trials.left(one) < BETTER[one.kind] * own] or [Lighting("capture")]
+            own = trials.error(Lighting("capture"))
+            likely = [one for one in likely if trials.error(one) < BETTER[one.kind] * own] or [Lighting("capture")]
         found = trials.best(*likely)
         if found.kind in ("environment", "lamps"):  # several lamps are between the two
             found = trials.best(found, trials.lamps())
-    if math.isinf(trials.left(found)):
+    if math.isinf(trials.error(found)):
         raise trials.failures[-1]
     if found.kind != "capture":
         found = trials.plain(found)
@@ -80,57 +80,57 @@ def lighting_of(capture: Capture, config: Config, trial: Callable[..., "Fit"]) -
 class Trials:
     """Coarse fits of a capture under different lights, each made once."""
 
-    def __init__(self, capture: Capture, config: Config, trial: Callable[..., "Fit"]) -> None:
-        """`config`: of the fit that they are for; `trial`: makes one."""
-        self.capture, self.config, self.trial = capture, config, trial
+    def __init__(self, capture: Capture, config: Config) -> None:
+        """`config`: of the fit for which the light is chosen."""
+        self.capture, self.config = capture, config
         self.center, _ = capture.sphere()
-        self.errors: dict[Lighting, float] = {}  #: that they leave of the photographs
-        self.found: dict[Lighting, Lighting] = {}  #: where each has its lamps in the end
-        self.failures: list[InputError] = []  #: of those that came to no end
-        #: harmonics (COUNT, 3) that a fit under one has found, and how much photographs tell of each (COUNT,)
+        self.errors: dict[Lighting, float] = {}  #: mean error of each
+        self.found: dict[Lighting, Lighting] = {}  #: each with the lamps that its fit has found
+        self.failures: list[InputError] = []  #: of fits that failed
+        #: harmonics (PER_FRAME, 3) of the environment that a fit has found, and information about each (PER_FRAME,)
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
-    def left(self, lighting: Lighting) -> float:
-        """The error that a coarse fit leaves."""
+    def error(self, lighting: Lighting) -> float:
+        """The mean error of a coarse fit; infinite if it fails."""
         if lighting in self.errors:
             return self.errors[lighting]
         refine = refined_under(lighting, self.config)
         weights = {"mask": self.config.weights["mask"], "settling": 0.0}
         config = replace(self.config, **COARSE, weights=weights, light=lighting.kind, refine=refine)
         try:
-            fit = self.trial(self.capture, config, lighting=lighting)
-            iterations = progress(fit, f"trying {lighting}", fit.iterations, unit="iteration")
+            fit = Fit(self.capture, config, lighting=lighting)
+            iterations = progress(fit, f"trying {lighting}", fit.schedule.iterations, unit="iteration")
             errors = [it.terms["rgb"] for it in iterations][-LAST:]
-        except InputError as error:  # it diverged, or has a lamp within the object: that light it is not
+        except InputError as error:  # it diverged, or a lamp is inside the object: it is not that light
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
         self.found[lighting] = moved(lighting, fit.calibrated(), self.center)
-        if lighting == Lighting("environment") and fit.calibration:
-            room = fit.calibration.room
-            told = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
-            self.environment = room.harmonics.numpy(force=True)[:COUNT], told.numpy(force=True)[:COUNT]
-        finite = [error for error in errors if math.isfinite(error)]  # a renderer has one now and then that is not
+        if lighting == Lighting("environment") and fit.model.calibration:
+            room = fit.model.calibration.room
+            information = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
+            self.environment = room.harmonics.numpy(force=True)[:PER_FRAME], information.numpy(force=True)[:PER_FRAME]
+        finite = [error for error in errors if math.isfinite(error)]  # a renderer produces a NaN now and then
         self.errors[lighting] = float(np.mean(finite)) if finite else math.inf
         if not finite:
             self.failures.append(InputError(f"{self.capture.path}: a coarse fit ({lighting}) has no finite error"))
         return self.errors[lighting]
 
     def best(self, *lightings: Lighting) -> Lighting:
-        """That which leaves the least."""
-        return min(lightings, key=self.left)
+        """The lighting with the least error."""
+        return min(lightings, key=self.error)
 
     def lamps(self) -> Lighting:
-        """As few as explain the photographs about as well as more, as far away as the cameras or infinitely far."""
+        """The fewest lamps that explain the photographs well enough, at the cameras' distance or infinitely far."""
         several = [self.brightest(count) for count in range(1, MOST + 1)]
-        enough = FEWER * min(self.left(some) for some in several if self.apart(some))
-        lamps = next(some for some in several if self.apart(some) and self.left(some) <= enough)
+        enough = FEWER * min(self.error(some) for some in several if self.apart(some))
+        lamps = next(some for some in several if self.apart(some) and self.error(some) <= enough)
         distant = self.brightest(len(lamps.lamps), distant=True)
         return self.best(lamps, distant) if self.apart(distant) else lamps
 
     def apart(self, lamps: Lighting) -> bool:
-        """Are they, seen from the object, where a coarse fit has moved them? Else two stand for one elsewhere."""
-        self.left(lamps)
+        """Are the lamps that were found apart, seen from the object? Else two of them stand for one."""
+        self.error(lamps)
         if len(lamps.lamps) < 2:
             return True
         vectors = np.array([vector for vector, _ in self.found[lamps].lamps])
@@ -140,11 +140,11 @@ class Trials:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """So many lamps that light the object as the environment does, and as strongly as makes its albedo a half."""
-        self.left(Lighting("environment"))
+        """So many lamps in the brightest directions of the environment, as strong as an albedo of one half needs."""
+        self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
-        away = np.median([np.linalg.norm(sensor.camera.position - self.center) for sensor in self.capture.sensors])
+        away = np.median([np.linalg.norm(shot.camera.position - self.center) for shot in self.capture.shots])
         directions, colours = brightest(*self.environment, count)
         vectors = -directions if distant else self.center + away * directions
         rgb = math.pi * self.capture.exposure() / ALBEDO * colours * (1.0 if distant else away**2)
@@ -152,31 +152,31 @@ class Trials:
         return Lighting("lamps", lamps, distant)
 
     def plain(self, lighting: Lighting) -> Lighting:
-        """As a coarse fit has it in the end; at first on one material if that explains the photographs as well."""
+        """The lighting that was found; with one material at first if that explains the photographs as well."""
         one = lighting._replace(plain=1.0)
-        if self.left(one) >= PLAIN * self.left(lighting) or not self.apart(one):
+        if self.error(one) >= PLAIN * self.error(lighting) or not self.apart(one):
             return self.found[lighting]
         return self.found[one]._replace(plain=LOOSE)
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """What a coarse fit refines of what `Config.refine` has: how photographs were recorded, and their own lights."""
-    own = {*OF_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
-    return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDED, *own}) or ("none",)
+    """The part of `Config.refine` that a coarse fit refines: the recording, and the photographs' own lights."""
+    own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
+    return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)
 
 
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """So many directions (count, 3) of lamps that light an object as an environment does, and colours (count, 3).
+    """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
 
-    Colours are by the first's, which is white: which colour it has nobody can tell from the object's. `harmonics`
-    (COUNT, 3) of the environment, and how much photographs tell of each, `certainty` (COUNT,). By least squares,
-    beside light that is alike from all sides: each direction in turn is put where it is best, until none moves.
+    Colours are relative to the first lamp, which is white: its colour cannot be told from the object's. `harmonics`
+    (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
+    light: each direction in turn moves to its best place, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics
-    directions, _ = directions_of(ROWS)
-    lobes = shown * harmonics_in(directions)  # (harmonics, directions)
-    grey = shown * np.eye(COUNT)[:, :1]
+    directions, _ = envmap_directions(ROWS)
+    lobes = shown * world_harmonics(directions)  # (harmonics, directions)
+    grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
         """Strengths (n + 1, C) and what is left."""

@@ -1,7 +1,7 @@
-"""What lights the photographs of a fit, where that is not what the scene says.
+"""The lighting of a fit: the lights of the scene, or unknown lights in their place.
 
-How bright an unknown light is and how much the object reflects cannot be told apart: the object's albedo is taken to be
-about one half, in each colour.
+Photographs do not tell the brightness of an unknown light from the albedo. So the mean albedo is assumed to be about
+one half, in each colour.
 """
 
 import math
@@ -12,47 +12,58 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from torch import Tensor
 
-from mi_ring.capture.calibrated import with_calibration
+from mi_ring.calibration.unknowns import OWN_LIGHTS
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import OF_LIGHTS
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, without_environment
-from mi_ring.scene.assembly import lamp_lights
+from mi_ring.scene.assembly import lamp_lights, with_lamps
 from mi_ring.scene.lights import Light, shared_emitters
 
 Kind: TypeAlias = Literal["capture", "environment", "turntable", "lamps"]
-AMBIGUOUS: set[Kind] = {"environment", "turntable"}  #: light that can hardly be told from what the material is
-Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `rgb` of a `Light`, that can be saved
+AMBIGUOUS: set[Kind] = {"environment", "turntable"}  #: light that photographs hardly tell from the material
+Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `rgb` of a `Light`, for checkpoints
 
 
 class Lighting(NamedTuple):
-    """The lights of the photographs, as a fit begins."""
+    """The lights of the photographs at the start of a fit, see `mi_ring.choose_lighting`."""
 
-    kind: Kind  #: of `Config.light`, but for "auto"
+    kind: Kind  #: as `Config.light`, except "auto"
     lamps: tuple[Lamp, ...] = ()
-    distant: bool = False  #: Are they infinitely far away?
-    plain: float = 0.0  #: progress of the fit until which the object is taken to be of one material
+    distant: bool = False  #: Are the lamps infinitely far away?
+    plain: float = 0.0  #: progress until which the object has a single material; 0: from the start it varies
+
+    @classmethod
+    def of(cls, capture: Capture, config: Config) -> "Lighting":
+        """The lights of the scene.
+
+        Raises InputError if it has none, or if the settings ask for unknown lights: coarse fits find those.
+        """
+        require_compatible(capture, config)
+        if config.light != "capture":
+            raise InputError(f"light: is {config.light}, which coarse fits have to find; give Fit what "
+                             "mi_ring.choose_lighting(capture, config) returns")  # fmt: skip
+        return cls("capture")
 
     def __str__(self) -> str:
-        """For people: environment, 1 lamp, 2 distant lamps."""
+        """For people, for instance: environment, 1 lamp, 2 distant lamps."""
         count = len(self.lamps)
         kind = f"{count} {'distant ' * self.distant}lamp{'s' * (count > 1)}" if count else self.kind
         return kind + " on one material" * (self.plain > 0)
 
-    def shared(self, material: dict[str, Tensor], progress: float) -> dict[str, Tensor]:
-        """The material (V, …) as a fit takes it by now: as long as it is `plain`, its mean all over.
+    def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The material (V, …) of a fit at this progress: the mean over all vertices as long as it is `plain`.
 
-        Slow changes of albedo and of light can hardly be told apart. So the light explains what both can.
+        Photographs hardly tell slow changes of albedo from slow changes of light. So the light explains both.
         """
         if progress >= self.plain:
             return material
         return {name: value.mean(0, keepdim=True).expand_as(value) for name, value in material.items()}
 
 
-def require_unknown(capture: Capture, config: Config) -> None:
-    """Raise InputError for what does not go with `Config.light`."""
-    others, own = shared_emitters(capture.scene), OF_LIGHTS & set(config.refine)
+def require_compatible(capture: Capture, config: Config) -> None:
+    """Raise InputError if capture and settings do not go with `Config.light`."""
+    others, own = shared_emitters(capture.scene), OWN_LIGHTS & set(config.refine)
     if config.light == "capture":
         if own and capture.photographs.dark:
             raise InputError(f"{capture.path}: --refine {min(own)}: is of the photographs' own lights, of which there "
@@ -66,7 +77,7 @@ def require_unknown(capture: Capture, config: Config) -> None:
         names = ", ".join(f'"{emitter.id()}"' for emitter in others)
         raise InputError(f"{capture.path}: emitter {names}: --light {config.light} finds all the light there is; take "
                          "the lamps of the scene out, or leave --light out")  # fmt: skip
-    if any(sensor.ambient for sensor in capture.sensors):
+    if any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
     if not any(capture.masks.given):
@@ -80,14 +91,14 @@ def require_unknown(capture: Capture, config: Config) -> None:
 
 
 def unlit(capture: Capture) -> bool:
-    """Have photographs neither lights of their own nor a room?"""
-    return capture.photographs.dark and capture.photographs.room is None
+    """Have the photographs neither lights of their own nor room light?"""
+    return capture.photographs.dark and capture.room is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
-    """(P, 3) how strong the photographs' own lights are, by their mean: under one light that is how they were exposed.
+    """(P, 3) strengths of the photographs' own lights relative to their mean; 1 if the scene has none.
 
-    1 where the scene does not say.
+    Under one common light these are the exposures of the photographs.
     """
     strengths = capture.photographs.lights.rgb()
     kinds = capture.photographs.lights.is_finite()
@@ -97,10 +108,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def moved(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """The same with lamps as a fit that began so has them in the end, `capture` as it has calibrated it.
+    """The lighting with the lamps that a fit has found: those of `capture`, which it has calibrated.
 
-    As strong together as makes the first bring the object, at `center` (3,), as much light as before, for the albedo's
-    sake.
+    All lamps are scaled so that the first brings as much light as before to the object at `center` (3,): the albedo
+    is assumed.
     """
     if not lighting.lamps:
         return lighting
@@ -113,45 +124,45 @@ def moved(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
 
 
 def lit(capture: Capture, lighting: Lighting) -> Capture:
-    """The capture under these lights: an environment is grey and alike from all sides to begin with.
+    """The capture under these lights. An environment starts grey and constant.
 
-    More lamps than one are the scene's.
+    Lamps after the first become lamps of the scene.
     """
     if lighting.kind == "capture":
         return capture
-    cameras, exposure = [sensor.camera for sensor in capture.sensors], capture.exposure()
-    room, lamps = None, None
+    scene, room, gains = capture.scene, None, exposures(capture)
     if lighting.lamps:
         kind: Literal["point", "directional"] = "directional" if lighting.distant else "point"
         first, *others = [Light(kind, np.array(vector), np.array(rgb)) for vector, rgb in lighting.lamps]
-        lights, lamps = [first] * len(cameras), others or None
+        lights = [first] * len(capture)
+        scene = with_lamps(scene, others) if others else scene
     else:
         room = np.zeros((BASIS, 3))
-        room[0] = math.sqrt(4 * math.pi) * exposure / ALBEDO
-        lights = [Light("point", camera.position, np.zeros(3)) for camera in cameras]
-    result = with_calibration(capture, cameras, lights, room=room, falloff=[0.0] * len(cameras),
-                              gains=exposures(capture), lamps=lamps)  # fmt: skip
-    result.hull = capture.hull  # the same masks from the same places, which takes a while
-    return result
+        room[0] = math.sqrt(4 * math.pi) * capture.exposure() / ALBEDO
+        lights = [Light("point", shot.camera.position, np.zeros(3)) for shot in capture.shots]
+    shots = []
+    for shot, light, gain in zip(capture.shots, lights, gains):
+        shots.append(replace(shot, light=light, falloff=0.0, response=shot.response.changed(gain=gain)))
+    return replace(capture, scene=scene, shots=tuple(shots), room=room)
 
 
 def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
-    """The capture with the environment that its scene says among its room's harmonics, and the scene without it.
+    """Move the scene's environment into the harmonics of the room's light, whose reflection has no noise.
 
-    And these harmonics (BASIS, 3); None if there are none. What a surface reflects of them has no noise. That the
-    environment may be seen beside the object, which is not predicted then, does not matter where all photographs have
-    masks; else it stays as it is, to be sampled, and where the reflectance is another than `cooktorrance`.
+    Returns the capture with that room, the scene without the environment, and its harmonics (BASIS, 3) or None. Nothing
+    changes if a photograph has no mask, since the background then shows the environment, and for other reflectances
+    than `cooktorrance`.
     """
     if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
         return capture, capture.scene, None
     scene, known = without_environment(capture.scene)
     if known is None:
         return capture, scene, None
-    room = known if capture.photographs.room is None else capture.photographs.room + known
-    return replace(capture, photographs=replace(capture.photographs, room=room)), scene, known
+    room = known if capture.room is None else capture.room + known
+    return replace(capture, room=room), scene, known
 
 
 def frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """In which axes the unknown light of a room is fixed."""
+    """Axes in which unknown room light is fixed."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

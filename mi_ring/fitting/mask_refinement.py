@@ -1,10 +1,10 @@
-"""Masks as unknowns: found anew in the course of a fit, by GrabCut about what the surface covers by then."""
+"""Mask refinement: masks are found anew during a fit, by GrabCut near what the surface covers by then."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -13,49 +13,49 @@ from torch import Tensor
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.grabcut import grabcut, overlap
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.renderer import Renderer
 from mi_ring.images import linear_to_srgb, to_bytes
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.system.progress import progress
 
-if TYPE_CHECKING:
-    from mi_ring.fitting.fit import Fit
+LARGEST = 512  #: largest side of the pictures in which they are found [px]
+BAND = 0.04  #: how far the surface may be off, relative to the object's size
+PLAUSIBLE = 0.8  #: overlap with the surface's coverage below which a mask is not used
+BRIGHTNESS = 0.25  #: linear brightness of the object in these pictures
 
-REDRAWN = 0.5, 0.75  #: progress of the fit at which masks are found anew
-LONGEST = 512  #: pixels at most along the pictures in which they are found
-BAND = 0.04  #: of the object's size, by which the surface may be off
-SURE = 0.8  #: overlap with what the surface covers, below which a mask is not believed
-BRIGHTNESS = 0.25  #: of the object in these pictures, linear
+Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduced size, by photograph
 
 
-def find_outlines(fit: "Fit") -> dict[int, Tensor]:
-    """What photographs show of the object by the index of each: (h, w) uint8, 0 or 1, perhaps reduced.
+def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Renderer, level: int) -> Masks:
+    """New masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
 
-    Those that are not sure are left out. Photographs from one place are looked at together.
+    `level`: of the surface.
     """
-    capture = fit.calibrated()
-    fit.surface.show(fit.ring, *fit.ring.domain.sample(fit.stages[-1].level))
+    capture = model.calibrated(capture)
+    surface = renderer.showing(model, level)
     places: dict[tuple, list[int]] = {}
-    for k, sensor in enumerate(capture.sensors):
-        places.setdefault((sensor.size, sensor.camera.to_world.tobytes()), []).append(k)
+    for k, shot in enumerate(capture.shots):
+        places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture, coverage, and what surely is background."""
-        scale = -(-max(capture.sensors[index[0]].size) // LONGEST)
+        """Picture, coverage of the surface, and pixels that are certainly background."""
+        scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
-        _, coverage = bridge.draw(fit.surface, capture.photograph(index[0], scale), spp=4, shadows=False)
-        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / fit.exposure)))
+        _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
+        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / problem.exposure)))
         background = np.zeros(picture.shape[:2], bool)
         if seen.valid is not None:
             background |= ~seen.valid.numpy().any(0)
         return picture, (coverage[0].numpy() > 0.5).astype(np.uint8), background
 
-    def outlined(given: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray | None:
+    def mask_of(given: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray | None:
         mask = grabcut(*given, BAND)
-        return mask if overlap(mask, given[1]) >= SURE else None
+        return mask if overlap(mask, given[1]) >= PLAUSIBLE else None
 
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # what draws does so on this thread
-        masks = pool.map(outlined, map(seen_from, places.values()))
-        found = list(progress(masks, "masks", len(places)))
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # rendering stays on this thread
+        found = list(progress(pool.map(mask_of, map(seen_from, places.values())), "masks", len(places)))
     return {
         k: torch.from_numpy(mask)
         for index, mask in zip(places.values(), found)
@@ -64,14 +64,16 @@ def find_outlines(fit: "Fit") -> dict[int, Tensor]:
     }
 
 
-def with_outlines(capture: Capture, outlines: Mapping[int, Tensor]) -> Capture:
-    """The capture with these masks instead of its own, as `find_outlines` gives them."""
+def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
+    """The capture with these masks, as `find_masks` returns them, in place of its own."""
 
-    def enlarged(outline: Tensor, size: tuple[int, int]) -> np.ndarray:
-        (width, height), (rows, columns) = size, outline.shape
-        scale = width // columns  # what is over is less than a pixel of the outline's
-        whole = cv2.resize(255 * outline.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
+    def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
+        (width, height), (rows, columns) = size, mask.shape
+        scale = width // columns  # the rest is narrower than a pixel of the mask
+        whole = cv2.resize(255 * mask.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
         return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
 
-    readers = {k: partial(enlarged, outline, capture.sensors[k].size) for k, outline in outlines.items()}
+    if not masks:
+        return capture
+    readers = {k: partial(enlarged, mask, capture.shots[k].size) for k, mask in masks.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

@@ -1,7 +1,7 @@
-"""Priors on shape and material, as terms of the loss: off by default.
+"""Priors on shape and material, as terms of the loss; all but `settling` are off by default.
 
-The paper names TV-L1 for the shape, L1 and low rank for the BRDF; these are ours of that name. None depends on the
-resolution of the mesh or on the units of the scene.
+The paper names TV-L1 for the shape, and L1 and low rank for the BRDF; these are priors of that kind. None depends on
+the resolution of the mesh or on the units of the scene.
 """
 
 import math
@@ -15,16 +15,15 @@ from torch.nn import functional as F
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.nets.brdf_net import MaterialNet
 
-FAINT = 1e-3  #: means that nothing is divided by less than, and how far from its ends a parameter's logit stays
+EPS = 1e-3  #: least mean to divide by, and least distance of a share from 0 and 1 in a logit
 
 
 def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
     """Total variation of the normals of a closed mesh, vertices (V, 3) and faces (F, 3): a length.
 
-    The sum over edges of their length times how far the normals of both sides are apart ("Discrete total variation of
-    the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020; chords instead of angles). A turn
-    costs about as much if it is sharp as if it is spread over many edges, so that flat sides and edges are as good as
-    what is round, and ripples are not. 8πR for a sphere of even triangles.
+    The sum over all edges of their length times the distance between the normals of both sides ("Discrete total
+    variation of the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020; chords instead of
+    angles). A sharp bend costs about as much as a round one, and ripples cost more. 8πR for a sphere of even triangles.
     """
     pairs, ends = trimesh.graph.face_adjacency(faces, return_edges=True)
     a, b, c = vertices[torch.as_tensor(faces, device=vertices.device)].unbind(1)
@@ -34,7 +33,7 @@ def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
 
 
 def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> Tensor:
-    """Mean over a mesh of the gradient's length of values (V, C), linear on each triangle; summed over the channels.
+    """Mean length of the gradient of values (V, C) over a mesh, linear on each triangle, summed over channels.
 
     Per unit of length of the vertices (V, 3).
     """
@@ -50,14 +49,14 @@ def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> 
 def number_of_bases(values: Tensor) -> Tensor:
     """‖M‖₁ / ‖M‖₂ of the singular values of M (V, C), its nuclear norm over Frobenius' norm.
 
-    1 for multiples of one basis material, √k for k that are orthogonal and as strong as each other, √C at most. The
-    nuclear norm is the convex stand-in for the rank (Fazel 2002); divided like this it does not darken the material.
+    It is 1 for multiples of one basis material, √k for k orthogonal ones of equal strength, and √C at most. The nuclear
+    norm is the convex relaxation of the rank (Fazel 2002). The division keeps it from darkening the material.
     """
     return torch.linalg.matrix_norm(values, "nuc") / values.norm()
 
 
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
-    """The material at V points as a matrix (V, C) of numbers near 1: in units of `scale`, or as shares of a range."""
+    """The material at V points as a matrix (V, C) of numbers near 1: in units of `scale`, or as shares of the range."""
     columns = []
     for p in brdf_net.bsdf_parameters:
         unit = float(brdf_net.scale) if math.isinf(p.high) else p.high - p.low
@@ -66,33 +65,24 @@ def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
 
 
 def normal_variation(it: Iteration) -> Tensor:
-    """Over that of a sphere of the object's size."""
-    return variation_of_normals(it.vertices, it.faces) / (8 * math.pi * it.fit.ring.radius)
-
-
-def material_variation(it: Iteration) -> Tensor:
-    """Per radius of the object. The shape does not follow it."""
-    return variation_per_radius(it, columns_of(it.material, it.fit.ring.brdf_net))
+    """Total variation of the normals, relative to a sphere of the object's size."""
+    radius = it.context.model.ring.radius
+    return variation_of_normals(it.prediction.vertices, it.batch.faces) / (8 * math.pi * radius)
 
 
 def albedo_variation(it: Iteration) -> Tensor:
-    """The same, but for what is had for nothing where the light is found for the material.
+    """Mean gradient of the material over the surface, times the object's radius. The shape gets no gradient.
 
-    Of how much is reflected by its mean: half as much in twice the light is the same. Of what has an upper end (a
-    roughness) the logits: as shares they would vary less near its ends.
+    Reflectances are divided by their mean: half the reflectance in twice the light looks the same. A parameter with an
+    upper bound (a roughness) counts by its logit: as a share it would vary less near its bounds.
     """
-    net = it.fit.ring.brdf_net
-    values = columns_of(it.material, net)
-    ends = torch.tensor([math.isfinite(p.high) for p in net.bsdf_parameters for _ in range(p.channels)])
-    values = torch.where(ends.to(values.device), values.logit(FAINT), values / values.mean(0).clamp(min=FAINT))
-    return variation_per_radius(it, values)
-
-
-def variation_per_radius(it: Iteration, values: Tensor) -> Tensor:
-    """How fast values (V, n) at the vertices change over the surface, in the mean, times the object's radius."""
-    return it.fit.ring.radius * variation_of_values(it.vertices.detach(), it.faces, values)
+    ring, prediction = it.context.model.ring, it.prediction
+    values = columns_of(prediction.material, ring.brdf_net)
+    bounded = torch.tensor([math.isfinite(p.high) for p in ring.brdf_net.bsdf_parameters for _ in range(p.channels)])
+    values = torch.where(bounded.to(values.device), values.logit(EPS), values / values.mean(0).clamp(min=EPS))
+    return ring.radius * variation_of_values(prediction.vertices.detach(), it.batch.faces, values)
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """Of the material at all vertices."""
-    return number_of_bases(columns_of(it.material, it.fit.ring.brdf_net))
+    """Number of basis materials at all vertices."""
+    return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

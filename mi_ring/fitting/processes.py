@@ -1,9 +1,9 @@
-"""Processes that share out the points and the photographs of each iteration of a fit, as `torchrun` starts them.
+"""Data parallelism: the processes that `torchrun` starts share the work of each iteration.
 
-All draw the same random numbers, hold the same networks and make the same steps; each evaluates the networks at some of
-the points and renders some of the photographs, and what these say is summed over all (synchronous data parallelism,
-"Accurate, Large Minibatch SGD", Goyal et al. 2017). The first alone writes and prints. This module alone knows of
-torch.distributed, which one process does without.
+All processes draw the same random numbers, hold the same networks and make the same steps. Each evaluates the networks
+at a part of the points and renders a part of the photographs. Sums go over all processes (synchronous data parallelism,
+"Accurate, Large Minibatch SGD", Goyal et al. 2017). Only the first process writes and prints. No other module uses
+torch.distributed.
 """
 
 import atexit
@@ -24,80 +24,80 @@ from mi_ring.system.machine import cores, device
 Value = TypeVar("Value")
 
 
-class Lost(InputError):
-    """Another process of the fit has ended, or cannot be reached: the results stay as they were."""
+class ProcessLost(InputError):
+    """Another process of the fit has ended or cannot be reached. No results are written."""
 
 
 class Processes:
-    """All processes of a fit, seen from one of them. This is one that is alone: its sums are those of all."""
+    """The processes of a fit, seen from one of them. This class is a single process: its sums are the totals."""
 
-    count, rank = 1, 0  #: how many, and which of them this is
-    here = 1  #: how many of them are on this machine
-    exchanged, exchanges = 0, 0  #: bytes that this process has given to sums so far, and how many these were
+    count, rank = 1, 0  #: number of processes, and the number of this one
+    on_this_machine = 1  #: processes on this machine
+    exchanged, exchanges = 0, 0  #: bytes that this process has sent to sums so far, and the number of sums
 
     @property
     def threads(self) -> int:
-        """Of the processor, those that are this process's."""
-        return max(1, cores() // self.here)
+        """Processor threads for this process."""
+        return max(1, cores() // self.on_this_machine)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The sum of what each process has, the same in all; tensors are of one shape."""
+        """The sum of the tensors of all processes, the same in all. All tensors have one shape."""
         return tensor
 
-    def told(self, value: Value) -> Value:
-        """What the first process has; it is pickled."""
+    def broadcast(self, value: Value) -> Value:
+        """The value of the first process, sent to all others by pickle."""
         return value
 
-    def together(self, work: Callable[[], Value]) -> Value:
-        """What `work` returns here. If it fails with an InputError in one process, it does in all."""
+    def agreed(self, work: Callable[[], Value]) -> Value:
+        """Call `work` in each process and return its result. An InputError in one process is raised in all."""
         return work()
 
-    def by_first(self, work: Callable[[], Value]) -> Value:
-        """What `work` returns in the first process, which alone does it; so do its InputError and its exit."""
+    def on_first(self, work: Callable[[], Value]) -> Value:
+        """Call `work` in the first process only. Its result, InputError or SystemExit reaches all processes."""
         return work()
 
-    def most(self, number: int) -> int:
-        """The largest of the numbers that processes have."""
+    def maximum(self, number: int) -> int:
+        """The largest number of all processes."""
         return number
 
-    def wait(self) -> None:
-        """Wait for all others."""
+    def barrier(self) -> None:
+        """Wait until all processes are here."""
 
     def share(self, total: int) -> "Share":
-        """This process's share of so many photographs."""
+        """The share of this process in `total` photographs or points."""
         return Share(self, total)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Have each parameter have the sum of its gradients; those without one in any process go without."""
+        """Replace each parameter's gradient by the sum over all processes; None where no process has one."""
 
 
 class Team(Processes):
-    """One of several processes, which torch.distributed has brought together."""
+    """One of several processes, connected by torch.distributed."""
 
     def __init__(self) -> None:
         import torch.distributed as distributed
 
         self.distributed = distributed
         self.rank, self.count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-        self.here = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+        self.on_this_machine = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         # NCCL wants a GPU of its own for each process; what is no tensor goes through the processor.
-        own = self.here == 1 or os.environ.get(OWN) == "1"
+        own = self.on_this_machine == 1 or os.environ.get(OWN) == "1"
         self.nccl = own and torch.cuda.is_available() and distributed.is_nccl_available()
         distributed.init_process_group("cpu:gloo,cuda:nccl" if self.nccl else "gloo")
         atexit.register(self.part)
 
     def part(self) -> None:
-        """Take leave of the others, at the end of the process: a second time it could not join them."""
+        """Leave the process group when the process ends. A process cannot join twice."""
         with contextlib.suppress(RuntimeError):
             self.distributed.destroy_process_group()
 
     def attempt(self, exchange: Callable[[], None]) -> None:
-        """Raises Lost where torch's own error is that another process has gone."""
+        """Call `exchange`. Raises ProcessLost if another process is gone."""
         try:
             exchange()
         except RuntimeError as error:
-            raise Lost("another process of this fit has ended or is out of reach; go on from the last checkpoint with "
-                       "the same command and --resume") from error  # fmt: skip
+            raise ProcessLost("another process of this fit has ended or is out of reach; go on from the last "
+                              "checkpoint with the same command and --resume") from error  # fmt: skip
 
     def sum(self, tensor: Tensor) -> Tensor:
         """As of one process."""
@@ -107,14 +107,14 @@ class Team(Processes):
         self.attempt(lambda: self.distributed.all_reduce(total))
         return total.to(tensor.device)
 
-    def told(self, value: Value) -> Value:
+    def broadcast(self, value: Value) -> Value:
         """As of one process."""
         box = [pickle.dumps(value) if self.rank == 0 else None]
         self.attempt(lambda: self.distributed.broadcast_object_list(box))
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
-    def together(self, work: Callable[[], Value]) -> Value:
-        """As of one process; of several messages that of the first of them that has one is told."""
+    def agreed(self, work: Callable[[], Value]) -> Value:
+        """As of one process; if several processes fail, the message of the first of them is used."""
         result: Any = None
         error: InputError | None = None
         try:
@@ -129,7 +129,7 @@ class Team(Processes):
             raise InputError(f"{where}{messages[failed[0]]}") from error
         return result
 
-    def by_first(self, work: Callable[[], Value]) -> Value:
+    def on_first(self, work: Callable[[], Value]) -> Value:
         """As of one process."""
         outcome: tuple[str, Any] | None = None
         try:
@@ -138,7 +138,7 @@ class Team(Processes):
             outcome = ("error", str(error))
         except SystemExit as stop:
             outcome = ("exit", stop.code)
-        told: Any = self.told(outcome)
+        told: Any = self.broadcast(outcome)
         kind, value = told
         if kind == "error":
             raise InputError(value)
@@ -146,15 +146,15 @@ class Team(Processes):
             raise SystemExit(value)
         return value
 
-    def most(self, number: int) -> int:
+    def maximum(self, number: int) -> int:
         """As of one process."""
         numbers = torch.tensor([number])
         self.attempt(lambda: self.distributed.all_reduce(numbers, self.distributed.ReduceOp.MAX))
         return int(numbers)
 
-    def wait(self) -> None:
+    def barrier(self) -> None:
         """As of one process."""
-        self.most(0)
+        self.maximum(0)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
         """As of one process, all in one exchange."""
@@ -168,7 +168,7 @@ class Team(Processes):
 
 
 class Rows(torch.autograd.Function):
-    """Rows of a tensor (N, C) of which each process has its own, attached; their backward pass is that of all."""
+    """All rows of a tensor (N, C) of which each process has a part. Gradients are summed over all processes."""
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, share: "Share") -> Tensor:
@@ -178,28 +178,29 @@ class Rows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """What all processes together make of the loss."""
+        """The gradients of the loss of all processes."""
         return ctx.share.processes.sum(grad)[ctx.share.part], None
 
 
 class Share:
-    """What one process has of the photographs of an iteration: those of `part`; none of its own if `weight` is 0.
+    """The part of an iteration's photographs (or points) that one process works on: the slice `part`.
 
-    Then it renders one that another process has, too, and that counts there: some are more than the photographs.
+    With more processes than photographs some have `weight` 0. They render a photograph of another process, which does
+    not count.
     """
 
     def __init__(self, processes: Processes, total: int) -> None:
         self.processes, self.total_count = processes, total
         first, last = (total * k // processes.count for k in (processes.rank, processes.rank + 1))
-        self.weight = (last - first) / total  #: of a mean over its photographs in the mean over all of them
+        self.weight = (last - first) / total  #: weight of this process's mean in the mean over all photographs
         self.part = slice(first, last) if last > first else slice(min(first, total - 1), min(first, total - 1) + 1)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The sum over all photographs of what is the sum over those of this process; without gradients."""
+        """The sum over all photographs, from the sum over those of this process. Without gradients."""
         return self.processes.sum(tensor if self.weight else torch.zeros_like(tensor))
 
     def gathered(self, tensor: Tensor) -> Tensor:
-        """Of all photographs (N, …), in their order, what this process has of its own (n, …); without gradients."""
+        """(N, …) for all photographs, in order, from (n, …) for those of this process. Without gradients."""
         if self.processes.count == 1:
             return tensor
         whole = tensor.new_zeros(self.total_count, *tensor.shape[1:])
@@ -207,8 +208,8 @@ class Share:
             whole[self.part] = tensor
         return self.processes.sum(whole)
 
-    def joined(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """The same of tensors (n, …) together, attached, of all points (N, …): every process has some of its own."""
+    def concatenated(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Tensors (N, …) for all points, from tensors (n, …) for those of this process. With gradients."""
         if self.processes.count == 1:
             return list(tensors)
         columns = [tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors]
@@ -221,21 +222,21 @@ _current: Processes = ALONE
 
 
 def current() -> Processes:
-    """Those that `joined` has brought together; outside of it one process, alone."""
+    """The processes within `joined`; outside of it a single process."""
     return _current
 
 
 @functools.cache
 def team_of_this_process() -> Team:
-    """The one that it belongs to."""
+    """The group that this process belongs to, connected once."""
     return Team()
 
 
 @contextlib.contextmanager
 def joined() -> Iterator[Processes]:
-    """Within it the processes that `torchrun` has started are one fit; others are alone.
+    """Context in which the processes that `torchrun` has started work on one fit. Other processes stay single.
 
-    All but the first print nothing, and what the user can mend, which the first says, ends them silently.
+    Only the first process prints. An InputError, which the first process reports, ends the others silently.
     """
     global _current
     if int(os.environ.get("WORLD_SIZE", 1)) == 1 or "TORCHELASTIC_RUN_ID" not in os.environ:
@@ -255,6 +256,6 @@ def joined() -> Iterator[Processes]:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Within it nothing that is printed is seen."""
+    """Context in which printed text is dropped."""
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
         yield

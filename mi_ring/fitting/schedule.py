@@ -1,40 +1,111 @@
-"""Coarse to fine: the stages of a fit, and one in which light and material settle."""
+"""The schedule of a fit: coarse-to-fine stages, learning rates and blur, known before it begins."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
+
+import torch
 
 from mi_ring.fitting.config import Config
 
 HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
-SETTLING = 0.15  #: iterations in which light and material settle, by those before them
-EXCHANGE = 0.4  #: iterations of the second stage that it gets for each; by the presets they take about as long
+EXCHANGE = 0.4  #: iterations of the second stage that replace one of these; with the presets both take the same time
+SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
+RAMP = 0.05  #: progress during which a learning rate rises from 0, once it starts
+MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
+INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
+SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 
 
 class Stage(NamedTuple):
-    """One stage of coarse to fine."""
+    """One stage, coarse to fine."""
 
     level: int  #: of the icosphere
-    width: int  #: of the photographs, at most [px]
-    first: int  #: iteration
+    width: int  #: largest width of the photographs [px]
+    first: int  #: first iteration, from 0
     last: int  #: iteration after the last
-    settles: bool = False  #: Does the surface stand still, while light and material settle?
+    settles: bool = False  #: Is the surface fixed, while light and material settle?
 
 
-def stages_of(config: Config, near: bool = False, settling: bool = False) -> list[Stage]:
-    """Those stages that get at least one iteration, in order, from a start that is `near` the object or far.
+class Rate(NamedTuple):
+    """The learning rate of a parameter group."""
 
-    `settling`: and one more, in which the surface stands still.
-    """
-    shares = list(config.shares)
-    if near and len(shares) > 1:
-        shares[1] += EXCHANGE * HEAD_START * shares[0]
-        shares[0] -= HEAD_START * shares[0]
-    total, done, first, stages = sum(config.shares), 0.0, 0, []
-    for level, width, share in zip(config.levels, config.widths, shares):
-        done += share
-        last = round(config.iterations * done / total)
-        stages.append(Stage(level, width, first, last))
-        first = last
-    if settling:
-        more = max(1, round(SETTLING * first))
-        stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
-    return [stage for stage in stages if stage.last > stage.first]
+    initial: float
+    decay: float  #: the factor that the rate has reached at the end; it falls exponentially
+    start: float = -1.0  #: progress at which the rate begins to rise from 0; -1: it starts at full
+
+
+class Stepper(NamedTuple):
+    """An optimiser and the learning rate of each of its parameter groups."""
+
+    optimizer: torch.optim.Optimizer
+    rates: Sequence[Rate]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Stages, progress and what depends on progress."""
+
+    stages: tuple[Stage, ...]
+
+    @classmethod
+    def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
+        """The schedule of a fit with these settings. Stages without iterations are left out.
+
+        `near`: the fit starts near the object. `settling`: a last stage with a fixed surface is added.
+        """
+        shares = list(config.shares)
+        if near and len(shares) > 1:
+            shares[1] += EXCHANGE * HEAD_START * shares[0]
+            shares[0] -= HEAD_START * shares[0]
+        total, done, first, stages = sum(config.shares), 0.0, 0, []
+        for level, width, share in zip(config.levels, config.widths, shares):
+            done += share
+            last = round(config.iterations * done / total)
+            stages.append(Stage(level, width, first, last))
+            first = last
+        if settling:
+            more = max(1, round(SETTLING * first))
+            stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
+        return cls(tuple(stage for stage in stages if stage.last > stage.first))
+
+    @property
+    def iterations(self) -> int:
+        """Number of all iterations."""
+        return self.stages[-1].last
+
+    @property
+    def shaping(self) -> int:
+        """Number of iterations that shape the surface: all but those of the settling stage."""
+        return self.stages[-1].first if self.stages[-1].settles else self.iterations
+
+    @property
+    def final_level(self) -> int:
+        """Level of the icosphere in the last stage."""
+        return self.stages[-1].level
+
+    def surface_fixed(self, iteration: int) -> bool:
+        """Is the surface fixed in an iteration, counted from 0?"""
+        last = self.stages[-1]
+        return last.settles and last.first <= iteration < last.last
+
+    def masks_due(self, iteration: int) -> bool:
+        """Are masks to be refined before an iteration, counted from 0?"""
+        return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
+
+    def stage(self, iteration: int) -> Stage:
+        """The stage of an iteration, counted from 0."""
+        return next(stage for stage in self.stages if iteration < stage.last)
+
+    def progress(self, iteration: int) -> float:
+        """Share, in [0, 1], of the shaping iterations that are done before this one."""
+        return min(1.0, iteration / self.shaping)
+
+    def outline_blur(self, progress: float, width: float) -> float:
+        """Standard deviation [px] of the silhouettes' blur in photographs of this width; at least one pixel."""
+        return max(1.0, INITIAL_BLUR * (1 - progress / SHARP) * width)
+
+
+def learning_rate(rate: Rate, progress: float) -> float:
+    """The learning rate at this progress of a fit."""
+    return rate.initial * rate.decay**progress * min(1.0, max(0.0, (progress - rate.start) / RAMP))

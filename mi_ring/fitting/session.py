@@ -1,4 +1,4 @@
-"""A fit from its first iteration to its results: progress, log, checkpoints, signals, a disk that is full."""
+"""A fit from its first iteration to its results: progress, log, checkpoints, signals, full disks."""
 
 import contextlib
 import math
@@ -17,28 +17,30 @@ from mi_ring.fitting.budget import Costs, measure
 from mi_ring.fitting.checkpoint import BEFORE, digests, write_checkpoint
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.processes import Lost
+from mi_ring.fitting.processes import ProcessLost
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
 from mi_ring.output import results
+from mi_ring.output.fit_result import FitResult
 from mi_ring.system.command import SIGNALS
 from mi_ring.system.optional import installed
-from mi_ring.system.progress import outliving_readers, progress
+from mi_ring.system.progress import progress, tolerating_closed_output
 
 CHECKPOINT_SECONDS = 30.0
-WORTH_MEASURING = 60  #: iterations: shorter fits do without knowing how long theirs take
+INPUTS_LEVEL = 4  #: of the surface in inputs.png
+WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an iteration takes
 
 
 @contextlib.contextmanager
 def heeding_signals() -> Iterator[Callable[[], int]]:
-    """Yields a function that tells which signal has come that ends a fit, 0: none. A second Ctrl-C ends it at once.
+    """Yields a function that returns the first signal that ends a fit, 0: none. A second Ctrl-C ends it at once.
 
-    Shells, schedulers and the kernel send the others more than once.
+    Shells, schedulers and the kernel send the other signals more than once.
     """
     come: list[int] = []
 
     def hear(number: int, frame: object) -> None:
-        come.append(number)  # and no word: it may come in the midst of one
+        come.append(number)  # without printing: it may interrupt a print
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
@@ -51,20 +53,20 @@ def heeding_signals() -> Iterator[Callable[[], int]]:
 
 
 class Keeper:
-    """Writes into the folder of a fit what tells how far it is; what cannot be written now is tried again later.
+    """Writes log, checkpoints and results of a fit into its folder. What cannot be written now is tried again later.
 
-    Of several processes that of the first does.
+    Of several processes only the first one writes.
     """
 
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
         self.fit, self.folder, self.prepare = fit, folder, prepare
-        self.writes = fit.processes.rank == 0
-        self.files = digests(fit.capture, fit.config) if self.writes else {}
+        self.writes = fit.problem.processes.rank == 0
+        self.files = digests(fit.problem.given, fit.problem.config) if self.writes else {}
         self.saved, self.failing = -math.inf, False
 
     def follow(self, it: Iteration) -> None:
-        """Write log and checkpoint where they are due after this iteration: the first, each stage's last, in time."""
-        log = self.fit.log
+        """Write log and checkpoint if they are due after this iteration: regularly, and at the end of each stage."""
+        log = self.fit.course.log
         if not self.writes:
             return
         if log and log[-1]["iteration"] == it.number:
@@ -75,16 +77,16 @@ class Keeper:
             self.saved = time.monotonic()
 
     def checkpoint(self) -> None:
-        """Write one now, and the whole log. Raises InputError or OSError if that is not possible."""
+        """Write a checkpoint and the whole log now. Raises InputError or OSError if that is impossible."""
         if not self.writes:
             return
         if not self.folder.is_dir():  # somebody has removed it
             self.prepare()
-        results.write_log(self.folder, self.fit.log)
+        results.write_log(self.folder, self.fit.course.log)
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
-        """A fit does not end for it."""
+        """Call `write`; if it fails, tell the user once and go on."""
         try:
             write()
         except (InputError, OSError) as error:
@@ -95,30 +97,28 @@ class Keeper:
             self.failing = False
 
     def finish(self, fitted_scene: bytes) -> None:
-        """Write the results; if not where they were to go, then into a new folder among the system's temporary ones.
-
-        Raises InputError, even then, if they cannot be written where they were to go.
-        """
+        """Write the results; if that is impossible, write them to a new temporary folder and raise InputError."""
         if not self.writes:
             return
+        result = self.fit.result()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            results.write(self.folder, self.fit, fitted_scene)
+            results.write(self.folder, result, fitted_scene)
         except (InputError, OSError) as error:
-            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(fitted_scene)}") from error
+            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
-    def rescue(self, fitted_scene: bytes) -> str:
-        """Write checkpoint and results elsewhere, as far as that is possible. Returns where they are, in words."""
+    def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
+        """Write checkpoint and results elsewhere, as far as possible. Returns a sentence about where they are."""
         saved = ""
         try:
             elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
-            results.prepare_folder(elsewhere, self.fit.capture.path, self.fit.config.settings(), resume=True)
-            results.write_log(elsewhere, self.fit.log)
+            results.prepare_folder(elsewhere, result.given.path, result.settings, resume=True)
+            results.write_log(elsewhere, result.log)
             write_checkpoint(self.fit, self.files, elsewhere)
             saved = f"what could be written is in {elsewhere} instead, with a checkpoint"
             with contextlib.suppress(InputError, OSError):  # the scene may have gone with the folder
-                fitted_scene = results.fitted_scene(self.fit, elsewhere)
-            results.write(elsewhere, self.fit, fitted_scene)
+                fitted_scene = results.fitted_scene(result.given, result.ring, elsewhere)
+            results.write(elsewhere, result, fitted_scene)
         except (InputError, OSError):
             left = "what the last checkpoint there has is left, for --resume; make room or choose another place"
             return saved or left
@@ -128,25 +128,27 @@ class Keeper:
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
     """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
-        costs = measure(fit, [stage for stage in fit.stages if stage.last > fit.iteration], interrupted)
-    work = [(costs or {}).get((s.level, s.width), 1.0) for s in fit.stages for _ in range(s.first, s.last)]
+        left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
+        costs = fit.problem.processes.broadcast(measure(fit, left, interrupted))
+    stages = fit.schedule.stages
+    work = [(costs or {}).get((s.level, s.width), 1.0) for s in stages for _ in range(s.first, s.last)]
     bar = progress(
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",
     )  # fmt: skip
     if keeper.writes:
-        results.write_log(keeper.folder, fit.log)
+        results.write_log(keeper.folder, fit.course.log)
     come = 0
     with bar:
         while fit.iteration < fit.iterations and not (come := interrupted()):
-            retreats = fit.caution.retreats
+            retreats = fit.optimisation.guard.retreats
             it = fit.step()
-            if fit.caution.retreats > retreats:
+            if fit.optimisation.guard.retreats > retreats:
                 bar.write(f"Iteration {it.number}: loss, gradient or weights were not finite; going on from the last "
                           "ones that were, by smaller steps")  # fmt: skip
-            stage = fit.stages.index(it.stage) + 1
+            stage = stages.index(it.stage) + 1
             doing = ", light and material settle" * it.stage.settles
-            where = f"stage {stage}/{len(fit.stages)}{doing}, iteration {it.number}/{fit.iterations}"
+            where = f"stage {stage}/{len(stages)}{doing}, iteration {it.number}/{fit.iterations}"
             bar.set_description_str(where, refresh=False)
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
@@ -158,7 +160,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
 
 @contextlib.contextmanager
 def telling_how_to_go_on(folder: Path) -> Iterator[None]:
-    """Within it a second Ctrl-C, which drops what is being written, says what is left."""
+    """Context in which a second Ctrl-C, which drops the results, says how to resume."""
     try:
         yield
     except KeyboardInterrupt:
@@ -167,11 +169,16 @@ def telling_how_to_go_on(folder: Path) -> Iterator[None]:
         raise
 
 
+def write_inputs(fit: Fit, folder: Path) -> None:
+    """inputs.png: the start surface drawn over the photographs."""
+    results.write_inputs(folder / "inputs.png", fit.problem.capture, fit.renderer.showing(fit.model, INPUTS_LEVEL))
+
+
 def start_of(fit: Fit) -> str:
-    """What a fit starts from."""
+    """A description of the surface that a fit starts from."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
     if isinstance(domain, Sphere):
-        missing = fit.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")
+        missing = fit.problem.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")
         better = "; the masks' hull would be a better one, for which the package gpytoolbox is needed" * missing
         return f"a sphere of radius {float(fit.ring.radius):.4g} about {place}{better}"
     return f"a surface of genus {genus(trimesh.Trimesh(domain.points, domain.faces, process=False))} about {place}"
@@ -180,42 +187,42 @@ def start_of(fit: Fit) -> str:
 def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Costs | None = None) -> int:
     """Run a fit in a folder and write its results, whatever ends it.
 
-    Returns the signal that it was interrupted by, or 0. `prepare` makes the folder anew, should it vanish. `costs`: of
-    iterations, if they have been measured already.
+    Returns the signal that interrupted it, or 0. `prepare` makes the folder again if it is removed. `costs`: seconds of
+    an iteration, if they are known.
     """
-    processes = fit.processes
-    fitted_scene = processes.by_first(lambda: results.fitted_scene(fit, folder))
-    with heeding_signals() as heard, outliving_readers():
+    processes, model, config = fit.problem.processes, fit.model, fit.problem.config
+    fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))
+    with heeding_signals() as heard, tolerating_closed_output():
 
         def interrupted() -> int:
-            return processes.most(heard())
+            return processes.maximum(heard())
 
         somebody = getattr(sys.stdin, "isatty", bool)()
         keeps = "; Ctrl-C ends early and keeps what there is" * somebody
         print(f"{len(fit.capture)} photographs; results go to {folder}/{keeps}")
-        if fit.calibration:
-            print(f"Refined besides surface and material: {', '.join(fit.calibration.refined)}")
-        if fit.config.indirect and not fit.ring.indirect:
+        if model.calibration:
+            print(f"Refined besides surface and material: {', '.join(model.calibration.refined)}")
+        if config.indirect and not fit.ring.indirect:
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
-                  f"reflects {fit.albedo:.3g} times the light that it gets")  # fmt: skip
-        elif fit.albedo >= 1 and fit.calibration and "scale" in fit.calibration.refined:
-            print(f"By the lights' intensities the object reflects {fit.albedo:.3g} times the light that it gets: how "
-                  "strong they are is found by interreflection (--refine scale)")  # fmt: skip
+                  f"reflects {model.albedo:.3g} times the light that it gets")  # fmt: skip
+        elif model.albedo >= 1 and model.calibration and "scale" in model.calibration.refined:
+            print(f"By the lights' intensities the object reflects {model.albedo:.3g} times the light that it gets: "
+                  "how strong they are is found by interreflection (--refine scale)")  # fmt: skip
         if processes.count > 1:
             print(f"{processes.count} processes share the points and photographs of each iteration")
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
-            processes.by_first(lambda: results.write_inputs(folder / "inputs.png", fit))
+            processes.on_first(lambda: write_inputs(fit, folder))
         keeper = Keeper(fit, folder, prepare)
         with telling_how_to_go_on(folder):
             try:
                 train(fit, keeper, interrupted, costs)
-            except Lost:
+            except ProcessLost:
                 raise
             except Exception as error:
                 keeper.finish(fitted_scene)
                 if isinstance(error, InputError):  # in all processes: `torchrun` would end the first with the others
-                    processes.wait()
+                    processes.barrier()
                 raise
             keeper.finish(fitted_scene)
-        return interrupted() if fit.iteration < fit.iterations else processes.most(0)
+        return interrupted() if fit.iteration < fit.iterations else processes.maximum(0)

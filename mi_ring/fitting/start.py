@@ -1,4 +1,4 @@
-"""Where a fit starts: the networks, the surface that is deformed, and the sphere that normalises it."""
+"""The start of a fit: its networks, the surface that is deformed, and the sphere that normalises it."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -10,8 +10,9 @@ import torch
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import overall, refined_of
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import initial_power, refined_of
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
@@ -26,7 +27,7 @@ def require_settings(capture: Capture, config: Config) -> None:
     """Raise InputError for settings that do not go with a capture."""
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
-    if {"curve", "contrast"} & set(config.refine) and any(sensor.ambient for sensor in capture.sensors):
+    if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted by the curve that the scene says; leave out "
                          "--refine curve and contrast")  # fmt: skip
     if "masks" in config.refine and capture.threshold is not None:
@@ -37,25 +38,24 @@ def require_settings(capture: Capture, config: Config) -> None:
                          "the photographs' own lights; leave it out, or find them all by --light lamps")  # fmt: skip
 
 
-def starting_ring(
-    capture: Capture, config: Config, exposure: float, networks: tuple[Flow, MaterialNet] | None
-) -> FittedObject:
-    """The networks before the first iteration, on the surface that a fit of these photographs starts from.
+def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
+    """The object before the first iteration. `networks`: (Shape-Net, BRDF-Net) in place of the default ones.
 
-    `exposure`: radiance of the object in them.
+    Raises InputError if capture, settings and networks do not go together.
     """
+    capture, config, light = problem.seen, problem.config, problem.lighting.kind
     domain, center, radius = starting_surface(capture, config.domain)
     require_view_from_outside(capture, domain, center, radius)
-    parameters, bsdf = predicted_parameters(capture.path, capture.shape, config.parameters)
-    if config.light != "capture":
+    parameters, bsdf = predicted_parameters(capture, config.parameters)
+    if light != "capture":
         bsdf = with_fresnel(bsdf)
-    scale = capture.reflectance(center, exposure)
+    scale = capture.reflectance(center, problem.exposure)
     bounded = all(math.isfinite(p.high) for p in parameters)
     if math.pi * scale >= 1 and bounded:
         raise InputError(f"{capture.path}: emitter: by the lights' intensities the object reflects "
                          f"{math.pi * scale:.3g} times the light that it gets, which the ranges of --parameters do "
                          "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
-    refined = refined_of(capture, config, math.pi * scale)
+    refined = refined_of(capture, config, light, math.pi * scale)
     if "scale" in refined and (bounded or not config.indirect):
         raise InputError(f"{capture.path}: --refine scale: what the power of the lights is tells interreflection "
                          "alone, and a reflectance without bounds; it goes neither with --no-indirect nor with "
@@ -63,7 +63,7 @@ def starting_ring(
     if "scale" in refined and has_table(capture.scene):
         raise InputError(f"{capture.path}: --refine scale: the scene has a table, whose reflectance tells how strong "
                          "the lights are; leave scale out, or remove the table")  # fmt: skip
-    scale /= overall(refined, math.pi * scale)
+    scale /= initial_power(refined, math.pi * scale)
     indirect = config.indirect and math.pi * scale < 1
     if networks:
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
@@ -71,18 +71,18 @@ def starting_ring(
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
         networks[1].set_parameters(parameters, scale)
     else:
-        networks = (shape_net_of(config.shape_net, config.steps, config.solver, config.encoding, config.frequencies),
+        networks = (shape_net_of(config.shape_net, config.steps, config.encoding, config.frequencies),
                     BRDFNet(scale, parameters, config.encoding, config.frequencies))  # fmt: skip
     ring = FittedObject(center, radius, scale, domain, parameters, bsdf, indirect, config.steps, config.subdivisions,
-                networks, capture.shape.ground, capture.shape.up, capture.shape.metres, config.material_at)  # fmt: skip
+                networks, capture.shape.ground, capture.shape.up, capture.shape.metres)  # fmt: skip
     require_networks(ring)
     return ring
 
 
 def with_fresnel(bsdf: str) -> str:
-    """A `cooktorrance` as XML, that reflects more at grazing angles unless it says something of that itself.
+    """A `cooktorrance` as XML, with the Fresnel term unless the XML decides about it.
 
-    A flash at the camera does not see it, light from the other side does.
+    Under a flash at the camera the term does not matter. Under light from the other side it does.
     """
     element = ElementTree.fromstring(bsdf)
     if element.find("boolean[@name='fresnel']") is None:
@@ -91,7 +91,7 @@ def with_fresnel(bsdf: str) -> str:
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
-    """The domain of a fit and the sphere that normalises it: what `--domain` asks for, else what the scene says."""
+    """The domain of a fit, and centre and radius of the normalising sphere: by `--domain`, else by the scene."""
     shape = capture.shape
     if isinstance(choice, tuple):
         return closed_domain(load_closed_mesh(choice[1], "--domain"), shape.center, shape.radius)
@@ -102,11 +102,11 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     except InputError:
         if choice == "hull" or shape.center is None or shape.radius is None:
             raise
-        surface = None  # the masks are of no use, but the scene says where the object is
+        surface = None  # the masks make no hull, but the scene says where the object is
     if surface is None and choice == "hull":
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip
-    # Where the hull has no handles and what it takes to start from one is missing, a sphere does, too.
+    # Without the package for remeshing, a sphere is good enough in place of a hull without handles.
     if surface is not None and (choice == "hull" or installed("gpytoolbox") or genus(surface)):
         return closed_domain(surface, shape.center, shape.radius)
     return Sphere(), *capture.sphere()
@@ -114,20 +114,20 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
     """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
-    cameras, lights = [sensor.camera for sensor in capture.sensors], capture.photographs.lights
+    cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
     surface = center + radius * domain.points
     ahead = [((surface - camera.position) @ camera.forward).max() for camera in cameras]
     if min(ahead) < 0:
-        sensor = capture.sensors[int(np.argmin(ahead))]
-        raise InputError(f'{capture.path}: photograph "{sensor.id()}", to_world: its camera looks away from the '
+        shot = capture.shots[int(np.argmin(ahead))]
+        raise InputError(f'{capture.path}: photograph "{shot.name}", to_world: its camera looks away from the '
                          "surface that the fit starts from; see python -m mi_ring.check")  # fmt: skip
     places = {"to_world: its camera": np.stack([camera.position for camera in cameras]),
               "emitter: its light": np.where(lights.is_finite()[:, None], lights.positions(), np.inf)}  # fmt: skip
     for what, points in places.items():
         if (inside := domain.contains((points - center) / radius)).any():
-            sensor = capture.sensors[int(inside.argmax())]
+            shot = capture.shots[int(inside.argmax())]
             raise InputError(
-                f'{capture.path}: photograph "{sensor.id()}", {what} is inside the surface that the fit starts from, '
+                f'{capture.path}: photograph "{shot.name}", {what} is inside the surface that the fit starts from, '
                 f"of radius {radius:.4g} about ({', '.join(f'{c:.4g}' for c in center)}); check its place and units"
             )
 

@@ -1,104 +1,87 @@
-"""Photographs that are kept out of a fit: does what was refined explain them better?
+"""Validation on held-out photographs: does what was refined explain them better?
 
-Surface and material stay as they were fitted, together with what was refined: that is a judgement of them all, and what
-is put back is not made up for.
+Surface and material stay as they were fitted together with what was refined. So the result judges all of it together,
+and what is reset is not fitted again.
 """
 
 import copy
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
 
-from mi_ring.capture.capture import Capture
+from mi_ring.calibration.unknowns import UNKNOWNS
 from mi_ring.capture.decoding import recorded
-from mi_ring.errors import InputError
-from mi_ring.fitting.calibration import OF_ONE, UNKNOWNS
-from mi_ring.rendering import bridge
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.renderer import Renderer
+from mi_ring.rendering import prediction
 
-if TYPE_CHECKING:
-    from mi_ring.fitting.fit import Fit
-
-#: Of all photographs; what is of one is not known where it is out.
-SHARED = set(UNKNOWNS) - OF_ONE
-WIDTH, SPP, MOST = 256, 4, 16  #: of the pictures that are compared, and how many of them
+COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared
+#: Options that are refined for single photographs, and so are unknown of those that are held out.
+PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per == "photograph"}
 
 
-def kept_out(capture: Capture, every: int) -> np.ndarray:
-    """Indices of one photograph of so many, from the middle of the first so many on; none if `every` is 0.
+def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
+    """Mean absolute error on the object in held-out photographs, as a share of its light; NaN if it is not seen.
 
-    Raises InputError if that is none or all of them.
+    Each photograph is compared at its best exposure. `level`: of the surface.
     """
-    several = len(capture)
-    found = np.arange(several)[every // 2 :: every] if every else np.arange(0)
-    if every and several < 2:
-        raise InputError(f"{capture.path}: --holdout: there is one photograph alone; leave it out")
-    if every and not 0 < len(found) < several:
-        raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(found)} of {several} photographs "
-                         f"out; give 2 to {2 * several - 1}")  # fmt: skip
-    return found
-
-
-def unexplained(fit: "Fit", capture: Capture) -> float:
-    """Share of the object's light in photographs that are kept out, each at its best exposure, that is not predicted.
-
-    The surface must have been shown. `capture`: with the calibration that is asked about.
-    """
-    shares = []
-    for k in fit.held_out[:: -(-len(fit.held_out) // MOST)]:
-        scale = -(-capture.sensors[k].size[0] // WIDTH)
-        rgb, coverage = bridge.draw(fit.surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
-                                    indirect=fit.ring.indirect)  # fmt: skip
-        seen, sensor = capture.observe([k], scale), capture.sensors[k]
+    capture, shares = model.calibrated(problem.capture), []
+    surface = renderer.showing(model, level)
+    for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
+        shot = capture.shots[k]
+        scale = -(-shot.size[0] // COMPARED_WIDTH)
+        rgb, coverage = prediction.draw(surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
+                                    indirect=model.ring.indirect)  # fmt: skip
+        seen = capture.observe([k], scale)
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)
-        observed, predicted = (recorded(linear[0].numpy(), sensor, scale)[inside[0]] for linear in (seen.rgb, rgb))
+        observed, predicted = (recorded(linear[0].numpy(), shot, scale)[inside[0]] for linear in (seen.rgb, rgb))
         if len(observed):
             factor = (observed * predicted).sum() / max((predicted**2).sum(), 1e-12)
             shares.append(float(np.abs(factor * predicted - observed).sum() / observed.sum()))
     return float(np.mean(shares)) if shares else np.nan
 
 
-def confirm(fit: "Fit") -> dict:
-    """Put back what was refined for all photographs and explains those that were kept out no better than before.
+@torch.no_grad()
+def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Any]:
+    """Reset each option of `--refine` whose values do not explain held-out photographs better than the capture's.
 
-    Returns what is unexplained of them (`unexplained`; `before`: with all unknowns as they began, but this surface) and
-    what was `put_back`; nothing is unexplained nor put back where they show nothing that is surely the object.
+    Returns `unexplained` of the result; `before`: the same with all unknowns as the capture says; `put_back`: the
+    options that were reset. The numbers are missing if held-out photographs do not show the object.
     """
-    calibration = fit.calibration
+    calibration = model.calibration
 
-    def unexplained_now() -> float:
-        fit.follow_power()
-        fit.surface.show(fit.ring, *fit.ring.domain.sample(fit.stages[-1].level))
-        return unexplained(fit, fit.calibrated())
+    def now() -> float:
+        model.update_albedo()
+        return unexplained(problem, model, renderer, level)
 
-    now = unexplained_now()
-    if math.isnan(now):
+    found = now()
+    if math.isnan(found):
         return {"put_back": []}
-    back: list[str] = []
     if calibration is None:
-        return {"unexplained": now, "put_back": back}
-    for name in [name for name in calibration.refined if name in SHARED]:
-        unknowns = [calibration.unknown(own) for own in UNKNOWNS[name] or [name]]
-        found = [unknown.detach().clone() for unknown, _ in unknowns]
-        if all(torch.equal(one, given) for one, (_, given) in zip(found, unknowns)):  # nothing could be put back
+        return {"unexplained": found, "put_back": []}
+    reset: list[str] = []
+    for option in [option for option in calibration.refined if option not in PER_PHOTOGRAPH]:
+        pairs = calibration.current_and_given(option)
+        if all(torch.equal(current, given) for current, given in pairs):
             continue
-        with torch.no_grad():
-            for unknown, given in unknowns:
-                unknown.copy_(given)
-            without = unexplained_now()
-            if without <= now:
-                now, back = without, [*back, name]
-            else:
-                for one, (unknown, _) in zip(found, unknowns):
-                    unknown.copy_(one)
-                fit.follow_power()
-    found_by_now = copy.deepcopy(calibration.state_dict())
-    with torch.no_grad():
-        for name in (*calibration.widths, "ambient"):
-            unknown, given = calibration.unknown(name)
-            unknown.copy_(given)
-        before = unexplained_now()
-    calibration.load_state_dict(found_by_now)
-    fit.follow_power()
-    return {"unexplained": now, "before": before, "put_back": back}
+        refined = [current.clone() for current, _ in pairs]
+        for current, given in pairs:
+            current.copy_(given)
+        without = now()
+        if without <= found:
+            found, reset = without, [*reset, option]
+        else:
+            for (current, _), value in zip(pairs, refined):
+                current.copy_(value)
+            model.update_albedo()
+    result = copy.deepcopy(calibration.state_dict())
+    for option in {*calibration.refined, "ambient"}:
+        for current, given in calibration.current_and_given(option):
+            current.copy_(given)
+    before = now()
+    calibration.load_state_dict(result)
+    model.update_albedo()
+    return {"unexplained": found, "before": before, "put_back": reset}

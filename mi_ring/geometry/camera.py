@@ -1,4 +1,4 @@
-"""Cameras, pinholes or with a lens, as numpy arrays: the twin of `mi_ring.rendering.pinhole`."""
+"""Cameras, with or without lens distortion, as numpy arrays; `mi_ring.rendering.pinhole` is the same in Dr.Jit."""
 
 from typing import Any, NamedTuple
 
@@ -6,67 +6,67 @@ import numpy as np
 
 from mi_ring.errors import InputError
 
-#: Of `distortion` times the squared distance of a picture's corner from its centre [focal lengths²]: below −4/27 the
-#: lens folds the picture and shows things twice; up to here Newton's method leaves less than a millionth.
-LEAST, MOST = 0.9 * -4 / 27, 10.0
-NEWTON = 6  #: steps
+#: Limits of `distortion` · r², where r is the distance of a corner of the picture from its centre [focal lengths].
+#: Below −4/27 the lens folds: it shows some points twice. Above 10, Newton's method leaves an error of over 1e-6.
+MIN_DISTORTION, MAX_DISTORTION = 0.9 * -4 / 27, 10.0
+NEWTON_STEPS = 6
+FARTHEST = 50  #: sizes of the picture from which a principal point may be
 
 
 class NoParallax(InputError):
-    """All cameras are in one place or look along one line: they do not say how far the object is."""
+    """All cameras are at one place or look along one line, so that the object's distance is unknown."""
 
 
 def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """A camera-to-world pose (4, 4) in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
-    there = np.eye(4)
-    there[:3, :3] = rotation @ pose[:3, :3]
-    there[:3, 3] = scale * rotation @ pose[:3, 3] + shift
-    return there
+    """A camera-to-world pose (4, 4) after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,)."""
+    moved = np.eye(4)
+    moved[:3, :3] = rotation @ pose[:3, :3]
+    moved[:3, 3] = scale * rotation @ pose[:3, 3] + shift
+    return moved
 
 
-def straightening(distortion: Any, distance2: Any) -> Any:
-    """The factor by which a pinhole would have a point of a photograph nearer the centre, or farther, than a lens has.
+def undistortion_factor(distortion: Any, distance2: Any) -> Any:
+    """The factor that removes lens distortion from a point's vector from the picture's centre.
 
-    `distance2`: the point's squared distance from the centre [focal lengths²], as photographed. It solves
-    s (1 + `distortion` s² `distance2`) = 1 by Newton's method, within `LEAST` and `MOST`; for arrays of numpy, torch
-    and Dr.Jit alike.
+    `distance2` is the squared length of the distorted vector [focal lengths²]. The factor s solves
+    s (1 + `distortion` s² `distance2`) = 1 by Newton's method, between `MIN_DISTORTION` and `MAX_DISTORTION`. Arguments
+    are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     factor = 1 / (1 + k)
-    for _ in range(NEWTON):
+    for _ in range(NEWTON_STEPS):
         factor = factor - (factor + k * factor**3 - 1) / (1 + 3 * k * factor**2)
     return factor
 
 
-def bending(distortion: Any, distance2: Any) -> tuple[Any, Any]:
-    """The factor by which a lens has a point farther from the centre, or nearer, than a pinhole; and does it show it?
+def distortion_factor(distortion: Any, distance2: Any) -> tuple[Any, Any]:
+    """The factor by which lens distortion scales a point's vector from the picture's centre; and is the point visible?
 
-    `distance2`: the point's squared distance from the centre [focal lengths²], in a pinhole's picture. Beyond where the
-    lens folds it shows nothing. For arrays of numpy, torch and Dr.Jit alike.
+    `distance2` is the squared length of the undistorted vector [focal lengths²]. A point is not visible beyond the
+    distance at which the lens folds. Arguments are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     return 1 + k, 1 + 3 * k > 0
 
 
 def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
-    """Least and most distortion (...) of lenses by whose pictures' corners `straightening` works.
+    """The lowest and the highest distortion (...) that `undistortion_factor` can remove in the whole picture.
 
-    `focal`, `centre`, `size` (..., 2) [px], of numpy or torch.
+    `focal`, `centre`, `size`: (..., 2) [px], of numpy or torch.
     """
     corner = (abs(centre - size / 2) + size / 2) / focal
     corner2 = (corner**2).sum(-1)
-    return LEAST / corner2, MOST / corner2
+    return MIN_DISTORTION / corner2, MAX_DISTORTION / corner2
 
 
 class Camera(NamedTuple):
-    """A camera. The picture spans [0, W] × [0, H], x right, y down: the first pixel's centre is (0.5, 0.5)."""
+    """A camera. The picture spans [0, W] × [0, H], x right, y down; the first pixel's centre is (0.5, 0.5)."""
 
     to_world: np.ndarray  #: (4, 4) camera-to-world, Mitsuba's axes: x left, y up, z forward
     focal: np.ndarray  #: (2,) focal lengths [px]
     centre: np.ndarray  #: (2,) principal point [px]
     size: tuple[int, int]  #: (width, height) [px]
-    #: First radial one of the lens: what a pinhole has at r focal lengths from the centre is 1 + distortion · r² times
-    #: as far from it.
+    #: First radial coefficient of the lens: a point at r focal lengths from the centre moves to r (1 + distortion r²).
     distortion: float = 0.0
 
     @property
@@ -76,7 +76,7 @@ class Camera(NamedTuple):
 
     @property
     def forward(self) -> np.ndarray:
-        """(3,) where it looks, unit length."""
+        """(3,) viewing direction, unit length."""
         return self.to_world[:3, 2]
 
     @property
@@ -86,33 +86,33 @@ class Camera(NamedTuple):
 
     @property
     def projection(self) -> np.ndarray:
-        """(3, 4): of a point (x, y, z, 1) pixel coordinates times depth, and depth; without distortion."""
+        """(3, 4) maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth); without distortion."""
         across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
         rows = np.column_stack([across, self.forward]).T
         return np.column_stack([rows, -rows @ self.position])
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit directions (n, 3) in the world through pixel coordinates (n, 2)."""
+        """Unit directions (n, 3) in the world of the rays through pixel coordinates (n, 2)."""
         x, y = self.undistorted((pixels - self.centre) / self.focal).T
         d = np.stack([-x, -y, np.ones_like(x)], 1) @ self.to_world[:3, :3].T
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def undistorted(self, places: np.ndarray) -> np.ndarray:
-        """Where a pinhole would have what is photographed at places (..., 2), from the centre [focal lengths]."""
+        """Vectors (..., 2) from the picture's centre [focal lengths] without lens distortion."""
         if not self.distortion:
             return places
-        return places * straightening(self.distortion, np.square(places).sum(-1, keepdims=True))
+        return places * undistortion_factor(self.distortion, np.square(places).sum(-1, keepdims=True))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates (n, 2), and depths (n,) along the optical axis [scene units], of points (n, 3).
+        """Pixel coordinates (n, 2) and depths (n,) along the optical axis [scene units] of points (n, 3).
 
-        NaN beyond where a lens folds: it does not show what is farther out.
+        Pixel coordinates are NaN beyond the distance from the centre at which the lens folds.
         """
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
-        with np.errstate(divide="ignore", invalid="ignore"):  # where the depth is 0
+        with np.errstate(divide="ignore", invalid="ignore"):  # the depth may be 0
             places = np.stack([x, y], 1) / z[:, None]
-            factor, shown = bending(self.distortion, np.square(places).sum(1, keepdims=True))
-            places *= np.where(shown, factor, np.nan)
+            factor, visible = distortion_factor(self.distortion, np.square(places).sum(1, keepdims=True))
+            places *= np.where(visible, factor, np.nan)
             return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:
@@ -123,15 +123,36 @@ class Camera(NamedTuple):
         return (1 + np.square(places).sum(-1)) ** -0.5
 
     def shrunk(self, scale: int) -> "Camera":
-        """Of the same photograph, `scale` times smaller."""
+        """The camera of the same photograph at 1 / `scale` of its size."""
         size = self.size[0] // scale, self.size[1] // scale
         return self._replace(focal=self.focal / scale, centre=self.centre / scale, size=size)
 
+    @property
+    def key(self) -> tuple[bytes, ...]:
+        """Equal for equal cameras: a key for dictionaries."""
+        return tuple(np.asarray(part).tobytes() for part in self)
+
+    def fault(self) -> str | None:
+        """What is wrong with principal point, distortion or pose, as a scene file names them; None if nothing is."""
+        if (far := np.abs(self.centre / np.array(self.size))).max() > FARTHEST:
+            k = int(far.argmax())
+            return (f"{('cx', 'cy')[k]} is {self.centre[k]:g}, which is more than {FARTHEST} times its film away; is "
+                    "it in pixels?")  # fmt: skip
+        least, most = distortion_range(self.focal, self.centre, np.array(self.size))
+        if not least <= self.distortion <= most:
+            return (f"distortion is {self.distortion:.6g}, must be within {least:.6g} and {most:.6g}: below, its "
+                    "corners would show what is elsewhere, too")  # fmt: skip
+        rotation = self.to_world[:3, :3]
+        rigid = np.isfinite(self.to_world).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+        if not rigid or np.linalg.det(rotation) < 0:
+            return "to_world must be a rotation and a translation, without scale or mirror"
+        return None
+
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
-    """The point (3,) closest in the least-squares sense to lines (n, 3) + t (n, 3).
+    """The point (3,) nearest to lines `origins` (n, 3) + t · `directions` (n, 3), in the least-squares sense.
 
-    Raises NoParallax, a message about `what`, if the lines do not determine one.
+    Raises NoParallax, whose message begins with `what`, if the lines do not determine a point.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]

@@ -1,4 +1,4 @@
-"""The visual hull: all points that are inside the masks, where a fit starts."""
+"""The visual hull of masks: all points whose projections are inside the masks. A fit may start from it."""
 
 import math
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera, bending, nearest_point
+from mi_ring.geometry.camera import Camera, distortion_factor, nearest_point
 
-SHOWN = 0.25  #: share of the photographs that must show a point, else it is outside
-MOST, WIDTH = 128, 512  #: silhouettes, and pixels across each; more add little
+MIN_SHARE = 0.25  #: of the photographs must show a point; otherwise it is outside
+MAX_MASKS, MAX_WIDTH = 128, 512  #: number of silhouettes, and their width [px]; more improve the hull little
 
 
 class NoHull(InputError):
@@ -29,47 +29,45 @@ class Silhouette(NamedTuple):
     mask: np.ndarray  #: (H, W) uint8, object above 127
     camera: Camera
     name: str  #: for messages
-    valid: np.ndarray | None = None  #: (H, W) uint8: it says nothing of pixels up to 127. None: of all it does
+    valid: np.ndarray | None = None  #: (H, W) uint8: the mask is unknown where this is 127 or less. None: nowhere
 
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """A mask (H, W) uint8 with so many pixels across, at most, and how many of its own are one of these across."""
+    """A mask (H, W) uint8 reduced by a whole factor to at most this `width` [px]; and the factor."""
     scale = -(-mask.shape[1] // width)
-    if scale == 1:
-        return mask, 1
     height, width = (n // scale for n in mask.shape)
     blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
     return blocks.mean((1, 3)).astype(np.uint8), scale
 
 
-def small_silhouette(silhouette: Silhouette, width: int = WIDTH) -> Silhouette:
-    """With so many pixels across, at most."""
+def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouette:
+    """A silhouette reduced to at most this `width` [px]."""
     mask, scale = shrink_mask(silhouette.mask, width)
     valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
     return silhouette._replace(mask=mask, camera=silhouette.camera.shrunk(scale), valid=valid)
 
 
-def evenly(count: int, most: int) -> list[int]:
-    """Indices of at most `most` of so many things, evenly spread."""
-    taken = min(most, count)
-    return [k * count // taken for k in range(taken)]
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most `most` indices, evenly spaced in 0 … count − 1."""
+    number = min(most, count)
+    return [k * count // number for k in range(number)]
 
 
-def thinned(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
-    """At most so many of them, evenly, each with so many pixels across, at most."""
-    return [small_silhouette(silhouettes[k], width) for k in evenly(len(silhouettes), most)]
+def subsample(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
+    """At most `most` of the silhouettes, evenly spaced, each reduced to at most this `width` [px]."""
+    return [small_silhouette(silhouettes[k], width) for k in evenly_spaced(len(silhouettes), most)]
 
 
 class Hull:
-    """The visual hull of silhouettes. Raises InputError if there is none.
+    """The visual hull of silhouettes. Messages begin with `what`. Raises InputError if a silhouette is empty.
 
-    `center` (3,) and `reach` are those of a ball that holds it [scene units]. `wrong` is the share of the silhouettes
-    that may be wrong about a point.
+    `center` (3,) and `reach` are the centre and the radius of a ball that contains it [scene units]. A point may be
+    outside the share `outliers` of the silhouettes, so that a few faulty masks do no harm.
     """
 
-    def __init__(self, silhouettes: Sequence[Silhouette], what: str, wrong: float = 0.02) -> None:
-        self.silhouettes = thinned(silhouettes, MOST, WIDTH)
-        self.what, self.wrong = what, wrong
+    def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:
+        self.silhouettes = subsample(silhouettes, MAX_MASKS, MAX_WIDTH)
+        self.what, self.outliers = what, outliers
         self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
         origins = np.stack([s.camera.position for s in self.silhouettes])
         rays = [self.rays(s) for s in self.silhouettes]
@@ -79,49 +77,48 @@ class Hull:
 
     @staticmethod
     def rays(silhouette: Silhouette) -> np.ndarray:
-        """Directions (n, 3) through the pixels of a mask."""
+        """Unit directions (n, 3) of the rays through the pixels of a mask."""
         rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
             raise InputError(f"{silhouette.name}: mask: nothing in it, or next to nothing: no pixels above 127")
         return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
 
     def depth(self, points: Tensor) -> Tensor:
-        """About how deep each point (N, 3) is inside the hull [scene units]; negative outside.
+        """Approximate signed distance of points (N, 3) from the hull's surface [scene units]; positive inside.
 
-        The distance from the outline, at the depth of the point, in the silhouette where it is smallest. So that a
-        faulty one does no harm some may be wrong. What lies outside a photograph it knows nothing of; but what few
-        photographs show is not the object.
+        It is the smallest distance from the outline in any silhouette, at the depth of the point, without outliers.
+        Photographs that do not show the point are not counted. A point that few photographs show is outside.
         """
-        worst = math.floor(self.wrong * len(self.silhouettes)) + 1
+        worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
         for (mask, camera, _, valid), distance in zip(self.silhouettes, self.distances):
             matrix, focal, centre = (torch.tensor(a, dtype=torch.float32) for a in camera[:3])
             local = (points - matrix[:3, 3]) @ matrix[:3, :3]
-            z = local[:, 2]
-            across = local[:, :2]
+            z, across = local[:, 2], local[:, :2] / local[:, 2:]
             if camera.distortion:
-                factor, shows = bending(camera.distortion, (across / z[:, None]).square().sum(1, keepdim=True))
-                across = across * torch.where(shows, factor, torch.nan)
-            place = (centre - focal * across / z[:, None]) / torch.tensor(mask.shape[::-1])  # in [0, 1]
+                factor, visible = distortion_factor(camera.distortion, across.square().sum(1, keepdim=True))
+                across = across * torch.where(visible, factor, torch.nan)
+            size = torch.tensor(mask.shape[::-1])
+            place = (centre - focal * across) / size  # in [0, 1]
             seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
             if valid is not None:
-                row, column = (place * torch.tensor(mask.shape[::-1])).nan_to_num(-1).long().flip(1).T
+                row, column = (place * size).nan_to_num(-1).long().flip(1).T
                 row, column = row.clamp(0, mask.shape[0] - 1), column.clamp(0, mask.shape[1] - 1)
                 seen &= torch.from_numpy(valid > 127)[row, column]
             inside = F.grid_sample(distance[None, None], 2 * place[None, None] - 1, align_corners=False)[0, 0, 0]
             deep = torch.where(seen, inside * z / focal.mean(), torch.inf)
-            for low in lowest:  # in order, so that each hands on what is more than it keeps
+            for low in lowest:  # insert into the sorted rows; the larger value goes on to the next row
                 deep, low[:] = torch.maximum(low, deep), torch.minimum(low, deep)
             shown += seen
-        return torch.where(shown >= SHOWN * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
+        return torch.where(shown >= MIN_SHARE * len(self.silhouettes), lowest[-1], -self.reach).clamp(max=self.reach)
 
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """By how much the hull misses silhouettes, by default those that it is made of: (N, pixels) [px], above 0.
+        """By how much the projected hull misses silhouettes, by default its own: distances (N, pixels) [px], 0 or more.
 
-        Of so many pixels of each mask, or of its outline, how far the nearest of the hull is: 0 where the other
-        silhouettes leave something of what is behind the pixel.
+        For random `pixels` of each mask, or of its `outline`: the distance from the hull to the ray through the pixel,
+        sampled at `samples` points.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
@@ -140,18 +137,17 @@ class Hull:
         return np.array(result)
 
     def grid(self, low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
-        """Points (N, 3) and the shape of the grid that they form."""
+        """The points (N, 3) of a grid between two corners (3,), and its shape."""
         axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
         return torch.cartesian_prod(*axes), tuple(map(len, axes))
 
     def require(self, inside: int) -> None:
         """Raise NoHull if no point was found inside."""
         if not inside:
-            raise NoHull(f"{self.what}: mask: no point in space is inside all masks; "
-                         "check to_world, fx, fy, cx, cy")  # fmt: skip
+            raise NoHull(f"{self.what}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
 
     def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
-        """The hull's centre of mass (3,) and the radius of the ball of its volume [scene units]."""
+        """The hull's centre of mass (3,) and the radius of the ball of equal volume [scene units]."""
         spacing = 2 * self.reach / (resolution - 1)
         points, _ = self.grid(self.center - self.reach, self.center + self.reach, spacing)
         inside = points[self.depth(points) > 0].double()
@@ -159,7 +155,7 @@ class Hull:
         return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
 
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
-        """Closed surface of the largest piece [scene units], by marching cubes, so many along the longest side."""
+        """The closed surface of the largest piece [scene units], by marching cubes; `resolution` is along its side."""
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)
@@ -171,10 +167,10 @@ class Hull:
         points, shape = self.grid(low, high, fine)
         index = (points.numpy() - (self.center - self.reach)).T / spacing
         depth = torch.from_numpy(scipy.ndimage.map_coordinates(coarse, index, order=1, mode="nearest"))
-        near = depth.abs() < 2 * spacing  # elsewhere nothing but the sign matters
+        near = depth.abs() < 2 * spacing  # elsewhere only the sign matters
         depth[near] = self.depth(points[near])
         field = depth.reshape(shape).numpy().clip(-3 * fine, 3 * fine)
-        field = np.pad(scipy.ndimage.gaussian_filter(field, 1.0), 1, constant_values=-fine)  # closed at the border, too
+        field = np.pad(scipy.ndimage.gaussian_filter(field, 1.0), 1, constant_values=-fine)  # closed at the border
         self.require(int((field > 0).sum()))
         vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
         mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
@@ -182,7 +178,7 @@ class Hull:
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance of each pixel's centre from the outline of a mask (H, W) [px], above 0 inside."""
+    """The distance of each pixel's centre from the outline of a mask (H, W) [px]; positive inside."""
     inside = mask > 127
     edge = scipy.ndimage.distance_transform_edt
     return np.where(inside, edge(inside) - 0.5, 0.5 - edge(~inside)).astype(np.float32)

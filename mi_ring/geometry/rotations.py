@@ -5,9 +5,9 @@ from torch import Tensor
 
 
 def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """(P, 3, 3) quarter turns about the optical axis that take the first of places (P, 3) next to each.
+    """(P, 3, 3) rotations by multiples of 90° about the optical axis that bring the first of places (P, 3) to each.
 
-    The identity where they are `near` each other already.
+    It is the identity for places that are closer than `near` to the first.
     """
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
     turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
@@ -16,7 +16,7 @@ def quarter_turns(places: Tensor, near: float) -> Tensor:
 
 
 def rotations(vectors: Tensor) -> Tensor:
-    """(P, 3, 3) rotation matrices of rotation vectors (P, 3) [rad]."""
+    """Rotation matrices (P, 3, 3) from rotation vectors (P, 3) [rad]; differentiable."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3))

@@ -6,14 +6,14 @@ from os.path import splitext
 from pathlib import Path
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import require_survival
+from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import existing
 from mi_ring.system.optional import need
 
-#: Code that reads a model, for `require_survival`.
+#: Code that reads a model, for `require_readable`.
 READ_MODEL = """
 import pycolmap
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL
@@ -23,9 +23,9 @@ pycolmap.Reconstruction(sys.argv[1])
 
 @dataclass(frozen=True)
 class Colmap(Photogrammetry):
-    """COLMAP, text or binary; the light is beside the camera.
+    """COLMAP, text or binary. The light is beside the camera.
 
-    SRC is the folder of the model (cameras, images), or one that holds it as sparse/0 or sparse.
+    SRC is the folder of the model (cameras, images), or a folder that has the model in sparse/0 or sparse.
     """
 
     @staticmethod
@@ -40,7 +40,7 @@ class Colmap(Photogrammetry):
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
         pycolmap = need("pycolmap", f"{model}")
         if size := sum(file.stat().st_size for file in model.glob("*.bin")):
-            require_survival(READ_MODEL, model, size, "a COLMAP model")
+            require_readable(READ_MODEL, model, size, "a COLMAP model")
         try:
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # the exception repeats what it logs
             reconstruction = pycolmap.Reconstruction(str(model))

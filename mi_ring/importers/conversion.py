@@ -7,6 +7,7 @@ from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_ele
 from mi_ring.errors import InputError
 from mi_ring.importers.frames import Frame, Source, frames_of, require_frames
 from mi_ring.importers.writer import Writer, write_frame
+from mi_ring.scene.shot import Shot
 from mi_ring.system.progress import progress
 
 
@@ -19,7 +20,7 @@ def write_scene(source: Source) -> list[Frame]:
     names = [frame.name or frame.image.stem for frame in frames]
     if len({*names, "object"}) <= len(names):
         names = [f"{k:0{len(str(len(frames)))}}_{name}" for k, name in enumerate(names)]
-    root = scene_element([])
+    root = scene_element()
     if source.scene.suffix != ".xml" or source.scene.exists():
         what = "exists already; give another name" if source.scene.exists() else "must end in .xml"
         raise InputError(f"{source.scene}: SCENE.xml: {what}")
@@ -28,8 +29,8 @@ def write_scene(source: Source) -> list[Frame]:
             for frame, name in zip(progress(frames, "converting", unit="photograph", disable=None), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
                 files = write_frame(writer, frame, name, source.copy, encoding)
-                root.append(photograph_element(name, files.filename, frame.camera, frame.light, files.mask, encoding,
-                                               frame.saturation, files.valid))  # fmt: skip
+                root.append(photograph_element(Shot(name, frame.camera, frame.light, files=files, encoding=encoding,
+                                                    saturation=frame.saturation)))  # fmt: skip
             if truth := getattr(source, "truth", None):
                 writer.write("truth/mesh.ply", lambda file: shutil.copyfile(truth, file))
             writer.finish(scene_bytes(root))

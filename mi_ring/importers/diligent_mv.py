@@ -14,15 +14,16 @@ from mi_ring.importers.reading import chosen, entry, existing, image_size, load_
 class DiligentMV(Source):
     """DiLiGenT-MV: an object on a turntable, 20 views under 96 distant lights each.
 
-    SRC is an object's folder, such as mvpmsData/bearPNG, with Calib_Results.mat, view_01, view_02, …
+    SRC is the folder of an object, such as mvpmsData/bearPNG, with Calib_Results.mat, view_01, view_02, …
     """
 
     views: tuple[int, ...] = ()
-    """Views to take, from 1. Default: all."""
+    """Numbers of the views to take, from 1. Without it: all."""
     lights: tuple[int, ...] = ()
-    """Lights to take, from 1. Default: all."""
+    """Numbers of the lights to take, from 1. Without it: all."""
     fill_holes: bool = False
-    """Fill holes in the masks. Those of the bear are faults of the masks; those of pot and cow are in the object."""
+    """Fill holes in the masks.
+    Use it for the bear, whose masks have wrong holes. Those of pot2 and cow are real."""
 
     def frames(self) -> Iterator[Frame]:
         file = self.src / "Calib_Results.mat"

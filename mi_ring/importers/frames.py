@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.reading import image_size
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right, y up, z back) to OpenCV's
@@ -29,8 +30,8 @@ class Frame:
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
     mask: Path | None = None  #: of the photograph's size; equal to `image` if the alpha channel is the mask
     light: Light | None = None  #: None: a point light of intensity 1 at the camera
-    saturation: float | None = None  #: encoded value from which pixels are clipped; None: full scale
-    encoding: str | None = None  #: "srgb" or "linear"; None: what the type of file implies
+    saturation: float = 1.0  #: encoded value from which pixels are clipped (1 = full scale)
+    encoding: Encoding = "auto"
     name: str = ""  #: in the scene; empty: the file's name without suffix
     pixels: np.ndarray | None = None  #: (H, W, 3) float32, of an image that is not in a file of its own
     fill_mask: bool = False  #: fill the holes in the mask
@@ -58,16 +59,17 @@ class Source:
     """What all formats have in common."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
-    """Where the data is."""
+    """Data of the other tool: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Scene file to write. What belongs to it and is no file yet goes into a folder of its name."""
+    """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
-    """Copy the photographs beside the scene file instead of referring to where they are."""
-    encoding: Literal["auto", "srgb", "linear"] = "auto"
-    """Of the photographs. auto: as the format says, else 8-bit files are sRGB and others linear. Linear ones of 8 bits
-    are written anew with 16."""
+    """Copy the photographs beside the scene file. Without it the scene refers to them where they are."""
+    encoding: Encoding = "auto"
+    """How the photographs are encoded.
+    auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
+    Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
-    """Those that are meant: cameras of others are left out. By default each camera must have its photograph."""
+    """The photographs to take; cameras of others are left out. Without it each camera must have its photograph."""
 
     def frames(self) -> Iterator[Frame]:
         """The photographs that have a pose. Raises InputError for invalid data."""

@@ -12,9 +12,9 @@ from mi_ring.importers.reading import first_file, image_size, load_json, matrix,
 
 @dataclass(frozen=True)
 class Iron(Source):
-    """IRON: cam_dict_norm.json with a folder image beside it; light at the camera.
+    """IRON: cam_dict_norm.json beside a folder image. The light is at the camera.
 
-    SRC is that folder, or one that holds it as train.
+    SRC is that folder, or a folder that has it as train.
     """
 
     def frames(self) -> Iterator[Frame]:

@@ -15,9 +15,9 @@ from mi_ring.importers.reading import existing, image_size, list_images, matrix
 
 @dataclass(frozen=True)
 class Llff(Photogrammetry):
-    """LLFF, NeRF: poses_bounds.npy with folders images, images_4, …; the light is beside the camera.
+    """LLFF, NeRF: poses_bounds.npy beside folders images, images_4, … The light is beside the camera.
 
-    SRC is the folder. Its first folder of photographs counts; they belong to the poses by the order of their names.
+    SRC is the folder. The photographs are in its first such folder; sorted by name they belong to the poses in order.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:

@@ -18,10 +18,10 @@ MAX_SKEW = 0.1  #: by which b2 may move any pixel [px]
 
 @dataclass(frozen=True)
 class Metashape(Photogrammetry):
-    """Metashape: File > Export > Export Cameras as Agisoft XML; the light is beside the camera.
+    """Metashape: File > Export > Export Cameras as Agisoft XML. The light is beside the camera.
 
-    SRC is the XML file. Photographs are found by the cameras' labels, with any suffix. Disabled cameras count as
-    having no pose.
+    SRC is the XML file. Photographs are found by the labels of the cameras, with any suffix. Disabled cameras have no
+    pose.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:

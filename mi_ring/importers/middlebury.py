@@ -12,9 +12,9 @@ from mi_ring.importers.reading import image_size, load_lines, matrix
 
 @dataclass(frozen=True)
 class Middlebury(Photogrammetry):
-    """Middlebury's multi-view stereo: NAME_par.txt beside its photographs; the light is beside the camera.
+    """Middlebury's multi-view stereo: NAME_par.txt beside its photographs. The light is beside the camera.
 
-    SRC is that file or the folder with it.
+    SRC is that file or its folder.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:

@@ -15,9 +15,9 @@ from mi_ring.importers.reading import entry, first_file, image_size, matrix, num
 
 @dataclass(frozen=True)
 class Neus(Source):
-    """IDR, NeuS, WildLight: cameras_sphere.npz or cameras.npz with folders image and mask; light at the camera.
+    """IDR, NeuS, WildLight: cameras_sphere.npz or cameras.npz, folders image and mask. The light is at the camera.
 
-    SRC is the folder. WildLight's light_energy_* become intensities; photographs without flash are left out.
+    SRC is the folder. WildLight's light_energy_* become intensities; its photographs without flash are left out.
     """
 
     def frames(self) -> Iterator[Frame]:

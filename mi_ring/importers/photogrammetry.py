@@ -12,7 +12,7 @@ from PIL import ExifTags
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
-from mi_ring.images import opened
+from mi_ring.images import open_image
 from mi_ring.importers.frames import Frame, Source, find_by_name
 from mi_ring.importers.reading import SUFFIXES, existing, first_file, list_images
 
@@ -24,13 +24,13 @@ class Photogrammetry(Source):
     """Photographs with poses from photogrammetry. Each format implements `posed`."""
 
     images: Path | None = None
-    """Folder of the photographs. Default: the nearest `images` beside or above SRC, else the folder of SRC."""
+    """Folder of the photographs. Without it: the nearest `images` beside or above SRC, else the folder of SRC."""
     masks: Path | None = None
-    """Folder of masks, each called like its photograph with .png added, as COLMAP's are, or instead of its suffix."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the light from the camera, in the camera's axes (x right, y down, z forward) [scene units]."""
+    """Position of the light relative to the camera: right, down and forward [scene units]."""
     exif: bool = True
-    """Bring the photographs to one scale by the exposure time, ISO and aperture in their EXIF data."""
+    """Bring the photographs to one brightness by exposure time, ISO and aperture of their EXIF data."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
         """The photographs that have a pose, each with the name that its mask is named after."""
@@ -81,7 +81,7 @@ def exif_exposure(path: Path) -> float | None:
     """Exposure time · ISO / aperture² by EXIF; None if one is missing. Raises InputError if one is not positive."""
     if path.suffix.lower() == ".exr":
         return None
-    with reading(path, "image"), opened(existing(path, "image")) as image:
+    with reading(path, "image"), open_image(existing(path, "image")) as image:
         exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
     exposure = exposure_of(exif)
     if exposure is not None and not 0 < exposure < math.inf:

@@ -11,7 +11,7 @@ import scipy.io
 
 from mi_ring import images
 from mi_ring.errors import InputError, is_file
-from mi_ring.foreign import reading, require_survival
+from mi_ring.foreign import reading, require_readable
 
 SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 Content = TypeVar("Content")
@@ -37,7 +37,7 @@ def has_alpha(path: Path) -> bool:
     """Does an image file have an alpha channel?"""
     if path.suffix.lower() == ".exr":
         return pixels_of(path).shape[2] in (2, 4)
-    with reading(path, "image"), images.opened(existing(path, "image")) as image:
+    with reading(path, "image"), images.open_image(existing(path, "image")) as image:
         return image.mode in ("LA", "RGBA")
 
 
@@ -105,7 +105,7 @@ def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: 
 def load_mat(path: Path) -> dict:
     """The variables in a MATLAB file. Another process reads it first, because damaged files crash scipy's reader."""
     size = existing(path, "MATLAB file").stat().st_size
-    require_survival("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
+    require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
     return read_as(path, "MATLAB file", scipy.io.loadmat)
 
 

@@ -25,10 +25,10 @@ BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown4": 4, "brown3t2": 6, "
 
 @dataclass(frozen=True)
 class RealityCapture(Photogrammetry):
-    """RealityCapture, RealityScan: XMP sidecars, or the CSV table; the light is beside the camera.
+    """RealityCapture, RealityScan: XMP sidecars or the CSV table. The light is beside the camera.
 
-    SRC is the folder of the sidecars, or the file of the registration's export "Internal/External camera parameters".
-    The lens must be of one of the Brown models.
+    SRC is the folder of the sidecars, or the file of the export "Internal/External camera parameters". The lens must
+    have one of the Brown models.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:

@@ -23,9 +23,9 @@ COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fie
 
 @dataclass(frozen=True)
 class SfmData(Photogrammetry):
-    """Meshroom's cameras.sfm or sfm.json, OpenMVG's sfm_data.json; the light is beside the camera.
+    """Meshroom's cameras.sfm or sfm.json, OpenMVG's sfm_data.json. The light is beside the camera.
 
-    SRC is the file. Photographs are where it says, or by the same names in --images.
+    SRC is the file. Photographs are where it says, or in --images under the same names.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:

@@ -16,7 +16,7 @@ from mi_ring.importers.reading import existing, first_file, has_alpha, image_siz
 
 @dataclass(frozen=True)
 class Transforms(Source):
-    """transforms.json of NeRF, instant-ngp, nerfstudio; the frames' pl_pos and pl_intensity are their lights.
+    """transforms.json of NeRF, instant-ngp, nerfstudio. pl_pos and pl_intensity of its frames are the lights.
 
     SRC is the file, or a folder with transforms.json or transforms_train.json.
     """

@@ -7,16 +7,17 @@ import shutil
 import tempfile
 from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
 
+from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.reading import pixels_of
 from mi_ring.importers.undistortion import undistort
+from mi_ring.scene.shot import Encoding, Files
 from mi_ring.system.files import relative_to, write_file
 
 
@@ -46,9 +47,9 @@ class Writer:
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
-    def relative(self, path: Path) -> str:
+    def relative(self, path: Path) -> Path:
         """The path as the scene file names it."""
-        return relative_to(self.scene.parent, path)
+        return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
         """Move all files to their places, then write the scene file.
@@ -73,15 +74,7 @@ class Writer:
                 folder.rmdir()
 
 
-class Files(NamedTuple):
-    """The files of a photograph, as the scene file names them."""
-
-    filename: str
-    mask: str | None = None
-    valid: str | None = None
-
-
-def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: str | None) -> Files:
+def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
     """Write the files of a frame that change, or all of them to `copy`. Other files stay where they are."""
     straight = frame.lens.is_pinhole
 
@@ -92,7 +85,7 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
             return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
         return path
 
-    def place_once(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> str:
+    def place_once(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
             writer.shared[folder, key] = place(folder, path, pixels())
         return writer.relative(writer.shared[folder, key])
@@ -107,8 +100,8 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: s
     valid = None
     if not straight:
         assert pixels is not None  # read above
-        srgb = encoding == "srgb" or (encoding is None and pixels.dtype == np.uint8)
-        pixels, shown = undistort(pixels, frame.lens, srgb, 1.0 if frame.saturation is None else frame.saturation)
+        srgb = not is_linear(encoding, pixels)
+        pixels, shown = undistort(pixels, frame.lens, srgb, frame.saturation)
         if not shown.all():
             valid = place_once("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
     image = writer.relative(place("images", frame.image, pixels))

@@ -1,4 +1,4 @@
-"""Whether a surface is what a flow can make: no triangle turned inside out, none that crosses another."""
+"""Is a surface an embedding, as the surface of a flow must be? It has no inverted and no crossing triangles."""
 
 import numpy as np
 import torch
@@ -7,14 +7,14 @@ from torch.nn import functional as F
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.optional import need
 
-STEP = 1e-3  #: from a triangle to both sides, in the normalised frame
+STEP = 1e-3  #: distance from a triangle of the points on its two sides, in the normalised frame
 
 
 def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
-    """Which triangles (F,) bool of a sampling of the domain, points (V, 3), Shape-Net flattens or turns inside out.
+    """(F,) bool: triangles of a sampling of the domain, points `s` (V, 3), that Shape-Net flattens or inverts.
 
-    Those for which what lay on their outer side lies on their inner side afterwards: det ∂Φ/∂s ≤ 0 there, if triangles
-    were infinitely small. A flow, solved exactly, has none.
+    A point on the outer side of such a triangle is on its inner side afterwards. For infinitely small triangles this
+    means det ∂Φ/∂s ≤ 0, which an exactly solved flow excludes.
     """
     s = s.to(ring.center.device)
     corners = torch.as_tensor(faces, device=s.device)
@@ -30,15 +30,11 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which triangles (F,) bool cross another, by exact arithmetic: CGAL's, in the package libigl (extra `exact`).
-
-    The reference for `mi_ring.scene.self_intersections`, faster and without other packages; those that overlap in
-    a plane, or touch, count as well. Raises InputError if it is not installed.
-    """
+    """(F,) bool: triangles that cross, overlap or touch another, exactly, by CGAL. Raises InputError without libigl."""
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections
 
-    # Vertices and faces, remeshed; pairs of faces that intersect; and which face and vertex came from which.
+    # Item 2 of the result: pairs of intersecting faces.
     pairs = remesh_self_intersections(np.asarray(vertices, float), np.asarray(faces, np.int64), detect_only=True)[2]
     crossing = np.zeros(len(faces), bool)
     crossing[np.asarray(pairs, int).ravel()] = True

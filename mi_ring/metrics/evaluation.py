@@ -1,4 +1,4 @@
-"""All numbers of a fit against the truth."""
+"""Evaluation of a fit against ground truth."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.calibrated import moved
 from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
@@ -17,7 +16,8 @@ from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
-LINES = {  # of the table
+#: Lines of the table by the beginnings of the names of numbers.
+LINES = {
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
     "aligned": "truth moved by °, % of the diagonal, factor",
@@ -31,49 +31,45 @@ LINES = {  # of the table
 def evaluate_fit(
     run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False, align: str | None = None
 ) -> dict:
-    """The paper's columns and more for the results folder `run`; of each photograph under `views`, `novel_views`.
+    """Errors of the results folder `run`, and lists of those of each photograph: `views` and `novel_views`.
 
-    `seen`: distances of surfaces are those of what at least one photograph shows. What is not defined is left out: the
-    genus of a surface that is not closed, for instance. Photographs that the fit kept out are no `_input`, but
-    `_held_out`. `align`: move the truth, and the cameras and lights of `novel`, onto the result first, "rigid" or also
-    scaled ("similarity"); by how much is under `aligned_*`.
+    `mesh`: true surface; `novel`: scene file of novel views; `seen`: distances between surfaces are of parts that a
+    photograph shows. `align`: first move the truth and `novel` onto the result, by a "rigid" motion or a "similarity";
+    the motion is `aligned_*`. Numbers of fitted photographs end in `_input`, those of held-out ones in `_held_out`.
+    Undefined numbers are missing: the genus of an open surface, for instance.
     """
-    ring = load_fit(run)
-    capture = load_capture(run / "scene.xml")
+    ring, capture = load_fit(run), load_capture(run / "scene.xml")
     unseen = novel and load_capture(novel)
     truth_mesh, truth = load_true_mesh(mesh)
     guess_mesh, guess = load_true_mesh(run / "mesh.ply")
-    diagonal, motion = float(np.linalg.norm(truth_mesh.extents)), {}
+    diagonal, motion = truth_mesh.scale, {}
     if align:
         matrix = alignment(truth_mesh, guess_mesh, align == "similarity")
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        rotation = matrix[:3, :3] / scale
+        rotation, before = matrix[:3, :3] / scale, truth_mesh.bounds.mean(0)
         angle = Rotation.from_matrix(rotation).magnitude()
-        before = truth_mesh.bounds.mean(0)
-        truth_mesh.apply_transform(matrix)
         shift = np.linalg.norm(matrix[:3, :3] @ before + matrix[:3, 3] - before)
         motion = {"aligned_turn": float(np.degrees(angle)), "aligned_shift": float(100 * shift / diagonal),
                  "aligned_scale": scale}  # fmt: skip
+        truth_mesh.apply_transform(matrix)
         truth, diagonal = scene_of(truth_mesh.vertices, truth_mesh.faces), diagonal * scale
-        unseen = unseen and moved(unseen, scale, rotation, matrix[:3, 3])
+        unseen = unseen and unseen.moved(scale, rotation, matrix[:3, 3])
     numbers, views = compare_surfaces(capture, guess, truth, diagonal)
-    numbers |= motion
-    numbers |= compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None, diagonal)
+    numbers |= motion | compare_shapes(guess_mesh, truth_mesh, capture.views if seen else None, diagonal)
     for key, surface in (("genus", guess_mesh), ("genus_true", truth_mesh)):
         if surface.is_watertight:
             numbers[key] = genus(surface)
     numbers["self_intersections"] = int(crossing_triangles(guess_mesh.vertices, guess_mesh.faces).sum())
     numbers["inside_out"] = int(inside_out(ring, *ring.domain.sample(ring.subdivisions)).sum())
     record = read_json(run / "calibration.json")
-    out = record["held_out"]["photographs"] if isinstance(record, dict) and "held_out" in record else []
-    for kind, kept_out in (("input", False), ("held_out", True)):
-        index = [k for k, name in enumerate(capture.names) if (name in out) == kept_out]
-        if not index:  # no surface is drawn for nothing
-            continue
-        predicted, photographs = compare_photographs(capture, ring, spp, index)
-        numbers |= {f"{key}_{kind}": value for key, value in predicted.items()}
-        for k, photograph in zip(index, photographs):
-            views[k] |= photograph
+    names = record["held_out"]["photographs"] if isinstance(record, dict) and "held_out" in record else []
+    for kind, held_out in (("input", False), ("held_out", True)):
+        index = [k for k, name in enumerate(capture.names) if (name in names) == held_out]
+        if index:
+            predicted, photographs = compare_photographs(capture, ring, spp, index)
+            numbers |= {f"{key}_{kind}": value for key, value in predicted.items()}
+            for k, photograph in zip(index, photographs):
+                views[k] |= photograph
     lists = {"views": views}
     if unseen:
         predicted, lists["novel_views"] = compare_photographs(unseen, ring, spp)
@@ -82,7 +78,7 @@ def evaluate_fit(
 
 
 def evaluation_table(numbers: dict[str, float]) -> str:
-    """The numbers of all photographs as text, those that belong together in one line."""
+    """The numbers of all photographs together as text, a line for each of the `LINES`."""
     lines = []
     for start, words in LINES.items():
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
@@ -94,7 +90,7 @@ def evaluation_table(numbers: dict[str, float]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """Four digits after the point, all that mean anything, of all numbers in lists and dictionaries."""
+    """All numbers in lists and dictionaries, rounded to four digits after the point: more are not significant."""
     if isinstance(value, dict):
         return {key: rounded(v) for key, v in value.items()}
     if isinstance(value, list):

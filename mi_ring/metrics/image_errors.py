@@ -1,4 +1,4 @@
-"""How near predicted photographs are to the files: PSNR and SSIM."""
+"""Errors of predicted photographs: PSNR and SSIM."""
 
 from collections.abc import Sequence
 
@@ -9,65 +9,62 @@ from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.decoding import recorded
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
-SPP = 64  #: samples per pixel of predicted photographs, by default
-WINDOW = 11  #: of SSIM [px]
+SPP = 64  #: default samples per pixel of predicted photographs
+WINDOW = 11  #: width of the window of SSIM [px]
 
 
 def compare_photographs(
     capture: Capture, ring: FittedObject, spp: int, index: Sequence[int] | None = None
 ) -> tuple[dict[str, float], list[dict]]:
-    """`psnr` [dB] and `ssim` of predictions as 8-bit sRGB against the files, sRGB in [0, 1].
+    """`psnr` [dB] and `ssim` of the photographs `index`, by default all, and a list of those of each photograph.
 
-    Of the photographs `index`, by default all, from the mean of their squared errors and as the mean of their SSIM, and
-    of each. What is predicted is what `mi_ring.render` writes by default. Where it is exact there is no PSNR. In a room
-    that was not black only what is wholly object by its mask counts: nobody predicts the rest.
+    Predictions are 8-bit sRGB, as `mi_ring.render` writes them. The PSNR of all is that of the mean squared error, the
+    SSIM of all is the mean. There is no PSNR if a prediction is exact. `comparable` says which pixels count.
     """
-    surface = bridge.Surface(capture.scene, capture.shape, ring)
+    surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     views: list[dict] = []
     for k in range(len(capture)) if index is None else index:
-        name = capture.names[k]
-        rgb, _ = bridge.draw(surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect)
-        predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.sensors[k]))) / 255
+        rgb, _ = prediction.draw(
+            surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect
+        )
+        predicted = to_bytes(linear_to_srgb(recorded(rgb[0].numpy(), capture.shots[k]))) / 255
         seen = capture.observe([k])
-        observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.sensors[k]))
-        telling = comparable(capture, seen)
-        if not telling.any():
-            views.append({"name": name})
-            continue
-        predicted = np.where(telling[..., None], predicted, observed)
-        squares.append(np.mean((predicted - observed)[telling] ** 2))
-        views.append({"name": name, **decibels(squares[-1]), **ssim(predicted, observed, telling)})
+        observed = linear_to_srgb(recorded(seen.rgb[0].numpy(), capture.shots[k]))
+        compared = comparable(capture, seen)
+        views.append({"name": capture.names[k]})
+        if compared.any():
+            predicted = np.where(compared[..., None], predicted, observed)
+            squares.append(np.mean((predicted - observed)[compared] ** 2))
+            views[-1] |= {**decibels(squares[-1]), **ssim(predicted, observed, compared)}
     similar = [view["ssim"] for view in views if "ssim" in view]
     totals = decibels(np.mean(squares)) if squares else {}
     return totals | ({"ssim": float(np.mean(similar))} if similar else {}), views
 
 
 def comparable(capture: Capture, seen: Observation) -> np.ndarray:
-    """(H, W) bool: which pixels of the first photograph seen can be as predicted."""
-    telling = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
-    if seen.masked[0] and capture.lit_room:
-        return telling & (seen.mask[0].numpy() > 0.99)
-    return telling
+    """(H, W) bool: valid pixels of the first photograph. If a background is visible, only those inside the mask."""
+    valid = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
+    return valid & (seen.mask[0].numpy() > 0.99) if seen.masked[0] and capture.lit_room else valid
 
 
 def decibels(square: float) -> dict[str, float]:
-    """PSNR of a mean squared error."""
+    """The PSNR of a mean squared error, if it is not 0."""
     return {"psnr": float(-10 * np.log10(square))} if square else {}
 
 
-def ssim(a: np.ndarray, b: np.ndarray, telling: np.ndarray | None = None) -> dict[str, float]:
-    """Structural similarity of images (H, W, 3) in [0, 1], mean over channels, none if they are less than its window.
+def ssim(a: np.ndarray, b: np.ndarray, compared: np.ndarray | None = None) -> dict[str, float]:
+    """Structural similarity of images (H, W, 3) in [0, 1], mean over channels; none if the window does not fit in.
 
-    `telling` (H, W) bool: the pixels over which it is averaged; None: all of whose neighbours its window holds.
-
-    Wang et al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 pixels, σ = 1.5 px.
+    Mean over the pixels `compared` (H, W) bool; None: over those whose window is inside the image. Wang et al., Image
+    Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 pixels, σ = 1.5 px.
     """
     if min(a.shape[:2]) < WINDOW:
         return {}
     wang = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     mean, local = structural_similarity(a, b, data_range=1, channel_axis=-1, full=True, **wang)
-    return {"ssim": float(mean if telling is None or telling.all() else local[telling].mean())}
+    return {"ssim": float(mean if compared is None or compared.all() else local[compared].mean())}

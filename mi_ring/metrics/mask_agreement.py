@@ -1,4 +1,4 @@
-"""Do the masks agree with each other? If not, which mistake with the cameras would explain it?"""
+"""Do the masks of a capture agree with each other? If not, which mistake in the cameras explains it?"""
 
 import copy
 from collections.abc import Sequence
@@ -8,16 +8,13 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.hull import Hull, Silhouette, evenly, thinned
+from mi_ring.geometry.hull import Hull, Silhouette, evenly_spaced, subsample
 
-CONFORMS = 0.9  #: share of a mask that the others agree to, at least
+CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """Of each mask, by its file, the share that the others agree to; and what is wrong with all of them.
-
-    A single one that is wrong spoils the hull for all. It is told by a hull for which some may be wrong.
-    """
+    """By file of each mask the share that the other masks agree with; and findings that concern all masks."""
     if not capture.hull:
         return {}, []
     silhouettes = capture.silhouettes()
@@ -29,9 +26,9 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     agree, why = shares(capture.hull), None
     if capture.whole and agree.min() < CONFORMS:
         why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
-        if not why:
+        if not why:  # one wrong mask spoils the hull for all; a hull that tolerates some may find it
             tolerant = copy.copy(capture.hull)
-            tolerant.wrong = max(0.1, 1.01 / len(tolerant.silhouettes))
+            tolerant.outliers = max(0.1, 1.01 / len(tolerant.silhouettes))
             robust = shares(tolerant)
             if np.median(robust) >= CONFORMS:
                 agree = robust
@@ -42,40 +39,38 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """A silhouette whose camera differs in these fields."""
+    """A silhouette with other values of these fields of its camera."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
-#: What a camera-to-world matrix may be by mistake, and the one that it should have been.
+#: Mistakes in camera-to-world matrices, and functions that correct them.
 MATRICES = {
     "": lambda m: m,
     "to_world is world-to-camera: invert it": np.linalg.inv,
-    "the rotation in to_world is transposed: transpose its upper left 3 x 3": lambda m: np.block(
-        [[m[:3, :3].T, m[:3, 3:]], [m[3:]]]
-    ),
-}
+    "the rotation in to_world is transposed: transpose its upper left 3 x 3":
+        lambda m: np.block([[m[:3, :3].T, m[:3, 3:]], [m[3:]]]),
+}  # fmt: skip
+#: Mistakes in the camera axes, and the signs that correct them.
 AXES = {
     "": (1, 1, 1),
     "its axes are OpenCV's (COLMAP's), x right, y down: to_world @ diag(-1, -1, 1, 1)": (-1, -1, 1),
     "its axes are OpenGL's (NeRF's, Blender's), x right, y up: to_world @ diag(-1, 1, -1, 1)": (-1, 1, -1),
     "its y and z are flipped: to_world @ diag(1, -1, -1, 1)": (1, -1, -1),
 }
-#: Other mistakes: what a silhouette should have been.
+#: Other mistakes, and functions that correct a silhouette.
 OTHERS = {
     "cx and cy are exchanged": lambda s: with_camera(s, centre=s.camera.centre[[1, 0]]),
-    "fx, fy, cx, cy are for photographs of half the size: double them": lambda s: with_camera(
-        s, focal=2 * s.camera.focal, centre=2 * s.camera.centre
-    ),
-    "fx, fy, cx, cy are for photographs of twice the size: halve them": lambda s: with_camera(
-        s, focal=s.camera.focal / 2, centre=s.camera.centre / 2
-    ),
+    "fx, fy, cx, cy are for photographs of half the size: double them":
+        lambda s: with_camera(s, focal=2 * s.camera.focal, centre=2 * s.camera.centre),
+    "fx, fy, cx, cy are for photographs of twice the size: halve them":
+        lambda s: with_camera(s, focal=s.camera.focal / 2, centre=s.camera.centre / 2),
     "photographs or masks are upside down": lambda s: s._replace(mask=s.mask[::-1]),
     "photographs or masks are mirrored": lambda s: s._replace(mask=s.mask[:, ::-1]),
-}
+}  # fmt: skip
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Share of the masks' pixels that all masks agree to; 0 if there is no hull."""
+    """Share of the masks' pixels that all masks agree with; 0 if the visual hull is empty."""
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -83,27 +78,24 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """The mistake with the cameras that explains why the masks do not agree, and its mend; None if none does."""
-    some = thinned(silhouettes, 32, 96)
+    """The mistake that explains why the masks do not agree, and how to correct it, as text; None if none does."""
+    some = subsample(silhouettes, 32, 96)
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
         for second, axes in AXES.items():
             name = "; then ".join(part for part in (first, second) if part)
             guesses[name] = [with_camera(s, to_world=change(s.camera.to_world) @ np.diag([*axes, 1.0])) for s in some]
-    as_it_is = share_agreed(guesses.pop(""))
+    unchanged = share_agreed(guesses.pop(""))
     scores = {name: share_agreed(guess) for name, guess in guesses.items()}
     best = max(scores, key=scores.__getitem__)
-    if scores[best] < max(CONFORMS, as_it_is + 0.05):
+    if scores[best] < max(CONFORMS, unchanged + 0.05):
         return None
     return f"{best} (the masks then agree to {scores[best]:.0%})"
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """Are all principal points off by half a pixel? Then outlines do not quite meet the hull.
-
-    Of photographs that are shrunk for the hull it cannot be told, and matters little.
-    """
-    gaps, hull, some = {}, copy.copy(hull), evenly(len(hull.silhouettes), 32)
+    """A finding if all principal points are off by half a pixel: the masks' outlines then miss the hull a little."""
+    gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):
         hull.silhouettes = [with_camera(s, centre=s.camera.centre + shift) for s in silhouettes]

@@ -1,4 +1,4 @@
-"""Photographs by `photometric` and by Mitsuba's path tracer, side by side."""
+"""The same photographs by `photometric` and by Mitsuba's path tracer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,17 +8,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.capture.loading import open_scene
+from mi_ring.capture.loading import open_scene, photographs_in
 from mi_ring.errors import InputError, SceneError
 from mi_ring.plugins import flash, photograph, shapenet
 from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs, pixel_rays
-from mi_ring.scene.assembly import assembled, own_emitters, parted
+from mi_ring.scene.assembly import assembled, split_tables, top_level_emitters
 from mi_ring.scene.lights import is_room
 from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
 
-BATCHES = 16  #: independent pictures of each photograph; their spread is the Monte Carlo noise
-LANES = 1 << 21  #: rays per launch, at most
+BATCHES = 16  #: independent renderings of each photograph; their spread is the Monte Carlo noise
+LANES = 1 << 21  #: most rays in one launch
 
 
 @dataclass
@@ -26,62 +26,56 @@ class Pictures:
     """Independent renderings (16, H, W, 3) of one photograph: linear radiance."""
 
     photometric: np.ndarray
-    unshadowed: np.ndarray  #: same samples as photometric
+    unshadowed: np.ndarray  #: photometric without shadows, same samples
     path: np.ndarray
-    direct: np.ndarray  #: the direct light of `path`, same samples
+    direct: np.ndarray  #: direct light of `path`, same samples
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """The scene without tables and its photographs, lit for stock integrators too. Raises InputError, one line."""
-    scene, sensors = open_scene(path)
+    """The scene without tables, lit for stock integrators, too, and its photographs. Raises InputError, one line."""
+    scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
             require_attributes(shape)
             if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
-        Photographs.of(sensors)
-        return with_flash(without_rooms(parted(scene)[0])), sensors
+        Photographs.of(shots)
+        return with_flash(split_tables(scene)[0]), photographs_in(scene)
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def without_rooms(scene: mi.Scene) -> mi.Scene:
-    """The scene without `room` emitters: what they add is path traced either way (`render_indirect`)."""
-    emitters = own_emitters(scene)
-    if not any(map(is_room, emitters)):
-        return scene
-    return assembled(scene.shapes(), [emitter for emitter in emitters if not is_room(emitter)])
-
-
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with one `flash` emitter, through which stock integrators see the light of a photograph.
+    """The scene with one `flash` emitter, by which stock integrators see the light of a photograph, and without rooms.
 
-    A `shapenet` brings it along; a scene of other shapes is assembled anew. Raises SceneError if there are several,
-    each of which would add the light once more.
+    A `shapenet` has a `flash`. The light of a `room` is path traced by both renderers. Raises SceneError for several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
         raise SceneError(f"flash: found {count} of them, so that the light would count {count} times; "
                          'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
-    if count == 1:
+    emitters = top_level_emitters(scene)
+    others = [emitter for emitter in emitters if not is_room(emitter)]
+    if count == 1 and len(others) == len(emitters):
         return scene
-    return assembled(scene.shapes(), [mi.load_dict({"type": "flash"}), *own_emitters(scene)])
+    return assembled(scene.shapes(), others if count else [mi.load_dict({"type": "flash"}), *others])
 
 
 def render_both(
     scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
 ) -> Pictures:
-    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 times, each with `spp` samples per pixel of its own.
+    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 independent renderings with `spp` samples per pixel.
 
-    `photometric` and `path` have different samples, but both along rays of ours: the film's filter has no part in it.
-    Seeds up to `seed` + 31 are used.
+    `photometric` and `path` have different samples along rays of the same kind: the film's filter is not used. Uses
+    seeds from `seed` to `seed` + 31.
     """
-    width, height = (s // scale for s in sensor.size)
+    size = sensor.camera.size
+    width, height = (s // scale for s in size)
     pixels = width * height
     group = max(1, min(BATCHES, LANES // (pixels * spp)))
     parts = []
     for first in range(0, BATCHES, group):
-        batch = photographs.select([k] * min(group, BATCHES - first), sensor.size, scale)
+        batch = photographs.select([k] * min(group, BATCHES - first), size, scale)
         own, other = seed + 2 * first, seed + 2 * first + 1
         parts.append([
             render_photographs(scene, batch, spp, own),
@@ -99,7 +93,7 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """Like `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
+    """As `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

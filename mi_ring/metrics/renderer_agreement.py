@@ -11,36 +11,36 @@ from mi_ring.images import linear_to_srgb
 from mi_ring.metrics.path_tracing import BATCHES, Pictures
 
 BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
-ROUNDING = 1e-6  #: two ways to compute the same radiance in float32 may differ by this much, relative
-IMPLAUSIBLE = 0.75  #: share of interreflection that hardly any object has
+ROUNDING = 1e-6  #: relative difference between two computations of the same radiance in float32
+IMPLAUSIBLE = 0.75  #: an implausible share of interreflection
 
 
 @dataclass
 class Comparison:
-    """What is found out about one photograph, or about all. Shares are of the mean radiance of `path`."""
+    """Numbers of one photograph, or of all. All but the PSNR and p-values are shares of the mean radiance of `path`."""
 
     name: str
     radiance: float  #: mean of `path` over all pixels and channels
     difference: float  #: mean of photometric − path
-    absolute_difference: float  #: mean over pixels of the size of photometric − path, of which …
-    noise: float  #: … Monte Carlo noise explains this much
+    absolute_difference: float  #: mean over pixels of |photometric − path|
+    noise: float  #: part of the absolute difference that Monte Carlo noise explains
     psnr: float  #: photometric against path [dB], sRGB, at most 100
-    shadows: float  #: what photometric without shadows has too much
-    interreflection: float  #: what path has beyond direct light
+    shadows: float  #: light that shadows remove
+    interreflection: float  #: light of `path` beyond direct light
     unexplained: float  #: mean of photometric − direct light of path
     unexplained_noise: float  #: its standard error
-    p_direct: float  #: of a difference this large if photometric and the direct light of path agree
-    p_path: float  #: likewise of photometric and all of path
+    p_direct: float  #: probability of this difference if photometric and the direct light of path agree
+    p_path: float  #: the same for photometric and all light of path
 
 
 def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
     """Probability that independent pictures a, b (16, H, W, 3) float64 differ this much if equally distributed.
 
-    The lesser of two p-values, corrected (Šidák): of the mean of all pixels, by Student's t, and of all blocks of
-    8 × 8 pixels, as follows. If a and b agree, each of the 16 differences d of a block is as likely as −d, however
-    heavy its tails. Over all choices of signs, (Σ d)² / Σ d² has the mean 1 and the variance 2 − 2 Σ d⁴ / (Σ d²)²;
-    blocks are independent, so that their sum follows a gamma distribution of known mean and variance. Channels share
-    their samples and would not be independent, so blocks take turns: red, green, blue.
+    The smaller of two p-values with Šidák's correction. The first is of the mean of all pixels, by Student's t. The
+    second is of blocks of 8 × 8 pixels: if a and b agree, each of the 16 differences d of a block is as likely as −d,
+    even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance 2 − 2 Σ d⁴ / (Σ d²)². Blocks are
+    independent, so the sum over blocks is about gamma distributed, with known mean and variance. Channels share
+    samples and are not independent, so each block is taken in one channel only: red, green, blue in turn.
     """
     whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
     error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
@@ -52,14 +52,14 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
     energy = (d**2).sum(0)
     ratio = d.sum(0) ** 2 / (energy + (count * ROUNDING * level) ** 2)
     variance = (2 - 2 * ((d**2 / energy) ** 2).sum(0)).sum()
-    if variance < 1e-6:  # no block differs more than once: signs say nothing
+    if variance < 1e-6:  # at most one picture of each block differs: signs carry no information
         return float(p_whole)
     p_blocks = stats.gamma.sf(ratio.sum(), len(ratio) ** 2 / variance, scale=variance / len(ratio))
     return sidak([p_whole, p_blocks])
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sums (16, h, w) over blocks of pixels, each in one channel, of (16, H, W, 3); the last may be cut off."""
+    """Sums (16, h, w) over blocks of pixels of (16, H, W, 3), each in one channel. Blocks at the border are smaller."""
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
     x = x.reshape(len(x), x.shape[1] // BLOCK, BLOCK, -1, BLOCK, 3).sum((2, 4))
@@ -68,12 +68,12 @@ def blocks(x: np.ndarray) -> np.ndarray:
 
 
 def sidak(p: Sequence[float] | np.ndarray) -> float:
-    """Probability that the least of so many independent p-values is as small as this (Šidák 1967)."""
+    """The least of several independent p-values, corrected for their number (Šidák 1967)."""
     return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
 
 
 def compare_renderers(name: str, pictures: Pictures) -> Comparison:
-    """The numbers of one photograph. Raises InputError if there are pixels that are no numbers."""
+    """The numbers of one photograph. Raises InputError if pixels are NaN or infinite."""
     for which, picture in vars(pictures).items():
         if bad := int((~np.isfinite(picture)).any((0, 3)).sum()):
             raise InputError(f"{name}: {which}: {bad} pixels are NaN or infinite; check BSDF and mesh")
@@ -82,24 +82,21 @@ def compare_renderers(name: str, pictures: Pictures) -> Comparison:
     difference, unexplained = photometric - path, photometric - direct
     noise = np.sqrt(2 / np.pi) * difference.std(0, ddof=1) / np.sqrt(BATCHES)  # mean of |x| for a normal x
     error = np.mean((linear_to_srgb(photometric.mean(0)) - linear_to_srgb(path.mean(0))) ** 2)
+    shares = {
+        "difference": difference.mean(), "absolute_difference": np.abs(difference.mean(0)).mean(),
+        "noise": noise.mean(), "shadows": (unshadowed - photometric).mean(), "interreflection": (path - direct).mean(),
+        "unexplained": unexplained.mean(),
+        "unexplained_noise": unexplained.mean((1, 2, 3)).std(ddof=1) / np.sqrt(BATCHES),
+    }  # fmt: skip
     return Comparison(
-        name=name,
-        radiance=float(path.mean()),
-        difference=float(difference.mean() / level),
-        absolute_difference=float(np.abs(difference.mean(0)).mean() / level),
-        noise=float(noise.mean() / level),
-        psnr=float(-10 * np.log10(max(error, 1e-10))),
-        shadows=float((unshadowed - photometric).mean() / level),
-        interreflection=float((path - direct).mean() / level),
-        unexplained=float(unexplained.mean() / level),
-        unexplained_noise=float(unexplained.mean((1, 2, 3)).std(ddof=1) / np.sqrt(BATCHES) / level),
-        p_direct=p_of_agreement(photometric, direct),
-        p_path=p_of_agreement(photometric, path),
-    )
+        name, float(path.mean()), psnr=float(-10 * np.log10(max(error, 1e-10))),
+        p_direct=p_of_agreement(photometric, direct), p_path=p_of_agreement(photometric, path),
+        **{key: float(value / level) for key, value in shares.items()},
+    )  # fmt: skip
 
 
 def all_as_one(rows: list[Comparison]) -> Comparison:
-    """All photographs as one: shares of all the light, p-values corrected for their number."""
+    """All photographs as one: shares of all light; p-values corrected for their number."""
     column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
     weight = column["radiance"] / (column["radiance"].sum() or 1.0)
     shares = {name: float((weight * values).sum()) for name, values in column.items()}
@@ -113,17 +110,17 @@ def all_as_one(rows: list[Comparison]) -> Comparison:
 
 
 def percent(x: float) -> str:
-    """A share."""
+    """A share as text."""
     return f"{100 * x:.2f} %"
 
 
 def probability(p: float) -> str:
-    """A p-value as far as it means anything."""
+    """A p-value as text with its significant digits."""
     return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
 
 
 def comparison_table(rows: list[Comparison]) -> str:
-    """The numbers as text, one line each; shares are of the radiance of `path`."""
+    """The numbers as text, one line each. Shares are of the mean radiance of `path`."""
     cells: list[tuple[str, ...]] = [(
         "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
         "unexplained %", "p direct", "p path",
@@ -139,7 +136,7 @@ def comparison_table(rows: list[Comparison]) -> str:
 
 
 def verdict(rows: list[Comparison], everything: Comparison, significance: float) -> list[str]:
-    """The findings in words."""
+    """The result in words."""
     p = probability(everything.p_direct)
     if everything.p_direct >= significance:
         direct = f"direct light agrees with path ({p})"

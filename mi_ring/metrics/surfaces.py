@@ -1,4 +1,4 @@
-"""How near two surfaces are: normals, depths, silhouettes, distances, crossing triangles."""
+"""Differences of two surfaces: normals, depths and silhouettes in photographs; distances; alignment."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,16 +15,16 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.scene.plain_mesh import scene_of
-from mi_ring.scene.visibility import View, Visibility
+from mi_ring.scene.visibility import MaskedCamera, Visibility
 from mi_ring.system.optional import need
 
-POINTS = 100_000  #: on each of two surfaces whose distance is measured
-ALIGNED, ALIGNMENTS = 20_000, 20  #: points that align two surfaces, and steps of doing so
+POINTS = 100_000  #: on each of two surfaces, to measure their distance
+ALIGNED, ALIGNMENTS = 20_000, 20  #: number of points and of steps of the alignment of two surfaces
 THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
-    """A mesh file and the scene that holds it alone, with smooth normals. Raises InputError if it cannot be read."""
+    """A mesh file, and a scene of this mesh only, with smooth normals. Raises InputError if it cannot be read."""
     mesh = read_mesh(path, "mesh")
     if not len(mesh.faces):
         raise InputError(f"{path}: mesh: has no triangles; give a surface")
@@ -32,12 +32,11 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """The motion (4, 4), perhaps with a scale, that brings a surface nearest to another, which is near already.
+    """The rigid motion or `similarity` (4, 4) that moves a mesh onto another one nearby.
 
-    By points of the one and the tangent planes where they are nearest to the other (Chen and Medioni, 1992), each
-    weighed by its distance so that parts that only one of them has do not pull.
+    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because the other mesh may lack a part.
     """
-    middle, unit = onto.bounds.mean(0), np.linalg.norm(onto.extents)
+    middle, unit = onto.bounds.mean(0), onto.scale
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
     end = np.asarray((onto.vertices - middle) / unit), np.asarray(onto.faces, np.int32)
     start = trimesh.transform_points(trimesh.sample.sample_surface(mesh, ALIGNED, seed=0)[0], normalise)
@@ -60,12 +59,9 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where pixel centres see the surface (P,), at what distance (P,) [scene units], with what normal (P, 3).
-
-    And where they see the back of a face (P,). One photograph.
-    """
-    # As `center_rays`, but not divided by the focal length: so Dr.Jit rounds where cameras are constants in the code.
-    # Rays that differ in the last bit show in the fourth digit of the means, by pixels that just graze the surface.
+    """At the pixel centres of a photograph: hit (P,), distance (P,), normal (P, 3), and is it a face's back (P,)?"""
+    # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
+    # bit change the fourth digit of mean errors, where pixels just graze the surface.
     to_world, focal, centre, distortion = photograph.camera(mi.UInt32(0))
     width, height = photograph.size
     pixel = dr.arange(mi.UInt32, width * height)
@@ -79,10 +75,10 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Angles between shading normals [deg], depths [% of `diagonal`] and silhouettes, at every pixel of every view.
+    """Errors of all views, and of each: shading normals [deg], depths [% of `diagonal`], silhouettes.
 
-    Normals and depths count where both surfaces are seen; `iou` is the mean over views; `flipped` is the share of what
-    is seen of `guess` whose faces point away from the camera. Returns those of all views, and of each.
+    Normals and depths count at pixels that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of
+    `guess` that see the back of a face.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
     for k, name in enumerate(capture.names):
@@ -102,7 +98,7 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Means and medians of errors (P,), none if there are no pixels."""
+    """Means and medians of errors (P,), if there are any."""
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -110,18 +106,19 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
 
 
 def compare_shapes(
-    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[View] | None = None, diagonal: float | None = None
+    guess: trimesh.Trimesh,
+    truth: trimesh.Trimesh,
+    views: Sequence[MaskedCamera] | None = None,
+    diagonal: float | None = None,
 ) -> dict[str, float]:
-    """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two whole surfaces.
+    """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two surfaces.
 
-    100,000 points of each, drawn evenly by area with a fixed seed, and their exact distances from the other surface:
-    not from points of it, so that equal surfaces have distance 0. `chamfer` is the mean of the two mean distances, from
-    the fit to the truth and back; `f_score_t` is the harmonic mean of precision, the share of the fit's points within t
-    % of the diagonal, and recall, the share of the truth's within t of the fit (Knapitsch et al., Tanks
-    and Temples, ACM TOG 2017). Parts that no camera sees count, too, unless `views` are given: then the points are
-    those that one of them shows, and `unseen` and `unseen_true` are the shares of the two surfaces that none does.
+    They are computed from the exact distances of 100,000 random points of each surface to the other. `chamfer`: mean
+    of the two mean distances. `f_score_t`: harmonic mean of precision, the share of the fit's points within t % of the
+    diagonal, and recall, the same of the truth's (Knapitsch et al., Tanks and Temples, ACM TOG 2017). With `views` only
+    points that one of them shows count; `unseen` and `unseen_true` are the shares of the others.
     """
-    diagonal, middle = diagonal or float(np.linalg.norm(truth.extents)), truth.bounds.mean(0)
+    diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
     numbers = {"chamfer": float(there.mean() + back.mean()) / 2}
     if views is not None:
@@ -133,15 +130,12 @@ def compare_shapes(
 
 
 def distances(
-    start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[View] | None = None
+    start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Of points of one surface from another (POINTS,), or of those that one of the views shows.
-
-    What counts is how both lie around `middle`.
-    """
+    """Distances (n,) of points of a surface, or of those that `views` show, from another. `middle` (3,): near both."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
-        points = points[Visibility(start.vertices, start.faces, views).of(points, start.face_normals[faces])]
+        points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]
         if not len(points):
             raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
                              "same frame, and do the faces of both point outwards?")  # fmt: skip

@@ -1,4 +1,4 @@
-"""The networks, as functions of points: encoding, perceptron, Shape-Net's flow, BRDF-Net's reflectance.
+"""The networks, as functions of points: encoding, perceptron, Shape-Net's flow, BRDF-Net's material.
 
-May import: torch, torchdiffeq.
+May import: torch.
 """

@@ -1,4 +1,4 @@
-"""BRDF-Net: the reflectance at every point of the domain (paper, section 3)."""
+"""BRDF-Net: the material at every point of the domain (paper, section 3)."""
 
 import math
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ class Parameter(NamedTuple):
     name: str
     channels: int  #: 1 or 3
     low: float
-    high: float  #: inf: no upper end
-    start: float = 0.0  #: is added to the network's output, before that is brought into the range
+    high: float  #: inf: no upper limit
+    start: float = 0.0  #: added to the network's output before that is mapped to the range
 
 
 #: The paper's five numbers.
@@ -32,14 +32,13 @@ COOK_TORRANCE = (
 
 
 class MaterialNet(nn.Module):
-    """The parameters of a BSDF as functions of the domain point, each within its range.
+    """Base class of BRDF-Net: the parameters of a BSDF as functions of the domain point, each within its range.
 
-    What BRDF-Net is, and what a network of one's own in its place must be: a subclass with an `evaluate`, whose outputs
-    begin around 0. A fit says by `set_parameters` which parameters are meant, and how bright.
+    A subclass with a method `evaluate`, whose outputs are about 0 at first, can replace BRDF-Net.
     """
 
     bsdf_parameters: tuple[Parameter, ...]
-    scale: Tensor  #: order of magnitude of ρ in the scene's units of light
+    scale: Tensor  #: order of magnitude of the reflectances, in the scene's units of light
 
     def __init__(self, parameters: Sequence[Parameter] = COOK_TORRANCE, scale: float = 1.0) -> None:
         super().__init__()
@@ -47,42 +46,41 @@ class MaterialNet(nn.Module):
         self.set_parameters(parameters, scale)
 
     def set_parameters(self, parameters: Sequence[Parameter], scale: float) -> None:
-        """Take these parameters for what the outputs mean, in their order, a colour as three."""
+        """Set what the outputs of `evaluate` are: these parameters in this order; a colour takes three outputs."""
         self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.scale.fill_(scale)
 
     @property
     def outputs(self) -> int:
-        """How many functions these parameters take."""
+        """The number of outputs that the parameters need."""
         return sum(p.channels for p in self.bsdf_parameters)
 
     def evaluate(self, s: Tensor) -> Tensor:
-        """(..., outputs) numbers without bounds, about 0 at first, at domain points (..., 3)."""
+        """Unbounded values (..., outputs) at domain points (..., 3); about 0 at first."""
         raise NotImplementedError
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        """The parameters by name at domain points (..., 3): (..., 3) where they are colours, else (...).
+        """The parameters by name at domain points (..., 3): (..., 3) for colours, otherwise (...).
 
-        Softplus times `scale` keeps a parameter without an upper end above its lower one, a sigmoid the others in their
-        ranges: the networks see numbers near 1 whatever the photographer's units are.
+        A sigmoid maps outputs to a parameter's range. If the range has no upper limit, it is softplus times `scale`, so
+        that the network's outputs are near 1 in any unit of light.
         """
         raw = self.evaluate(s).float().split([p.channels for p in self.bsdf_parameters], -1)
         result = {}
         for parameter, x in zip(self.bsdf_parameters, raw):
-            x = x if parameter.channels == 3 else x[..., 0]
+            x = (x if parameter.channels == 3 else x[..., 0]) + parameter.start
             if math.isinf(parameter.high):
-                value = parameter.low + self.scale * F.softplus(x + parameter.start)
+                result[parameter.name] = parameter.low + self.scale * F.softplus(x)
             else:
-                value = parameter.low + (parameter.high - parameter.low) * torch.sigmoid(x + parameter.start)
-            result[parameter.name] = value
+                result[parameter.name] = parameter.low + (parameter.high - parameter.low) * torch.sigmoid(x)
         return result
 
 
 @register_network("brdfnet")
 class BRDFNet(MLP, MaterialNet):
-    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons. Or the parameters of another BSDF.
+    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons; or the parameters of another BSDF.
 
-    On the domain point s, not on the deformed point, unless `FittedObject.material_at` says so.
+    On the domain point s, not on the deformed point.
     """
 
     def __init__(
@@ -93,5 +91,5 @@ class BRDFNet(MLP, MaterialNet):
         self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
-        """What makes it anew; `scale` is among the weights."""
+        """The arguments of the constructor, but for `scale`, which is among the weights."""
         return {"parameters": [tuple(p) for p in self.bsdf_parameters], **self.encoding.arguments()}

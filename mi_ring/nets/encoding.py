@@ -5,11 +5,11 @@ from torch import Tensor, nn
 
 
 class PosEnc(nn.Module):
-    """PosEnc(x) = [cos(ωx), sin(ωx)] with ω = 1, 2, …, `frequencies`: linear, not powers of two.
+    """PosEnc(x) = [cos(ωx), sin(ωx)] maps points (..., 3) to features (..., 6 · frequencies).
 
-    Maps (..., 3) points to (..., 6 · frequencies) features, 96 of them for the paper's 16 frequencies.
-    Order of the features: all cosines, then all sines; within each, frequency-major (ω₁x, ω₁y, ω₁z, ω₂x, …).
-    `spacing`: `octaves` has ω = 1, 2, 4, …, 2^(frequencies − 1), as NeRF's; with `none` the features are the points.
+    `spacing`: with "linear", as in the paper, ω = 1, 2, …, frequencies; with "octaves", as in NeRF, ω = 1, 2, 4, …,
+    2^(frequencies − 1); with "none" the features are the points. Order of the features: all cosines, then all sines;
+    within each ω₁x, ω₁y, ω₁z, ω₂x, …
     """
 
     def __init__(self, frequencies: int = 16, spacing: str = "linear") -> None:
@@ -20,7 +20,7 @@ class PosEnc(nn.Module):
         self.width = 3 if spacing == "none" else 6 * frequencies
 
     def arguments(self) -> dict:
-        """What makes it anew, as the networks' arguments call it."""
+        """The arguments of the constructor, by the names that the networks use."""
         return {"encoding": self.spacing, "frequencies": self.frequencies}
 
     def omega(self, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -29,14 +29,14 @@ class PosEnc(nn.Module):
         return 2**k if self.spacing == "octaves" else k + 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features of points."""
+        """The features of points (..., 3)."""
         if self.spacing == "none":
             return x
         phase = (x[..., None, :] * self.omega(x.dtype, x.device)[:, None]).flatten(-2)
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
     def backward(self, features: Tensor, gradient: Tensor) -> Tensor:
-        """From the gradient of the features (n, width) to that of the points (n, 3), in float32 at least."""
+        """The gradient of the points (n, 3) from that of the features (n, width), at least in float32."""
         dtype = torch.promote_types(features.dtype, torch.float32)
         if self.spacing == "none":
             return gradient.to(dtype)

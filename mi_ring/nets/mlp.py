@@ -1,4 +1,4 @@
-"""The multilayer perceptron that both networks are, differentiated by hand."""
+"""The multilayer perceptron of both networks, with derivatives written by hand, which are faster."""
 
 import contextlib
 import contextvars
@@ -21,9 +21,9 @@ SLOPE = 0.01  #: of the leaky ReLU
 
 @contextlib.contextmanager
 def plain_autograd() -> Iterator[None]:
-    """Within it the networks are PyTorch's own operations: slower, but differentiable as often as one likes.
+    """A context manager in which networks use PyTorch's own operations: slower, but differentiable repeatedly.
 
-    For Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
+    It is needed for Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
     """
     token = _plain.set(True)
     try:
@@ -45,8 +45,7 @@ class MLP(nn.Module):
     def evaluate(self, x: Tensor) -> Tensor:
         """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
 
-        Differentiable once and by one backward pass, which frees what was kept for it; within `plain_autograd` as
-        often as one likes.
+        It can be differentiated once, by one backward pass; within `plain_autograd`, any number of times.
         """
         if _plain.get():
             x = self.encoding(x)
@@ -57,24 +56,24 @@ class MLP(nn.Module):
         return values.reshape(*x.shape[:-1], self.output.out_features)
 
     def operands(self, x: Tensor) -> list:
-        """What `_Evaluate` and Shape-Net's `_Flow` take last.
+        """The last arguments of `_Evaluate` and of Shape-Net's `_EulerSteps`.
 
-        The encoding, the precision of the products, whether gradients are wanted, weights and biases in turn.
+        The encoding, the type of the matrix products, whether gradients are needed, weights and biases by layer.
         """
-        dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # what autocast makes of it, on any device
+        dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # as autocast decides
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
         return [self.encoding, dtype, torch.is_grad_enabled(), *parameters]
 
 
 class Layers:
-    """An MLP's weights and biases in the precision of the products: values by `forward`, gradients by `backward`."""
+    """The layers of an MLP in the precision of the matrix products, with `forward` and `backward`."""
 
     def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters: Sequence[Tensor]) -> None:
         self.encoding, self.dtype = encoding, dtype
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
     def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
-        """Encoding and activations of the hidden layers, only the last unless `keep`, and output of points (n, 3)."""
+        """Encoding and activations of all hidden layers (without `keep`, the last ones) and output at points (n, 3)."""
         activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
             activations.append(F.leaky_relu_(F.linear(activations[-1], w, b), SLOPE))
@@ -83,12 +82,12 @@ class Layers:
         return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
 
     def zeros(self) -> list[Tensor]:
-        """To sum up the parameters' gradients in, in their order, in float32 at least."""
+        """Zeros to which the parameters' gradients are added, at least in float32."""
         dtype = torch.promote_types(self.dtype, torch.float32)
         return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
     def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
-        """From the gradient of the output to that of the points; those of the parameters are added to `sums`."""
+        """The gradient of the points from that of the output; the parameters' gradients are added to `sums`."""
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):
             sums[2 * k] += gradient.T @ activations[k]
@@ -100,7 +99,7 @@ class Layers:
 
 
 class _Evaluate(torch.autograd.Function):
-    """An MLP at points (n, 3). Only encoding and activations are kept, in the precision of the products."""
+    """An MLP at points (n, 3). It stores the encoding and the activations, in the precision of the products."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, encoding: PosEnc, dtype: torch.dtype, keep: bool, *parameters: Tensor) -> Tensor:

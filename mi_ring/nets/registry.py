@@ -1,4 +1,4 @@
-"""Networks by name: what `ring.pt` says instead of pickling classes."""
+"""Networks by name: `ring.pt` stores names of networks instead of pickled classes."""
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -8,24 +8,22 @@ from torch import nn
 
 from mi_ring.errors import InputError
 
-GROUP = "mi_ring.networks"  #: entry points of packages that bring networks along
+GROUP = "mi_ring.networks"  #: entry points by which other packages offer networks
 
 _networks: dict[str, type[nn.Module]] = {}
 
 
 def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
-    """A decorator that gives a class of networks the `name` by which `ring.pt` refers to it.
+    """A decorator that registers a class of networks under the `name` by which `ring.pt` refers to it.
 
-    `network(**arguments)` must make it anew, where `arguments` is the dictionary of plain data that its method of that
-    name returns; without such a method there are none. Its weights are those of its `state_dict`. A package can have
-    its networks found without being imported: by entry points of the group `mi_ring.networks`.
-
-    Raises ValueError if another class has the name.
+    The class may have a method `arguments`, which returns a dictionary of plain data; `network(**arguments)` must
+    then construct an equal network. Weights are saved by `state_dict`. Networks of other packages are found without an
+    import if they are entry points of the group `mi_ring.networks`. Raises ValueError if another class has the name.
     """
 
     def register(network: type[nn.Module]) -> type[nn.Module]:
         known = _networks.get(name)
-        if known is not None and names_of(known) != names_of(network):
+        if known is not None and qualified_name(known) != qualified_name(network):
             raise ValueError(f"network {name}: is registered already, as {known.__module__}.{known.__qualname__}")
         _networks[name] = network
         return network
@@ -33,15 +31,15 @@ def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
     return register
 
 
-def names_of(network: type) -> tuple[str, str]:
-    """What tells one class from another that was defined anew."""
+def qualified_name(network: type) -> tuple[str, str]:
+    """Module and name: equal for a class that was defined twice, as in a cell of a notebook."""
     return network.__module__, network.__qualname__
 
 
 def architecture_of(network: nn.Module) -> dict:
-    """What makes a network anew: its registered name and its arguments. Raises ValueError if it is not registered."""
+    """The registered name and the arguments of a network, for `build`. Raises ValueError if it is not registered."""
     for name, known in _networks.items():
-        if names_of(type(network)) == names_of(known):  # a cell of a notebook may have defined it once more
+        if qualified_name(type(network)) == qualified_name(known):
             arguments = getattr(network, "arguments", None)
             return {"name": name, "arguments": arguments() if arguments else {}}
     raise ValueError(f'{type(network).__name__}: has no name to be saved by; put @mi_ring.register_network("…") above '
@@ -49,11 +47,10 @@ def architecture_of(network: nn.Module) -> dict:
 
 
 def build(architecture: dict) -> Any:
-    """A network of this architecture, with random weights. Raises InputError if its name is not registered."""
+    """A network of an architecture, with random weights. Raises InputError if its name is not registered."""
     name = architecture["name"]
-    if name not in _networks:
-        for entry in entry_points(group=GROUP, name=name):
-            register_network(name)(entry.load())
+    for entry in entry_points(group=GROUP, name=name) if name not in _networks else ():
+        register_network(name)(entry.load())
     if name not in _networks:
         raise InputError(f'networks: was fitted with "{name}", which is not registered here (known: '
                          f"{', '.join(sorted(_networks))}); import the module that registers it first")  # fmt: skip

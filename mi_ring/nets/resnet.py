@@ -1,4 +1,4 @@
-"""What the ring is compared with: a plain ResNet, whose blocks do not share their weights (paper's ablation)."""
+"""A plain ResNet in place of Shape-Net, for the paper's ablation: its blocks do not share weights."""
 
 from typing import Any
 
@@ -7,17 +7,15 @@ from torch import nn
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import WIDTH
 from mi_ring.nets.registry import register_network
-from mi_ring.nets.shape_net import Flow, ShapeNet, VelocityField
-from mi_ring.nets.solvers import Velocity
+from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 
 
 @register_network("resnet")
 class ResNet(Flow):
-    """As deep as the ring, `steps` blocks `x ← x + Vₖ(x) / T`, but each with weights of its own: the flow of no field.
+    """`steps` blocks `x ← x + Vₖ(x) / T`, each with its own weights, so that it is not the flow of one field.
 
-    Together the blocks have as many parameters as the ring, as nearly as widths are whole numbers: they are narrower,
-    for T = 20 about 42 neurons wide instead of 256. Or `width` neurons each, which are T times as many parameters at
-    the ring's own 256.
+    By default all blocks together have as many parameters as Shape-Net: for T = 20 they are about 42 neurons wide.
+    With `width`, each has this number of neurons; at Shape-Net's 256 that is T times as many parameters.
     """
 
     def __init__(
@@ -30,19 +28,19 @@ class ResNet(Flow):
         self.blocks = nn.ModuleList(VelocityField(self.encoding, w) for w in widths)
 
     def arguments(self) -> dict:
-        """What makes it anew."""
+        """The arguments of the constructor."""
         return {"steps": self.steps, "width": self.width, **self.encoding.arguments()}
 
     def velocity_of(self, step: int) -> Velocity:
-        """Vₖ, of block k."""
+        """Vₖ of block k = `step`."""
         block: Any = self.blocks[step]
         return block.velocity
 
 
 def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
-    """Widths of blocks that have about as many parameters together as one of the ring's width.
+    """Widths of blocks that together have about as many parameters as one block of width `WIDTH`.
 
-    The first blocks are one neuron wider than the others, so that not half such a block is missing or too much.
+    The first blocks are one neuron wider than the others, to come as near as possible.
     """
 
     def parameters(width: int) -> int:
@@ -55,11 +53,8 @@ def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
     return [narrow + 1] * wide + [narrow] * (blocks - wide)
 
 
-def shape_net_of(kind: str, steps: int, solver: str, encoding: str, frequencies: int) -> Flow:
-    """The network in Shape-Net's place: the `ring`, a `resnet` of as many parameters, a `wide-resnet` of its width.
-
-    Raises InputError if the package that the solver needs is not installed.
-    """
+def shape_net_of(kind: str, steps: int, encoding: str, frequencies: int) -> Flow:
+    """Shape-Net (`ring`), a ResNet with as many parameters (`resnet`), or a ResNet of its width (`wide-resnet`)."""
     if kind == "ring":
-        return ShapeNet(steps, solver, encoding, frequencies)
+        return ShapeNet(steps, encoding, frequencies)
     return ResNet(steps, encoding, frequencies, WIDTH if kind == "wide-resnet" else None)

@@ -1,5 +1,6 @@
-"""Shape-Net: a recurrent ResNet that integrates a flow and carries the domain onto the object (paper, section 3)."""
+"""Shape-Net: a recurrent ResNet that integrates a flow from the domain to the object (paper, section 3)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,50 +11,48 @@ from mi_ring.nets.chunks import backward_in_chunks, forward_in_chunks
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import MLP, WIDTH, Layers, _plain
 from mi_ring.nets.registry import register_network
-from mi_ring.nets.solvers import SOLVERS, Velocity, dopri5, odeint
 
-SPEED = 2.0  #: bound of the velocity, per unit of time: what is opposite on the unit sphere can be reached
+SPEED = 2.0  #: bound of each component of the velocity: in unit time a point can cross the unit sphere
+
+Velocity = Callable[[Tensor], Tensor]
 
 
 class Flow(nn.Module):
     """Φ(x, t) = x + ∫₀ᵗ V(Φ(x, s)) ds of a time-invariant velocity field V, by Euler steps.
 
-    What Shape-Net is, and what a network of one's own in its place must be: a subclass with a `velocity`. Or any module
-    that has `forward`, `velocity`, `flow` and `steps` as here. Points live in the normalised frame, in which the start
-    domain is about the unit sphere; a small velocity at first keeps the fit's start there.
+    Base class of Shape-Net. To replace Shape-Net, derive a class with a method `velocity`, or write a module that has
+    `forward`, `velocity`, `flow` and `steps`. Points are in the normalised frame, where the domain is about the unit
+    sphere. The velocity should be small at first, so that the fit starts from the domain.
     """
 
     steps: int = 20  #: T: steps from the domain to the object
-    solver: str = "euler"  #: one of `mi_ring.nets.solvers.SOLVERS`; dopri5 takes steps of its own
 
     def velocity(self, x: Tensor) -> Tensor:
-        """V(x) for (..., 3) points, of the same shape and type."""
+        """V(x) at points (..., 3), of the same shape and type."""
         raise NotImplementedError
 
     def velocity_of(self, step: int) -> Velocity:
-        """V as it is in a step, counted from 0: the same in all of a flow, but not in those of a plain ResNet."""
+        """The velocity field of a step, counted from 0. Only a plain ResNet has a different one for each step."""
         return self.velocity
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Φ(x, steps / T): the first `steps` of the T steps, Euler's being `x ← x + V(x) / T`, of (V, 3) points."""
-        if self.solver == "dopri5":
-            return dopri5(self.velocity, x, steps / self.steps)
+        """Φ(x, steps / T) for points (V, 3): the first `steps` of T Euler steps `x ← x + V(x) / T`."""
         for step in range(steps):
-            x = SOLVERS[self.solver](self.velocity_of(step), x, 1 / self.steps)
+            x = x + 1 / self.steps * self.velocity_of(step)(x)
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Φ(x, time), `time` in [0, 1]; where that is between two steps, by a shorter one."""
+        """Φ(x, time) for points (V, 3), `time` in [0, 1]; between two steps it takes a shorter step."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
-        return SOLVERS[self.solver](self.velocity_of(steps), x, rest) if rest else x
+        return x + rest * self.velocity_of(steps)(x) if rest else x
 
 
 class VelocityField(MLP):
-    """V, one MLP, of 771 neurons in the paper.
+    """V, an MLP of 771 neurons in the paper.
 
-    It is bounded by `SPEED` (tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH 2022)
-    and starts at almost 0, so that the start surface equals the domain.
+    It is bounded by `SPEED` (by tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH
+    2022) and almost 0 at first, so that the start surface is the domain.
     """
 
     def __init__(self, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
@@ -63,44 +62,34 @@ class VelocityField(MLP):
             self.output.bias.zero_()
 
     def velocity(self, x: Tensor) -> Tensor:
-        """V(x) for (..., 3) points, of the same shape and type."""
+        """V(x) at points (..., 3), of the same shape and type."""
         return SPEED * torch.tanh(self.evaluate(x).to(x.dtype))
 
 
 @register_network("shapenet")
 class ShapeNet(VelocityField, Flow):
-    """The paper's flow, of one velocity field for all steps: the ring.
+    """The paper's flow: one velocity field for all steps."""
 
-    Raises InputError if the package that a `solver` needs is not installed.
-    """
-
-    def __init__(
-        self, steps: int = 20, solver: str = "euler", encoding: str = "linear", frequencies: int = 16
-    ) -> None:  # fmt: skip
+    def __init__(self, steps: int = 20, encoding: str = "linear", frequencies: int = 16) -> None:
         super().__init__(PosEnc(frequencies, encoding))
-        if solver not in SOLVERS:
-            raise ValueError(f"solver: is {solver}, must be one of {', '.join(SOLVERS)}")
-        if solver == "dopri5":
-            odeint()
-        self.steps, self.solver = steps, solver
+        self.steps = steps
 
     def arguments(self) -> dict:
-        """What makes it anew."""
-        return {"steps": self.steps, "solver": self.solver, **self.encoding.arguments()}
+        """The arguments of the constructor."""
+        return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """As `Flow.flow`, in bfloat16 under `torch.autocast`.
+        """`Flow.flow`, with products in bfloat16 under `torch.autocast`.
 
-        Differentiable once and by one backward pass, which frees what was kept for it; within
-        `mi_ring.nets.mlp.plain_autograd` as often as one likes.
+        It can be differentiated once, by one backward pass; within `plain_autograd`, any number of times.
         """
-        if _plain.get() or self.solver != "euler":
+        if _plain.get():
             return super().flow(x, steps)
-        return _Flow.apply(x, SPEED / self.steps, steps, *self.operands(x))
+        return _EulerSteps.apply(x, SPEED / self.steps, steps, *self.operands(x))
 
 
-class _Flow(torch.autograd.Function):
-    """Euler steps as long as `scale` at most. Of each the activations and the direction are kept, nothing else."""
+class _EulerSteps(torch.autograd.Function):
+    """Euler steps of length `scale` at most. For each it stores the activations and the direction."""
 
     @staticmethod
     def forward(
@@ -112,22 +101,22 @@ class _Flow(torch.autograd.Function):
         ctx.save_for_backward(*parameters)
 
         def flow(x: Tensor, keep: bool) -> tuple[Tensor, list]:
-            kept = []
+            stored = []
             for _ in range(steps):
                 activations, output = layers.forward(x, keep)
                 direction = torch.tanh(output.to(x.dtype))
                 x = x + scale * direction
                 if keep:
-                    kept.append((activations, direction))
-            return x, kept
+                    stored.append((activations, direction))
+            return x, stored
 
         return forward_in_chunks(ctx, flow, x, keep)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple:
-        def backward(g: Tensor, kept: list, sums: list[Tensor]) -> Tensor:
-            for activations, direction in reversed(kept):
+        def backward(g: Tensor, stored: list, sums: list[Tensor]) -> Tensor:
+            for activations, direction in reversed(stored):
                 g = g + ctx.layers.backward(ctx.scale * g * (1 - direction * direction), activations, sums)
             return g
 

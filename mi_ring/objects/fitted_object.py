@@ -1,4 +1,4 @@
-"""The ring: both networks, the domain and the normalisation, which together are a reconstructed object."""
+"""A reconstructed object: both networks, the domain and the normalisation."""
 
 from collections.abc import Sequence
 
@@ -12,16 +12,15 @@ from mi_ring.nets.shape_net import Flow, ShapeNet
 
 
 class FittedObject(nn.Module):
-    """A surface x(s) = center + radius · Φ(s) with a reflectance Ψ(s) for every point s of the domain.
+    """A surface x(s) = center + radius · Φ(s) with a material Ψ(s) at every point s of the domain.
 
-    `center` (3,) and `radius` are in scene units; `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML;
-    `indirect`: was interreflection part of the fit, so that it belongs into pictures? `material_at`: BRDF-Net is a
-    function of points of the "domain", or, to compare, of those of the "surface". `subdivisions`: the level to
-    sample the surface at; between the vertices of the fit the networks are less certain. `networks`: others than the
-    paper's, for which `steps`, `scale` and `parameters` are meant; as `mi_ring.nets.shape_net.Flow` and
-    `mi_ring.nets.brdf_net.MaterialNet` say. `ground` (2, 3): a point on the table that the object stands on, and the
-    table's unit normal; below it nothing is seen, and what the flow has there lies flat on it. `up` (3,) and `metres`,
-    the length of a scene unit, are for exports; None where they are not known.
+    `center` (3,) and `radius` are in scene units. `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
+    `indirect`: the fit included interreflection, so pictures do, too. `subdivisions`: the level at which to sample the
+    surface; the networks are less certain between the vertices of the fit. `networks` replace the paper's networks,
+    which are made by `steps`, `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and
+    `mi_ring.nets.brdf_net.MaterialNet`. `ground` (2, 3) is a point of the table below the object and the table's unit
+    normal; points below the table are moved up to it. `up` (3,), and `metres`, the length of a scene unit, are for
+    exports; None if they are unknown.
     """
 
     shape_net: Flow
@@ -35,11 +34,11 @@ class FittedObject(nn.Module):
         domain: Domain | None = None, parameters: Sequence[Parameter] = COOK_TORRANCE,
         bsdf: str = '<bsdf type="cooktorrance"/>', indirect: bool = False, steps: int = 20, subdivisions: int = 6,
         networks: tuple[Flow, MaterialNet] | None = None, ground: np.ndarray | Tensor | None = None,
-        up: Sequence[float] | np.ndarray | None = None, metres: float | None = None, material_at: str = "domain",
+        up: Sequence[float] | np.ndarray | None = None, metres: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.shape_net, self.brdf_net = networks or (ShapeNet(steps), BRDFNet(scale, parameters))
-        self.bsdf, self.indirect, self.subdivisions, self.material_at = bsdf, indirect, subdivisions, material_at
+        self.bsdf, self.indirect, self.subdivisions = bsdf, indirect, subdivisions
         self.register_buffer("center", torch.as_tensor(center, dtype=torch.float32))
         self.register_buffer("radius", torch.tensor(float(radius)))
         self.register_buffer("ground", None if ground is None else torch.as_tensor(ground, dtype=torch.float32))
@@ -48,21 +47,19 @@ class FittedObject(nn.Module):
         self.metres = None if metres is None else float(metres)
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
-        """Surface points (V, 3) [scene units] of domain points (V, 3), or where the flow has them at a `time`."""
-        return self.placed(self.shape_net(s, time))
+        """Surface points (V, 3) [scene units] of domain points (V, 3), at a `time` of the flow."""
+        return self.to_scene(self.shape_net(s, time))
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
-        """Parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
-        return self.brdf_net(s if self.material_at == "domain" else self.shape_net(s))
+        """The parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
+        return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """`surface` and `material`, by one pass of the flow. The material is that of the end of its time, always."""
-        moved = self.shape_net(s, time)
-        at_end = self.material_at == "surface" and time == 1
-        return self.placed(moved), self.brdf_net(moved) if at_end else self.material(s)
+        """`surface` and `material`."""
+        return self.surface(s, time), self.material(s)
 
-    def placed(self, points: Tensor) -> Tensor:
-        """Points (V, 3) of the normalised frame in scene units, those below the ground on it."""
+    def to_scene(self, points: Tensor) -> Tensor:
+        """Points (V, 3) of the normalised frame in scene units, none of them below the ground."""
         points = self.center + self.radius * points
         if self.ground is None:
             return points

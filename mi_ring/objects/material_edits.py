@@ -1,4 +1,4 @@
-"""Fitted materials: exchanged between objects, and edited."""
+"""Edits of fitted materials, and their transfer between objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,10 +10,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.sphere_map import SphericalMap
 from mi_ring.nets.brdf_net import MaterialNet
-from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 
@@ -25,52 +23,48 @@ class MaterialOptions:
     """Another material for the object."""
 
     material: Path | None = None
-    """Results folder of another fit: its material, on the shape of this one. Both must start from the same domain, or
-    from surfaces without handles; these meet on the sphere, where long limbs are small."""
+    """Results folder of another fit, whose material this object gets.
+    Both fits must start from the same domain or from surfaces without handles."""
     specular_scale: float = 1.0
-    """Factor of the specular reflectance."""
+    """Factor for the specular reflectance."""
     roughness_add: float = 0.0
-    """Is added to the roughness."""
+    """Number that is added to the roughness."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors of red, green and blue."""
+    """Factors for red, green and blue."""
 
 
-def dress(ring: FittedObject, options: MaterialOptions) -> None:
-    """Give a ring the material that the options ask for. Raises InputError if it cannot have it."""
+def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
+    """Apply the options to the material of an object. Raises InputError if they are not possible for it."""
     if options.material:
         other = load_fit(options.material)
-        ring.bsdf, ring.material_at = other.bsdf, "domain"
-        ring.brdf_net = other.brdf_net if other.material_at == "domain" else OnSurface(other.brdf_net, other.shape_net)
-        if not same_domain(ring, other):
-            here = SphericalMap(ring.domain, "--material: the shape")
-            there = SphericalMap(other.domain, f"{options.material}: --material")
-            ring.brdf_net = Carried(ring.brdf_net, here, there)
+        ring.bsdf, ring.brdf_net = other.bsdf, other.brdf_net
+        a, b = ring.domain, other.domain
+        same = type(a) is type(b) and np.array_equal(a.points, b.points) and np.array_equal(a.faces, b.faces)
+        if not same:
+            here, there = SphericalMap(a, "--material: the shape"), SphericalMap(b, f"{options.material}: --material")
+            ring.brdf_net = TransferredMaterial(ring.brdf_net, here, there)
         ring.indirect = ring.indirect and other.indirect
     gains: dict[str, ArrayLike] = {}
     offsets: dict[str, float] = {}
-    if options.specular_scale != 1:
-        at_least_0("--specular-scale", options.specular_scale)
-        gains = dict.fromkeys(named(ring, "--specular-scale", SPECULAR), options.specular_scale)
-    if options.tint != (1, 1, 1):
-        at_least_0("--tint", options.tint)
-        for name in named(ring, "--tint", [p.name for p in ring.brdf_net.bsdf_parameters if p.channels == 3]):
-            gains[name] = np.multiply(gains.get(name, 1.0), options.tint)
+    colours = [p.name for p in ring.brdf_net.bsdf_parameters if p.channels == 3]
+    scaled = ("--specular-scale", options.specular_scale, SPECULAR), ("--tint", options.tint, colours)
+    for option, gain, names in scaled:
+        if np.equal(gain, 1).all():
+            continue
+        if not (np.isfinite(gain).all() and np.min(gain) >= 0):
+            raise InputError(f"{option}: is {gain!r}, must be 0 or more")
+        for name in parameters_among(ring, option, names):
+            gains[name] = np.multiply(gains.get(name, 1.0), gain)
     if options.roughness_add != 0:
         if not np.isfinite(options.roughness_add):
             raise InputError(f"--roughness-add: is {options.roughness_add}, must be a number")
-        offsets = dict.fromkeys(named(ring, "--roughness-add", ROUGHNESS), options.roughness_add)
+        offsets = dict.fromkeys(parameters_among(ring, "--roughness-add", ROUGHNESS), options.roughness_add)
     if gains or offsets:
-        ring.brdf_net = Edited(ring.brdf_net, gains, offsets)
+        ring.brdf_net = EditedMaterial(ring.brdf_net, gains, offsets)
 
 
-def at_least_0(option: str, value: ArrayLike) -> None:
-    """Raise InputError for a factor, or one of several, that is negative or not finite."""
-    if not (np.isfinite(value).all() and np.min(value) >= 0):
-        raise InputError(f"{option}: is {value!r}, must be 0 or more")
-
-
-def named(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
-    """Which of these parameters the material has. Raises InputError if none."""
+def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
+    """The parameters of the material that are among `names`. Raises InputError if there is none."""
     parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
     found = [name for name in parameters if name in names]
     if not found:
@@ -78,38 +72,20 @@ def named(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
     return found
 
 
-def same_domain(a: FittedObject, b: FittedObject) -> bool:
-    """Are two rings functions on the same surface?"""
-    if isinstance(a.domain, Sphere) or isinstance(b.domain, Sphere):
-        return type(a.domain) is type(b.domain)
-    return np.array_equal(a.domain.points, b.domain.points) and np.array_equal(a.domain.faces, b.domain.faces)
-
-
-class OnSurface(MaterialNet):
-    """A BRDF-Net that is a function of points of its own object's surface, as one of points of the domain."""
-
-    def __init__(self, net: MaterialNet, shape_net: Flow) -> None:
-        super().__init__(net.bsdf_parameters, float(net.scale))
-        self.net, self.shape_net = net, shape_net
-
-    def forward(self, s: Tensor) -> dict[str, Tensor]:
-        return self.net(self.shape_net(s.reshape(-1, 3)).reshape(s.shape))
-
-
-class Carried(MaterialNet):
-    """A BRDF-Net on another domain than its own, by way of the sphere."""
+class TransferredMaterial(MaterialNet):
+    """A BRDF-Net of the domain `there` as a function on the domain `here`; points correspond by the sphere."""
 
     def __init__(self, net: MaterialNet, here: SphericalMap, there: SphericalMap) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))
         self.net, self.here, self.there = net, here, there
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        own = self.there.to_domain(self.here.to_sphere(s.detach().reshape(-1, 3).cpu().numpy()))
-        return self.net(torch.from_numpy(own).to(s).reshape(s.shape))
+        points = self.there.to_domain(self.here.to_sphere(s.detach().reshape(-1, 3).cpu().numpy()))
+        return self.net(torch.from_numpy(points).to(s).reshape(s.shape))
 
 
-class Edited(MaterialNet):
-    """A BRDF-Net with gains and offsets, by the names of its parameters, kept within the parameters' ranges."""
+class EditedMaterial(MaterialNet):
+    """A BRDF-Net with gains and offsets by parameter name; its values stay within the parameters' ranges."""
 
     def __init__(self, net: MaterialNet, gains: dict, offsets: dict) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))

@@ -1,8 +1,7 @@
-"""`ring.pt`: a reconstructed object as a file, its networks by their registered names."""
+"""`ring.pt`: the file of a reconstructed object, which refers to networks by their registered names."""
 
 import io
 import math
-import sys
 import zipfile
 from pathlib import Path
 
@@ -18,57 +17,68 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
 
-FORMAT = 4  #: version of the file
-FINEST, MOST_STEPS = 8, 10_000  #: level, Euler steps
+FORMAT = 4  #: version of the file format
+MAX_LEVEL, MAX_STEPS = 8, 10_000  #: of the mesh; Euler steps
 ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
-    """What `ring.pt` holds, to be written by `write_state`. Raises ValueError for networks that are not registered."""
+    """The content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
     domain = None
-    if not isinstance(ring.domain, Sphere):  # as tensors: numpy arrays are not among what torch loads safely
+    if not isinstance(ring.domain, Sphere):  # as tensors: torch loads no numpy arrays with `weights_only`
         domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
     return {
         "format": FORMAT, "mi_ring": __version__, "networks": ring.state_dict(), "domain": domain,
         "shape_net": architecture_of(ring.shape_net), "brdf_net": architecture_of(ring.brdf_net),
         "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
-        "up": ring.up, "metres": ring.metres, "material_at": ring.material_at,
+        "up": ring.up, "metres": ring.metres,
     }  # fmt: skip
 
 
 def ring_of(state: dict) -> FittedObject:
     """The inverse of `ring_state`.
 
-    Raises InputError for networks that are not registered here; KeyError, RuntimeError, TypeError or ValueError for
-    what no `ring_state` can be.
+    Raises InputError for networks that are not registered here and for settings of older versions that are gone, and
+    KeyError, RuntimeError, TypeError or ValueError if the state is damaged.
     """
+    refuse("material_at", state.get("material_at", "domain"), "domain")
+    shape_net = state["shape_net"]
+    if shape_net["name"] == "shapenet":
+        arguments = dict(shape_net["arguments"])
+        refuse("solver", arguments.pop("solver", "euler"), "euler")
+        shape_net = {**shape_net, "arguments": arguments}
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
         require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
     ring = FittedObject(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
-        subdivisions=state["subdivisions"], networks=(build(state["shape_net"]), build(state["brdf_net"])),
+        subdivisions=state["subdivisions"], networks=(build(shape_net), build(state["brdf_net"])),
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
-        material_at=sys.intern(state.get("material_at", "domain")),  # as that of a fit anew, so that files are equal
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
-    require_sound(ring)
+    require_valid(ring)
     return ring
 
 
-def require_sound(ring: FittedObject) -> None:
-    """Raise ValueError for an object that no fit has."""
+def refuse(name: str, found: object, supported: str) -> None:
+    """Raise InputError for a setting of an older version that is not the one still supported."""
+    if found != supported:
+        raise InputError(f"{name}: is {found}, only {supported} is supported; fit again, or use the version of mi_ring "
+                         "that wrote this file")  # fmt: skip
+
+
+def require_valid(ring: FittedObject) -> None:
+    """Raise ValueError for an object that no fit can have made."""
     for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
         require(bool(value.isfinite().all()), f"{name} is not finite")
     require(float(ring.radius) > 0, f"the radius is {float(ring.radius):.4g}")
-    require(type(ring.subdivisions) is int and 0 <= ring.subdivisions <= FINEST, f"level {ring.subdivisions}")
+    require(type(ring.subdivisions) is int and 0 <= ring.subdivisions <= MAX_LEVEL, f"level {ring.subdivisions}")
     steps = getattr(ring.shape_net, "steps", 1)
-    require(type(steps) is int and 1 <= steps <= MOST_STEPS, f"{steps} steps")
+    require(type(steps) is int and 1 <= steps <= MAX_STEPS, f"{steps} steps")
     require(ring.metres is None or 0 < ring.metres < math.inf, f"a unit of {ring.metres} m")
     require(ring.ground is None or ring.ground.shape == (2, 3), "ground is no place and normal")
     require(ring.up is None or (len(ring.up) == 3 and all(map(math.isfinite, ring.up))), "up is no direction")
     require(isinstance(ring.bsdf, str), "the BSDF is no XML")
-    require(ring.material_at in ("domain", "surface"), f"a material at {ring.material_at}")
     points, faces = ring.domain.points, ring.domain.faces
     require(points.shape[1:] == faces.shape[1:] == (3,) and bool(np.isfinite(points).all()), "the domain is no mesh")
     require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")
@@ -77,13 +87,13 @@ def require_sound(ring: FittedObject) -> None:
 
 
 def require(condition: bool, otherwise: str) -> None:
-    """Raise ValueError unless it holds."""
+    """Raise ValueError, with the message `otherwise`, unless the condition holds."""
     if not condition:
         raise ValueError(otherwise)
 
 
-def migrated(state: dict) -> dict:
-    """The state of a file of format 3, which mi_ring 0.1 wrote, as of today."""
+def upgraded(state: dict) -> dict:
+    """A state of format 3, which mi_ring 0.1 wrote, converted to the present format."""
     return state | {
         "format": FORMAT, "shape_net": {"name": "shapenet", "arguments": {"steps": state["steps"]}},
         "brdf_net": {"name": "brdfnet", "arguments": {"parameters": state["parameters"]}},
@@ -92,42 +102,36 @@ def migrated(state: dict) -> dict:
 
 
 def read_state(path: Path, kind: str, advice: str) -> dict:
-    """What `write_state` wrote. Raises InputError if there is no such file, if it is damaged or not of this `kind`.
+    """A state that `write_state` wrote. Raises InputError if there is no such file, or if it is damaged or not `kind`.
 
-    Files of before had no seal; they have but the checks of zip files.
+    Older files have no checksum of ours, only those of zip files.
     """
     try:
         content = path.read_bytes()
-        whole = is_sealed(content)
+        intact = is_sealed(content)
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        if isinstance(state, dict) and state.pop("sealed", False) and not whole:
-            raise ValueError("the seal is broken")
-        if not whole:
-            require_intact(content)
+        if isinstance(state, dict) and state.pop("sealed", False) and not intact:
+            raise ValueError("the checksum is wrong")
+        if not intact:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                if damaged := archive.testzip():
+                    raise ValueError(f"{damaged} is damaged")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {advice}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
-    except Exception as error:  # what torch makes of other bytes is of any kind
-        # Its words are advice to load files that may run anything.
+    except Exception as error:  # torch raises errors of many kinds for other files
+        # Torch's message is left out: it advises to load files that may run any code.
         raise InputError(f"{path}: not {kind}, or damaged; {advice}") from error
     if not isinstance(state, dict):
         raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")
     return state
 
 
-def require_intact(content: bytes) -> None:
-    """Raise ValueError if a part of a zip file is not as it was, as far as that tells."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        if damaged := archive.testzip():
-            raise ValueError(f"{damaged} is damaged")
-
-
 def load_fit(path: str | Path) -> FittedObject:
-    """The object of a fit: from its results folder, or from a `ring.pt`.
+    """The object of a fit, from its results folder or its `ring.pt`.
 
-    Raises InputError if there is none, if it was written by a newer mi_ring or by one that is too old, and if its
-    networks are not registered here.
+    Raises InputError if there is no such file, if its version cannot be read, or if its networks are not registered.
     """
     path = Path(path)
     path = path / "ring.pt" if path.is_dir() else path
@@ -139,7 +143,7 @@ def load_fit(path: str | Path) -> FittedObject:
         raise InputError(f"{path}: format version {version}, of mi_ring {state.get('mi_ring', '0.1 or older')}; this "
                          f"one, {__version__}, reads versions 3 and {FORMAT}")  # fmt: skip
     try:
-        return ring_of(migrated(state) if version == 3 else state)
+        return ring_of(upgraded(state) if version == 3 else state)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (AttributeError, IndexError, KeyError, TypeError, RuntimeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What photographs do not tell where their light was unknown, in words."""
+"""A warning about what a fit under unknown light cannot determine."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from mi_ring.system.files import read_json
 
 
 def ambiguity(light: str) -> str:
-    """Of a light as a fit's `summary` names it; empty where the scene says what it is."""
+    """The warning for a light, named as in a fit's summary; empty if the capture gives the light."""
     if light == "capture":
         return ""
     text = ("The light was unknown: how bright it is, and of which colour, cannot be told from the object's. "
@@ -17,7 +17,7 @@ def ambiguity(light: str) -> str:
 
 
 def ambiguity_of(run: Path) -> str:
-    """The same of a results folder, or of a ring.pt in one."""
+    """The warning for a results folder, or for a ring.pt in one."""
     record = read_json((run if run.is_dir() else run.parent) / "calibration.json")
     light = record.get("light") if isinstance(record, dict) else None
     return ambiguity(light) if isinstance(light, str) else ""

@@ -1,4 +1,4 @@
-"""Texture atlases: a fitted surface cut open and flattened, and its networks baked into images."""
+"""Texture atlases: a fitted surface is cut open and flattened, and its networks are baked into images."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,13 +14,13 @@ from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
-CUT = 5  #: level at which surfaces are cut open, at most: the time grows with the square of the triangles
+MAX_CUT_LEVEL = 5  #: the finest level that is cut open: the time grows with the square of the number of triangles
 PADDING = 4  #: between charts [texels]
-CHUNK = 2**17  #: texels that the networks see at once
+CHUNK = 2**17  #: texels that the networks evaluate at once
 
 
 class Atlas(NamedTuple):
-    """A mesh whose vertices are split along seams, V of them."""
+    """A mesh with V vertices, which are split along the seams."""
 
     s: np.ndarray  # (V, 3) domain points
     uv: np.ndarray  # (V, 2) in [0, 1], the first texel at (0, 0)
@@ -28,28 +28,28 @@ class Atlas(NamedTuple):
     normals: np.ndarray  # (V, 3), the same on both sides of seams
     tangents: np.ndarray  # (V, 4), as in glTF: along u, and the sign of the bitangent n × t
     faces: np.ndarray  # (F, 3)
-    whole: np.ndarray  # (V,) vertex of the surface before it was cut: equal on both sides of seams
+    uncut: np.ndarray  # (V,) number of the vertex in the surface before it was cut: the same on both sides of seams
     subdivisions: int
 
 
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
-    """Cut a surface open for square textures of so many texels a side, by xatlas (Young 2018, after Thekla)."""
-    points, faces = ring.domain.sample(min(subdivisions, CUT))
+    """Cut a surface open for square textures with `resolution` texels a side, by xatlas (Young 2018, after Thekla)."""
+    points, faces = ring.domain.sample(min(subdivisions, MAX_CUT_LEVEL))
     xatlas = need("xatlas", "textures")
     options = xatlas.PackOptions()
     options.resolution, options.padding, options.bilinear = resolution, PADDING, True
     charts = xatlas.Atlas()
-    charts.add_mesh(flowed(ring, points.numpy(), time), faces.astype(np.uint32))  # of size 1: it drops small triangles
+    charts.add_mesh(flow_points(ring, points.numpy(), time), faces.astype(np.uint32))  # normalised: it drops tiny faces
     charts.generate(pack_options=options)
     origin, faces, uv = charts[0]
     s, uv, faces = points.numpy()[origin], np.clip(uv, 0, 1), faces.astype(np.int64)
-    for _ in range(subdivisions - CUT):
+    for _ in range(subdivisions - MAX_CUT_LEVEL):
         s, uv, faces = subdivide(ring, s, uv, faces)
     return assemble(ring, s, uv, faces, subdivisions, time)
 
 
-def flowed(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """The surface (V, 3) in the normalised frame at domain points (V, 3)."""
+def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
+    """The surface points (V, 3) in the normalised frame of domain points (V, 3)."""
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
@@ -57,7 +57,7 @@ def flowed(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Every triangle cut in four, new points on the domain; `more` (V, n) is interpolated like `uv`."""
+    """Cut every triangle into four. New vertices are on the domain; `uv` and `more` (V, n) are interpolated."""
     columns = [s, uv, *more]
     ends = np.cumsum([c.shape[1] for c in columns])[:-1]
     finer, faces = trimesh.remesh.subdivide(np.hstack(columns).astype(np.float64), faces)
@@ -69,49 +69,47 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """An atlas with its vertices, normals and tangents."""
-    points, normals, whole = seamless_surface(ring, s, faces, time)
-    # The derivative of the position by u: constant on a triangle, averaged at vertices, weighted by area.
+    """An atlas with vertices, normals and tangents."""
+    points, normals, uncut = seamless_surface(ring, s, faces, time)
+    # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
     (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
     sign = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
     along = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * sign[:, None]
-    tangents, signs = np.zeros((len(s), 3)), np.zeros(len(s))
-    for corner in faces.T:
-        np.add.at(tangents, corner, along)
-        np.add.at(signs, corner, sign)
+    incidence = trimesh.geometry.index_sparse(len(s), faces)  # (V, F): which triangles a vertex belongs to
+    tangents, signs = incidence @ along, incidence @ sign
     tangents -= (tangents * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(tangents, axis=1, keepdims=True)
-    aside = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])  # where there is no direction, any will do
+    aside = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])  # for a zero derivative, any direction
     tangents = np.where(length > 0, tangents / np.maximum(length, 1e-30), aside)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    # With u to the right and v down, as glTF has it, the bitangent n × t points to smaller v.
+    # In glTF u points right and v down, so that the bitangent n × t points to smaller v.
     tangents = np.hstack([tangents, np.where(signs < 0, 1.0, -1.0)[:, None]])
     vertices = ring.center.cpu().numpy() + float(ring.radius) * points
-    return Atlas(s, uv, vertices, normals, tangents, faces, whole, subdivisions)
+    return Atlas(s, uv, vertices, normals, tangents, faces, uncut, subdivisions)
 
 
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (V, 3) in the normalised frame, smooth normals (V, 3) that know of no seam, and `Atlas.whole`."""
-    once, whole = np.unique(s, axis=0, return_inverse=True)
-    whole = whole.ravel()
-    points = flowed(ring, once, time)
-    normals = trimesh.Trimesh(points, whole[faces], process=False).vertex_normals
-    return points[whole], normals[whole], whole
+    """Points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, and `Atlas.uncut`."""
+    unique, uncut = np.unique(s, axis=0, return_inverse=True)
+    uncut = uncut.ravel()
+    points = flow_points(ring, unique, time)
+    normals = trimesh.Trimesh(points, uncut[faces], process=False).vertex_normals
+    return points[uncut], normals[uncut], uncut
 
 
 @dataclass(frozen=True)
 class Texels:
-    """What the texels of a square texture show; those between charts show what the nearest ones in charts do."""
+    """The texels of a square texture. A texel between charts is a copy of the nearest texel in a chart."""
 
     s: np.ndarray  # (N, 3) domain points of the N texels in charts
-    normals: np.ndarray  # (N, 3), unit length, in the tangent frame of the atlas: along t, along the bitangent, along n
-    index: np.ndarray  # (resolution, resolution): which of the N
+    normals: np.ndarray  # (N, 3) unit normals in the tangent frame of the atlas: along t, the bitangent, n
+    index: np.ndarray  # (resolution, resolution) texel, 0 … N − 1
 
 
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
-    """The texels of an atlas. The normals are those of the surface at the level of the fit, if that is finer."""
+    """The texels of an atlas. Normals are those of the surface at the level of the fit, if that is finer."""
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
     for _ in range(ring.subdivisions - atlas.subdivisions):
@@ -133,7 +131,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
         return (values[corners] * weights).sum(1).astype(np.float32)
 
     n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(normals)
-    # m = x t + y b + z n, solved: what a renderer does with the interpolated frame, inverted.
+    # Solve m = x t + y b + z n, which a renderer computes with the interpolated frame.
     n, t, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, t, b))
     local = np.stack([(np.cross(p, q) * m).sum(1) for p, q in ((b, n), (n, t), (t, b))], 1)
     local *= np.sign((np.cross(b, n) * t).sum(1, keepdims=True))
@@ -145,7 +143,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """The parameters of the material at domain points (N, 3): (N, 3) or (N,) by name."""
+    """The parameters of the material by name, (N, 3) or (N,), at domain points (N, 3)."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
         parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]

@@ -1,4 +1,4 @@
-"""What a fit has refined besides surface and material, in the report: a table and pictures of before and after."""
+"""The refined calibration in the report: a table, and charts of before and after."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.ambiguity import ambiguity
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering.spherical_harmonics import COUNT, seen_from_within
+from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
@@ -18,15 +18,15 @@ LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
 class Panel(NamedTuple):
-    """That part of the page."""
+    """That part of the report."""
 
     rows: list[tuple[str, str, str, str]]  #: what, before, after, standard deviation
     chart: str  #: a data URI
-    untold: str  #: what the photographs do not tell
+    untold: str  #: what photographs cannot tell, in words
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
-    """`refined`: a fit's `summary`, of what has made the one capture the other."""
+    """`refined`: the content of calibration.json, which changed capture `before` into `after`."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
     light = refined.get("light", "capture")
     if light != "capture":
@@ -36,7 +36,7 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """An unknown in words: what, before, after, standard deviation."""
+    """The row of an unknown: what it is, before, after, standard deviation."""
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
@@ -49,14 +49,14 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def numbers(value: Any, digits: int) -> str:
-    """A few of them."""
+    """Numbers as text."""
     values = np.ravel(value)
     least = 1e-6 * np.abs(values).max()  # below it is rounding
     return ", ".join(f"{0.0 if abs(v) < least else v:.{digits}g}" for v in values)
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """The unknowns of photographs, in the median."""
+    """Medians of the unknowns of single photographs."""
     entries = list(photographs.values())
     result = []
     for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved, median [scene units]")):
@@ -73,7 +73,7 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """How well photographs that were kept out are explained, as `mi_ring.fitting.validation` has it."""
+    """A sentence about held-out photographs, from the result of `mi_ring.fitting.validation`."""
     if not held_out:
         return "not asked, for the fit ended early"
     if "unexplained" not in held_out:
@@ -87,7 +87,7 @@ def held_out_text(held_out: dict[str, Any]) -> str:
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
-    """Cameras and lights from above, and how far each photograph's picture or power has moved."""
+    """Cameras and lights from above, and for each photograph how far it moved, or its power."""
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
     light = after.photographs.room if after.photographs.dark else None
@@ -104,8 +104,8 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     plan.set_title("cameras, lights (•) and lamps (★) from above [scene units]", fontsize=9)
     for bars in others:
         if light is not None:
-            frame = "camera" if light[COUNT:].any() else "world"
-            radiance = seen_from_within(light, np.eye(4)).clip(min=0)
+            frame = "camera" if light[PER_FRAME:].any() else "world"
+            radiance = room_envmap(light, np.eye(4)).clip(min=0)
             bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
             bars.axis("off")
             bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)
@@ -125,8 +125,8 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
 
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
-    """Cameras, the way they look, and their lights, in a plane of these two directions (2, 3)."""
-    poses = np.stack([sensor.camera.to_world for sensor in capture.sensors])
+    """Cameras, their directions and their lights, projected to a plane of two directions (2, 3)."""
+    poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
     axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)
     lights = capture.photographs.lights

@@ -1,4 +1,4 @@
-"""Views to render: the photographs of a scene, or a camera or a light that goes round."""
+"""Views to render: the photographs of a scene, or the frames of a film."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,89 +11,96 @@ from scipy.spatial.transform import Rotation
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.loading import reason
+from mi_ring.capture.loading import photographs_in, reason
 from mi_ring.capture.scenefile import photograph_element
 from mi_ring.errors import InputError, require_file
-from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.camera import Camera, moved_pose
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import MaterialOptions
-from mi_ring.output.atlas import flowed
-from mi_ring.rendering import bridge
-from mi_ring.rendering.photograph_lights import Lights
+from mi_ring.output.atlas import flow_points
+from mi_ring.rendering import prediction
 from mi_ring.rendering.photographs import LANES, Photographs
-from mi_ring.scene.assembly import assembled, is_table, own_emitters
-from mi_ring.scene.lights import Light, is_flash, is_room
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.assembly import assembled, is_table, top_level_emitters
+from mi_ring.scene.lights import is_flash, is_room
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.system.progress import progress
 
-SLANT = 45.0  #: between the light and the camera in a light orbit, seen from the object [deg]
+SLANT = 45.0  #: angle between light and camera in a light orbit, seen from the object [deg]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig(MaterialOptions):
     """Render every photograph of a scene with the object of a finished fit, under the same file names.
 
-    Or a film of it: the camera goes round, the light does, or the start surface flows into the object. OUT is then a
-    folder of numbered pictures, or an MP4 file.
+    Or render a film: the camera goes around the object, the light does, or the start surface flows into the object. OUT
+    is then a folder of numbered pictures, or an MP4 file.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs to take; their image files need not exist."""
+    """Mitsuba XML file with the photographs to render. Their image files need not exist."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """Folder for the pictures: linear where the scene names an EXR file, 8-bit sRGB for PNG and JPEG. Or FILE.mp4."""
+    """Folder for the pictures, or a file FILE.mp4 for a film.
+    A picture is linear if the scene names an EXR file, and 8-bit sRGB if it names PNG or JPEG."""
     turntable: int = 0
-    """So many pictures from a camera that goes once around the object, and its light with it."""
+    """Number of pictures from a camera that goes once around the object, together with its light."""
     light_orbit: int = 0
-    """So many pictures with a light that goes once around the line from the object to the camera, at 45°."""
+    """Number of pictures with a light that goes once around the line from the object to the camera.
+    The light is 45 degrees away from that line."""
     flow: int = 0
-    """So many pictures of the flow, from where the fit started to the object."""
+    """Number of pictures of the flow, from the surface where the fit started to the object."""
     view: str | None = None
-    """File name of the photograph from whose place, and under whose light, these three are seen. Default: the first."""
+    """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
+    Without it: the first photograph."""
     width: int | None = None
-    """Pixels across the pictures of these three. Default: as many as that photograph has."""
+    """Width of the pictures of --turntable, --light-orbit and --flow [px].
+    Without it: the width of that photograph."""
     up: tuple[float, float, float] | None = None
-    """Axis of the turntable, and up in the environment. Default: the mean up of the cameras."""
+    """Axis of the turntable, which is also up for --envmap.
+    Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
-    """Environment, an EXR or HDR file of latitude and longitude, to light the object instead."""
+    """Environment map that lights the object in place of the scene's lights: EXR or HDR, latitude and longitude."""
     integrator: str | None = None
-    """Mitsuba's name of the integrator. Default: photometric; with --envmap path, which sees all interreflection. A
-    `table` is part of photometric's pictures alone."""
+    """Mitsuba's name of the integrator.
+    Without it: photometric, or path with --envmap. path shows all interreflection, but no `table`."""
     format: Literal["png", "exr"] | None = None
-    """Of the pictures. Default: as the scene's file names say; png for the three films."""
+    """Format of the pictures. Without it: as the scene's file names say, and png for the three films."""
     fps: float = 24.0
-    """Pictures per second of an MP4 file."""
+    """Pictures per second of a film."""
     time: float = 1.0
-    """Of the flow: 0 is where it starts, 1 the object."""
+    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
     subdivisions: int | None = None
-    """Level of the mesh: about 10 · 4^level vertices. Default: that of the fit."""
+    """Level of the mesh, with about 10 · 4^level vertices. Without it: that of the fit."""
     spp: int = SPP
-    """Samples per pixel."""
+    """Samples per pixel. More give less noise."""
 
     @property
     def count(self) -> int:
-        """Pictures of the turntable, the light orbit or the flow; 0 without them."""
+        """The number of pictures of the turntable, the light orbit or the flow; 0 without these."""
         return self.turntable or self.light_orbit or self.flow
 
     @property
     def film(self) -> bool:
-        """Is one file to be written, not a folder of pictures?"""
+        """Is the output one film, instead of a folder of pictures?"""
         return self.out.suffix.lower() == ".mp4"
 
 
 @dataclass(frozen=True)
-class View:
-    """A picture to render."""
+class RenderedView:
+    """A view to render."""
 
-    sensor: Any  #: a `photograph`
-    name: str
-    time: float  # of the flow
+    shot: Shot
+    name: str  #: of the picture's file
+    time: float  #: of the flow
+    sensor: Any = None  #: the scene's own, if there is one, with the film that the scene gives it
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """The integrator to render with; None for our own photographs. Raises InputError if there is none of that name."""
+    """Mitsuba's integrator to render with; None for `photometric`. Raises InputError if there is none of this name."""
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
         return None
@@ -106,21 +113,22 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
     return integrator
 
 
-def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[View]:
-    """What to render: the scene's photographs, or those that a film is made of."""
+def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
+    """The views to render: the photographs of the scene, or the frames of a film."""
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
-        return [View(sensor, name, config.time) for sensor, name in zip(capture.sensors, names)]
+        several = zip(capture.shots, names, photographs_in(capture.scene), strict=True)
+        return [RenderedView(shot, name, config.time, sensor) for shot, name, sensor in several]
     if config.view is not None and config.view not in capture.names:
         first = capture.names[0]
         raise InputError(f"{config.scene}: --view: {config.view} is no photograph of it; the first is {first}")
-    sensor = capture.sensors[capture.names.index(config.view) if config.view else 0]
+    shot = capture.shots[capture.names.index(config.view) if config.view else 0]
     up = up_of(capture, config)
-    width, height = sensor.size
-    size = (config.width, round(height * config.width / width)) if config.width else sensor.size
-    camera, middle = framed(sensor.camera._replace(size=size), ring, up)
-    light = Lights.of([sensor])[0]
+    width, height = shot.size
+    size = (config.width, round(height * config.width / width)) if config.width else shot.size
+    camera, middle = framed(shot.camera._replace(size=size), ring, up)
+    light = shot.own_light
     if config.light_orbit and not light.rgb.any():
         raise InputError(f"{config.scene}: --light-orbit: photographs have no light of their own that could go round; "
                          "give --turntable")  # fmt: skip
@@ -129,49 +137,42 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         seen_from, lit_from, time = camera, light, config.time
         if config.turntable:
             turn = Rotation.from_rotvec(2 * np.pi * k / count * up).as_matrix()
-            to_world = camera.to_world.copy()
-            to_world[:3, :3] = turn @ to_world[:3, :3]
-            to_world[:3, 3] = middle + turn @ (camera.position - middle)
-            seen_from, lit_from = camera._replace(to_world=to_world), moved(light, middle, turn)
+            to_world = moved_pose(camera.to_world, 1.0, turn, middle - turn @ middle)
+            around = middle if light.kind == "point" else 0.0
+            lit_from = light._replace(vector=around + turn @ (light.vector - around))
+            seen_from = camera._replace(to_world=to_world)
         elif config.light_orbit:
             slant = np.radians(SLANT)
-            aside = np.sin(slant) * camera.up - np.cos(slant) * camera.forward  # toward the light
+            aside = np.sin(slant) * camera.up - np.cos(slant) * camera.forward  # direction to the light
             aside = Rotation.from_rotvec(2 * np.pi * k / count * camera.forward).apply(aside)
             reach = np.linalg.norm(light.vector - middle)
             lit_from = light._replace(vector=middle + reach * aside if light.kind == "point" else -aside)
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        cone = 0.0 if config.light_orbit else sensor.cone  # about the axis of a camera that the light goes with
-        element = photograph_element("view", "none", seen_from, lit_from, falloff=cone)
-        views.append(View(load_element(element), name, time))
+        falloff = 0.0 if config.light_orbit else shot.falloff  # about the axis of a camera that the light goes with
+        views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, files=Files(Path("none"))), name, time))
     return views
 
 
-def moved(light: Light, middle: np.ndarray, turn: np.ndarray) -> Light:
-    """A light that went around a point (3,) by a rotation (3, 3)."""
-    around = middle if light.kind == "point" else 0.0
-    return light._replace(vector=around + turn @ (light.vector - around))
-
-
 def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
-    """The direction (3,) that is up, unit length."""
+    """The up direction (3,), unit length: that of the options, otherwise that of the capture."""
     return capture.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """A camera in the place of another, turned so that all of the object and of its start are in the middle.
+    """A camera at the same position that shows the whole object, and the fit's start surface, in its middle.
 
-    Returns it and the middle (3,) of the object [scene units].
+    Also returns the middle (3,) of the object [scene units].
     """
     s = ring.domain.sample(3)[0].numpy()
-    points = np.concatenate([flowed(ring, s, time) for time in (0.0, 1.0)]).astype(float)
+    points = np.concatenate([flow_points(ring, s, time) for time in (0.0, 1.0)]).astype(float)
     points = ring.center.cpu().numpy() + float(ring.radius) * points
     middle = (points[len(s) :].min(0) + points[len(s) :].max(0)) / 2
     to_world = camera.to_world.astype(float)
     distance = np.linalg.norm(camera.position - middle)
     forward = (middle - camera.position) / distance
-    if np.linalg.norm(np.cross(up, forward)) < 1e-2:  # from above: up is where it was in the photograph
+    if np.linalg.norm(np.cross(up, forward)) < 1e-2:  # it looks along `up`: use the up direction of the photograph
         up = camera.up
     left = np.cross(up, forward)
     left /= np.linalg.norm(left)
@@ -181,18 +182,29 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
     return Camera(to_world, np.full(2, focal), np.array(camera.size) / 2, camera.size), middle
 
 
-def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> bridge.Surface:
-    """The object in its scene, in the light that the options ask for."""
-    if config.envmap:
-        return under(config.envmap, up_of(capture, config), capture, ring)
-    return bridge.Surface(capture.scene, capture.shape, ring, as_it_is=integrator_of(config) is not None)
+def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
+    """The object in its scene, in the scene's light, or in an environment and fixed lamps. Then there is no table."""
+    if not config.envmap:
+        return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
+    to_world = np.eye(4)
+    to_world[:3, :3] = Rotation.align_vectors([up_of(capture, config)], [[0.0, 1.0, 0.0]])[0].as_matrix()  # y is up
+    require_file(config.envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
+    try:
+        turn = mi.ScalarTransform4f(to_world.tolist())
+        light = mi.load_dict({"type": "envmap", "filename": str(config.envmap), "to_world": turn})
+    except RuntimeError as error:
+        raise InputError(f"{config.envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
+    lamps = [e for e in top_level_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
+    others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
+    object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
+    return Surface(assembled([object_, *others], [light, *lamps]), object_, ring, in_scene_units=True)
 
 
 def render_views(
-    surface: bridge.Surface, ring: FittedObject, views: list[View], integrator: mi.Integrator | None, shadows: bool,
-    config: RenderConfig, room: np.ndarray | None = None,
+    surface: Surface, ring: FittedObject, views: list[RenderedView], integrator: mi.Integrator | None,
+    capture: Capture, config: RenderConfig,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """The pictures, (H, W, 3) linear radiance each; `room`: its light, as `Photographs` have it."""
+    """The pictures, (H, W, 3) linear radiance each."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
@@ -200,42 +212,25 @@ def render_views(
             surface.show(ring, s, faces, view.time)
             shown = view.time
         if integrator:
-            yield in_passes(surface.scene, view.sensor, integrator, config.spp, seed=k)
+            sensor = view.sensor or load_element(photograph_element(view.shot))
+            yield render_passes(surface.scene, sensor, integrator, config.spp, seed=k)
         else:
-            one = Photographs.of([view.sensor], room)
-            rgb, _ = bridge.draw(surface, one, spp=config.spp, shadows=shadows, indirect=ring.indirect)
+            one = Photographs.of([view.shot], capture.room)
+            rgb, _ = prediction.draw(surface, one, spp=config.spp, shadows=capture.shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 
 
-def in_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """A picture (H, W, 3) by an integrator of Mitsuba's: the mean of passes of `LANES` rays each.
+def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
+    """A picture (H, W, 3) by an integrator of Mitsuba, as the mean of passes, so that memory does not grow with `spp`.
 
-    Or of one ray per pixel, where there are more pixels: memory does not grow with `spp`.
+    A pass has at most `LANES` rays, or one ray per pixel if there are more pixels.
     """
-    width, height = sensor.size
+    width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))
-    total, left, number = np.zeros(3, np.float32), spp, 0
-    while left:
-        samples = min(at_once, left)
-        # Seeds of passes must not be those of other pictures.
-        own: Any = seed + (number << 16)  # Mitsuba's annotation knows no int
-        picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=own)
+    total = np.zeros(3, np.float32)
+    for number, first in enumerate(range(0, spp, at_once)):
+        samples = min(at_once, spp - first)
+        pass_seed: Any = seed + (number << 16)  # unlike the seeds of other pictures; Mitsuba's annotation lacks int
+        picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=pass_seed)
         total = total + samples / spp * np.array(picture)[..., :3]
-        left, number = left - samples, number + 1
     return total
-
-
-def under(envmap: Path, up: np.ndarray, capture: Capture, ring: FittedObject) -> bridge.Surface:
-    """The object and what else is in the scene but its table, lit by an environment and by fixed lamps."""
-    to_world = np.eye(4)
-    to_world[:3, :3] = Rotation.align_vectors([up], [[0.0, 1.0, 0.0]])[0].as_matrix()  # Mitsuba's up is y
-    require_file(envmap, "an EXR or HDR file of latitude and longitude", "--envmap")
-    try:
-        turn = mi.ScalarTransform4f(to_world.tolist())
-        light = mi.load_dict({"type": "envmap", "filename": str(envmap), "to_world": turn})
-    except RuntimeError as error:
-        raise InputError(f"{envmap}: --envmap: cannot be read ({reason(error).rsplit('] ', 1)[-1]})") from error
-    lamps = [e for e in own_emitters(capture.scene) if not (e.is_environment() or is_flash(e) or is_room(e))]
-    others = [s for s in capture.scene.shapes() if s != capture.shape and not is_table(s)]
-    object_ = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
-    return bridge.Surface(assembled([object_, *others], [light, *lamps]), object_, ring, as_it_is=True)

@@ -1,4 +1,4 @@
-"""The contact sheet of a capture: where everything is, masks and hull over the photographs."""
+"""The contact sheet of a capture: a plan of cameras and lights, and the photographs with masks and hull."""
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,8 +15,8 @@ from mi_ring.metrics.mask_agreement import CONFORMS
 from mi_ring.metrics.surfaces import hits
 from mi_ring.scene.plain_mesh import scene_of
 
-CELL, LINE = 200, 16  # of the contact sheet: its photographs, lines of text [px]
-GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # names of photographs
+CELL, LINE = 200, 16  # size of a photograph, height of a line of text [px]
+GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # colours of the photographs' names
 RED, YELLOW, GREEN = (255, 51, 51), (255, 220, 40), (26, 255, 51)
 LEGEND = (
     ("mask", RED), ("unsure, or beyond the lens: not used", YELLOW), ("hull of all masks", GREEN),
@@ -25,8 +25,8 @@ LEGEND = (
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
-    """Cameras (with the way they look), lights and the normalising sphere from above and from two sides."""
-    cameras, lights = np.stack([sensor.camera.to_world for sensor in capture.sensors]), capture.photographs.lights
+    """Cameras with their viewing directions, lights and the normalising sphere, along the three axes."""
+    cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())
     away = away[lights.rgb().any(1)]
@@ -48,7 +48,7 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
 
 
 def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
-    """The contact sheet: where everything is; on photographs the visual hull, masks' outlines and what says nothing."""
+    """The contact sheet: the plan; then photographs with the visual hull, the masks' outlines and invalid pixels."""
     top = plan(capture, center, radius)
     try:
         mesh = capture.hull.surface() if capture.hull else None
@@ -60,13 +60,13 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
     above, lines = top.height + LINE, -(-len(some) // columns)
     page = Image.new("RGB", (max(top.width, columns * CELL), above + lines * (CELL + LINE)))
     page.paste(top)
-    draw, place_of_text = ImageDraw.Draw(page), 2.0
+    draw, left = ImageDraw.Draw(page), 2.0
     for words, colour in LEGEND:
-        draw.text((place_of_text, top.height + 2), words, fill=colour)
-        place_of_text += draw.textlength(words) + 16
+        draw.text((left, top.height + 2), words, fill=colour)
+        left += draw.textlength(words) + 16
     white = 3 * capture.exposure()
     for place, k in enumerate(some):
-        scale = max(1, max(capture.sensors[k].size) // CELL)
+        scale = max(1, max(capture.shots[k].size) // CELL)
         observed, _, mask, masked, valid = capture.observe([k], scale)
         picture = linear_to_srgb(observed[0].numpy() / white)
         if hull:
@@ -81,7 +81,6 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
         x, y = place % columns * CELL, above + place // columns * (CELL + LINE)
         page.paste(cell, (x, y + LINE))
         agreement = rows[k].agreement
-        fits = "" if agreement is None else f"  {agreement:.0%}"
-        good = agreement is None or agreement >= CONFORMS
-        draw.text((x + 2, y + 2), rows[k].name + fits, fill=GOOD if good else DOUBTED)
+        text = rows[k].name + ("" if agreement is None else f"  {agreement:.0%}")
+        draw.text((x + 2, y + 2), text, fill=GOOD if agreement is None or agreement >= CONFORMS else DOUBTED)
     return page

@@ -1,4 +1,4 @@
-"""Pictures and films of rendered views."""
+"""Files of rendered pictures and films."""
 
 import contextlib
 import os
@@ -15,33 +15,33 @@ from mi_ring.system.files import writing
 
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
-    """Write (H, W, 3) linear values: EXR as they are, anything else as 8-bit sRGB."""
+    """Write linear values (H, W, 3): unchanged as EXR, otherwise as 8-bit sRGB."""
     exr = path.suffix.lower() == ".exr"
     write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 
 
 def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:
-    """Write an MP4 file that browsers play, H.264 with an even number of rows and columns, whole or not at all.
+    """Write pictures (H, W, 3), linear, as an H.264 film in an MP4 file that browsers play; complete or not at all.
 
-    Raises InputError if it cannot be written. `size`: (width, height) [px] of the pictures.
+    `size`: (width, height) [px] of the pictures; odd ones get another column or row. Raises InputError if it fails.
     """
     partial = path.with_name(f".{path.stem}.partial.mp4")
     odd_columns, odd_rows = size[0] % 2, size[1] % 2
-    # Not through imageio, which takes a film that was cut short, on a full disk for instance, for a whole one.
+    # Not by imageio, which does not notice a truncated film, for instance on a full disk.
     ffmpeg = subprocess.Popen(
         [
             imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
             "-s", f"{size[0] + odd_columns}x{size[1] + odd_rows}", "-r", str(fps), "-i", "-",
             "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
-            # Which colours are meant: browsers would guess by the size of the pictures.
+            # The colour space; otherwise browsers guess it from the size of the pictures.
             "-vf", "scale=out_color_matrix=bt709,setparams=color_primaries=bt709:color_trc=iec61966-2-1",
             f"file:{partial}",
         ],
-        stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # Ctrl-C is for us alone
+        stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # so that Ctrl-C does not stop it
     )  # fmt: skip
     try:
-        assert ffmpeg.stdin is not None  # but a pipe
-        with contextlib.suppress(OSError):  # it ended, and says below why
+        assert ffmpeg.stdin is not None  # it is a pipe
+        with contextlib.suppress(OSError):  # ffmpeg has ended; its message is read below
             for picture in pictures:
                 image = to_bytes(linear_to_srgb(picture))
                 ffmpeg.stdin.write(np.pad(image, ((0, odd_rows), (0, odd_columns), (0, 0)), "edge").tobytes())

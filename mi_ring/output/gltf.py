@@ -1,6 +1,5 @@
 """glTF: a fitted object with metallic-roughness textures, as one GLB file."""
 
-import io
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -13,45 +12,45 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
 from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
-from mi_ring.scene.mesh_attributes import constants
-from mi_ring.scene.visibility import View, seen_of
+from mi_ring.scene.mesh_attributes import constant_values
+from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.scene.xml_elements import load_bsdf
 
-LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled`, but for glTF's
+LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled` that glTF lacks
 
 
 class Material(NamedTuple):
-    """Reflectances of N points in glTF's terms; what is linear is not encoded."""
+    """The material of N points as parameters of glTF; all are linear."""
 
-    base_color: np.ndarray  # (N, 3), linear, in [0, 1]
+    base_color: np.ndarray  # (N, 3), in [0, 1]
     metallic: np.ndarray  # (N,)
     roughness: np.ndarray  # (N,), the square root of the microfacet width
     specular: np.ndarray  # (N,), the weight of KHR_materials_specular
-    specular_color: float  # its factor of F₀
-    scale: float  # by which the reflectances were multiplied to stay within [0, 1]
+    specular_color: float  # the factor of F₀ in this extension
+    scale: float  # of the reflectances, so that they stay within [0, 1]
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
-    """A BSDF, Mitsuba's XML, with these parameters, (N, 3) or (N,) by name, in glTF's terms.
+    """The parameters of glTF for a BSDF, given as Mitsuba's XML, with parameters (N, 3) or (N,) by name.
 
     ``cooktorrance``: glTF's dielectric is (1 − F) c/π + F D V with Schlick's F between F₀ = min(0.04 k, 1) w and
-    F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25 F is w at all angles, and
+    F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25, F is w at all angles, and
 
         w = 4 ρᵞ,  c = π ρᵈ / (1 − w),  roughness = √r
 
-    make it ρᵈ + 4 ρᵞ D V, with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: G is Smith's product in ours,
-    correlated with height in glTF. c ≤ 1 and w ≤ 1 where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in
-    a hundred does not, the intensities of the lights were not true, and all ρ are scaled until it does.
+    make it ρᵈ + 4 ρᵞ D V, with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: ours is Smith's product, glTF's is
+    correlated with height. c ≤ 1 and w ≤ 1 hold where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in a
+    hundred does not, the lights' intensities were wrong, and all ρ are scaled.
 
-    ``diffuse`` is itself in glTF; ``principled`` without its further lobes nearly is. Raises InputError for others.
+    ``diffuse`` is exact in glTF, and ``principled`` without other lobes nearly so. Raises InputError for other BSDFs.
     """
     loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")
-    fixed, params = constants(loaded), mi.traverse(loaded)
+    fixed, params = constant_values(loaded), mi.traverse(loaded)
     count = len(next(iter(values.values())))
 
     def value(name: str, channels: int = 1) -> np.ndarray:
@@ -82,12 +81,12 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
 
 def require_expressible(ring: FittedObject) -> None:
-    """Raise InputError if the material of a ring cannot be told in glTF's terms: before the work of baking it."""
+    """Raise InputError if glTF cannot express the material of an object; call it before baking, which takes long."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """The material's images (H, W, 3 or 4) uint8, by the names that glTF has for them."""
+    """The textures of a material, (H, W, 3 or 4) uint8, by their names in glTF."""
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": linear_to_srgb(material.base_color),
@@ -98,23 +97,15 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
     return {name: to_bytes(image)[texels.index] for name, image in images.items()}
 
 
-def png(image: np.ndarray) -> bytes:
-    """An (H, W, 3 or 4) uint8 image."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
-    views: Sequence[View] | None = None, up: Sequence[float] | None = None,
+    views: Sequence[MaskedCamera] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """The object as a GLB file with textures of `resolution` texels a side.
 
-    Positions are in scene units and in the scene's frame; with `metres`, the length of one, a node scales them to
-    glTF's, and with `up` (3,) it turns them so that this is its y. The parameters of the
-    BSDF are also there as they are, as vertex attributes (_DIFFUSE, …) and, what they mean, in the material's extras.
-    With `views` there is also _SEEN: 1 where one of them shows the object, 0 where none does.
+    Positions are in scene units and in the scene's frame. A node scales them to metres if `metres`, the length of a
+    scene unit, is given, and turns `up` (3,) to the y axis. The BSDF's own parameters are vertex attributes (_DIFFUSE,
+    …), which the material's extras describe. With `views`, _SEEN is 1 where a view shows the object, and 0 elsewhere.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
@@ -122,9 +113,9 @@ def glb(
     material = metallic_roughness(ring.bsdf, reflectances(ring, texels.s))
     exact, seen = reflectances(ring, atlas.s), None
     if views is not None:
-        s = np.zeros((atlas.whole.max() + 1, 3), np.float32)
-        s[atlas.whole] = atlas.s
-        seen = seen_of(ring, s, atlas.whole[atlas.faces], views)[0][atlas.whole]
+        s = np.zeros((atlas.uncut.max() + 1, 3), np.float32)
+        s[atlas.uncut] = atlas.s
+        seen = visible_points(ring, s, atlas.uncut[atlas.faces], views)[0][atlas.uncut]
     return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen, up)
 
 
@@ -132,52 +123,43 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """The GLB file of a mesh, its `textures` and its exact parameters at the vertices; `seen` (V,) bool."""
-    file = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="mi_ring"))
+    """The GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
     blob = bytearray()
+    buffer_views: list[pygltflib.BufferView] = []
+    accessors: list[pygltflib.Accessor] = []
+    sources: list[pygltflib.Image] = []
 
     def view(content: bytes, target: int | None = None) -> int:
         blob.extend(b"\0" * (-len(blob) % 4))
         place = pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(content), target=target)
-        file.bufferViews.append(place)
+        buffer_views.append(place)
         blob.extend(content)
-        return len(file.bufferViews) - 1
+        return len(buffer_views) - 1
 
-    def accessor(array: np.ndarray, bounds: bool = False, target: int = pygltflib.ARRAY_BUFFER) -> int:
-        kind = pygltflib.UNSIGNED_INT if array.dtype == np.uint32 else pygltflib.FLOAT
-        columns = 1 if array.ndim == 1 else array.shape[1]
-        entry = pygltflib.Accessor(
-            bufferView=view(array.tobytes(), target), componentType=kind, count=len(array),
-            type=["", "SCALAR", "VEC2", "VEC3", "VEC4"][columns],
-        )  # fmt: skip
-        if bounds:
-            entry.min, entry.max = array.min(0).tolist(), array.max(0).tolist()
-        file.accessors.append(entry)
-        return len(file.accessors) - 1
+    def accessor(array: np.ndarray, target: int = pygltflib.ARRAY_BUFFER) -> int:
+        accessors.append(pygltflib.Accessor(
+            bufferView=view(array.tobytes(), target), count=len(array),
+            componentType=pygltflib.UNSIGNED_INT if array.dtype == np.uint32 else pygltflib.FLOAT,
+            type="SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
+        ))  # fmt: skip
+        return len(accessors) - 1
 
     def texture(name: str, kind: Any = pygltflib.TextureInfo) -> Any:
-        file.images.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=view(png(images[name]))))
-        file.textures.append(pygltflib.Texture(sampler=0, source=len(file.images) - 1))
-        return kind(index=len(file.textures) - 1)
+        content = view(encoded_picture(Image.fromarray(images[name])))
+        sources.append(pygltflib.Image(name=name, mimeType="image/png", bufferView=content))
+        return kind(index=len(sources) - 1)
 
-    attributes = pygltflib.Attributes(
-        POSITION=accessor(atlas.vertices.astype(np.float32), bounds=True),
-        NORMAL=accessor(atlas.normals.astype(np.float32)),
-        TANGENT=accessor(atlas.tangents.astype(np.float32)),
-        TEXCOORD_0=accessor(atlas.uv.astype(np.float32)),
-    )
-    for name, values in exact.items():
-        setattr(attributes, f"_{name.upper()}", accessor(values.astype(np.float32)))
-    if seen is not None:
-        attributes._SEEN = accessor(seen.astype(np.float32))
+    vertices = {"POSITION": atlas.vertices, "NORMAL": atlas.normals, "TANGENT": atlas.tangents, "TEXCOORD_0": atlas.uv}
+    vertices |= {f"_{name.upper()}": values for name, values in exact.items()}
+    vertices |= {} if seen is None else {"_SEEN": seen}
+    attributes = pygltflib.Attributes()
+    for name, values in vertices.items():
+        setattr(attributes, name, accessor(values.astype(np.float32)))
+    bounds, positions = accessors[0], atlas.vertices.astype(np.float32)
+    bounds.min, bounds.max = positions.min(0).tolist(), positions.max(0).tolist()
     indices = accessor(atlas.faces.astype(np.uint32).ravel(), target=pygltflib.ELEMENT_ARRAY_BUFFER)
-    file.samplers.append(pygltflib.Sampler(
-        magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
-        wrapS=pygltflib.CLAMP_TO_EDGE, wrapT=pygltflib.CLAMP_TO_EDGE,
-    ))  # fmt: skip
     specular = texture("specularTexture")
-    file.extensionsUsed.append("KHR_materials_specular")
-    file.materials.append(pygltflib.Material(
+    fitted = pygltflib.Material(
         name="fitted",
         pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
             baseColorTexture=texture("baseColorTexture"), metallicRoughnessTexture=texture("metallicRoughnessTexture")
@@ -189,16 +171,23 @@ def assemble_glb(
         extras={"mi_ring": {
             "bsdf": bsdf, "attributes": {name: f"_{name.upper()}" for name in exact}, "scale": material.scale,
         }},
-    ))  # fmt: skip
-    file.meshes.append(pygltflib.Mesh(primitives=[
-        pygltflib.Primitive(attributes=attributes, indices=indices, material=0)
-    ]))  # fmt: skip
-    extras = {"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"}
-    turn = None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist()
-    scale = [metres] * 3 if metres else None
-    file.nodes.append(pygltflib.Node(name="object", mesh=0, scale=scale, rotation=turn, extras=extras))
-    file.scenes.append(pygltflib.Scene(nodes=[0]))
-    file.scene = 0
-    file.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
+    )  # fmt: skip
+    node = pygltflib.Node(
+        name="object", mesh=0, scale=[metres] * 3 if metres else None,
+        rotation=None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist(),
+        extras={"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"},
+    )  # fmt: skip
+    sampler = pygltflib.Sampler(
+        magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,
+        wrapS=pygltflib.CLAMP_TO_EDGE, wrapT=pygltflib.CLAMP_TO_EDGE,
+    )  # fmt: skip
+    file = pygltflib.GLTF2(
+        asset=pygltflib.Asset(version="2.0", generator="mi_ring"), scene=0, scenes=[pygltflib.Scene(nodes=[0])],
+        nodes=[node], materials=[fitted], extensionsUsed=["KHR_materials_specular"],
+        meshes=[pygltflib.Mesh(primitives=[pygltflib.Primitive(attributes=attributes, indices=indices, material=0)])],
+        textures=[pygltflib.Texture(sampler=0, source=k) for k in range(len(sources))], samplers=[sampler],
+        images=sources, accessors=accessors, bufferViews=buffer_views,
+        buffers=[pygltflib.Buffer(byteLength=len(blob))],
+    )  # fmt: skip
     file.set_binary_blob(bytes(blob))
     return b"".join(file.save_to_bytes())

@@ -1,4 +1,4 @@
-"""index.html: one page that shows many fits, with a picture and the figures of each report."""
+"""index.html: a page that shows many fits, with a picture and the figures of each report."""
 
 import base64
 import contextlib
@@ -15,34 +15,35 @@ from urllib.parse import quote
 import jinja2
 from PIL import Image
 
+from mi_ring.images import encoded_picture
 from mi_ring.output.results import read_log
 from mi_ring.system.files import relative_to, write_file
 from mi_ring.version import __version__
 
-SIDE = 160  #: of the pictures, at most [px]
-#: Figures of the page by their names in a report, and what they are.
+SIDE = 160  #: largest side of the pictures [px]
+#: Figures of the page: names in a report, names on the page, explanations.
 FIGURES = {
-    "PSNR of the photographs": ("PSNR", "of the predicted photographs, sRGB; the more the better"),
-    "Silhouettes": ("silhouettes", "intersection over union of the predicted ones and the masks; 1 is the best"),
+    "PSNR of the photographs": ("PSNR", "of the predicted photographs, sRGB; higher is better"),
+    "Silhouettes": ("silhouettes", "intersection over union of predictions and masks; 1 is best"),
     "Mesh": ("mesh", "its size"),
     "Fit time": ("time", "of the fit, without start and report"),
 }
-UNEXPLAINED = "unexplained", "share of the photographs' light that the fit does not predict, last; the less the better"
+UNEXPLAINED = "unexplained", "share of the photographs' light that the fit does not predict; lower is better"
 STATES = "done", "running", "interrupted", "waiting", "failed"  #: of fits
 
 
 class Entry(NamedTuple):
-    """A fit: how it is called, how far it is, what there is to say of it, and the folder of its results."""
+    """A row of the page: a fit."""
 
     name: str
     state: str  #: of STATES
-    text: str
-    folder: Path
-    log: Path  #: what the fit has printed
+    text: str  #: about its progress, or its error
+    folder: Path  #: its results
+    log: Path  #: its output
 
 
 def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
-    """The page of all fits. While they are `running` a browser reads it anew now and then."""
+    """Write the page of all fits. While they are `running`, browsers reload it from time to time."""
     template = resources.files("mi_ring.output").joinpath("index.html.jinja").read_text("utf-8")
     rows = [row_of(entry, out) for entry in entries]
     states = [entry.state for entry in entries]
@@ -55,12 +56,12 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
 
 
 def row_of(entry: Entry, out: Path) -> dict:
-    """What the page shows of a fit."""
+    """The content of the page's row for a fit."""
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
-        told, picture = shown_of(report, report.stat().st_mtime_ns)
-        figures |= told
+        reported, picture = report_summary(report, report.stat().st_mtime_ns)
+        figures |= reported
     with contextlib.suppress(OSError, LookupError, TypeError, ValueError):
         figures[UNEXPLAINED[0]] = f"{read_log(entry.folder)[-1]['unexplained']:.1%}"
     return {**entry._asdict(), "figures": figures, "picture": picture, "link": link_to(report, out),
@@ -68,32 +69,24 @@ def row_of(entry: Entry, out: Path) -> dict:
 
 
 def link_to(file: Path, out: Path) -> str | None:
-    """As the page in `out` has it; None if there is no such file."""
+    """The link to a file from a page in `out`; None if there is no such file."""
     return quote(relative_to(out.resolve(), file.resolve())) if file.is_file() else None
 
 
 @functools.lru_cache(maxsize=4096)
-def shown_of(report: Path, written: int) -> tuple[dict[str, str], str | None]:
-    """Figures and picture of a report as it was `written`: the page is made anew whenever one of many fits goes on."""
+def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
+    """The figures of a report, without explanations, and the prediction of its first photograph, small, as a data URI.
+
+    Cached by the file's time `modified`: the page is written again whenever one of many fits makes progress.
+    """
     page = report.read_text("utf-8")
-    return figures_of(page), thumbnail_of(page)
-
-
-def figures_of(report: str) -> dict[str, str]:
-    """The figures of a report, the explanations in brackets left out."""
-    cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", report)
-    told = {html.unescape(name): html.unescape(value) for name, value in cells}
-    return {short: re.split(r" \(|, | intersection", told[name])[0]
-            for name, (short, _) in FIGURES.items() if name in told}  # fmt: skip
-
-
-def thumbnail_of(report: str) -> str | None:
-    """The prediction of a report's first photograph as a data URI, small."""
-    found = re.search(r'class="over" src="data:image/\w+;base64,([^"]*)"', report)
+    cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", page)
+    values = {html.unescape(name): html.unescape(value) for name, value in cells}
+    figures = {short: re.split(r" \(|, | intersection", values[name])[0]
+               for name, (short, _) in FIGURES.items() if name in values}  # fmt: skip
+    found = re.search(r'class="over" src="data:image/\w+;base64,([^"]*)"', page)
     if not found:
-        return None
+        return figures, None
     picture = Image.open(io.BytesIO(base64.b64decode(found[1]))).convert("RGB")
     picture.thumbnail((SIDE, SIDE))
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=85)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return figures, "data:image/jpeg;base64," + base64.b64encode(encoded_picture(picture, "JPEG", quality=85)).decode()

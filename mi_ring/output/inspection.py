@@ -1,6 +1,5 @@
-"""Whether a capture is usable and what is wrong with it: a table, findings and a contact sheet."""
+"""Is a capture usable, and what is wrong with it? A table, findings and a contact sheet."""
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,8 @@ from PIL import Image
 
 from mi_ring.capture.capture import Capture, sphere_of_cameras
 from mi_ring.geometry.hull import NoHull
-from mi_ring.metrics.capture_findings import capture_findings, drop_empty, facing, measure, quality_table
+from mi_ring.images import encoded_picture
+from mi_ring.metrics.capture_findings import capture_findings, facing, measure, quality_table, without_empty_masks
 from mi_ring.metrics.mask_agreement import agreements
 from mi_ring.output.capture_sheet import capture_sheet
 from mi_ring.system.files import write_file, writing
@@ -18,30 +18,29 @@ from mi_ring.system.progress import progress
 
 @dataclass(frozen=True)
 class Inspection:
-    """What there is to say of a capture."""
+    """The result of `inspect`."""
 
     text: str  #: the table of photographs and the findings
-    findings: list[str]  #: what is to be mended
+    findings: list[str]  #: the problems to mend
     page: Image.Image  #: the contact sheet
 
     def save(self, path: Path, field: str) -> None:
         """Write the contact sheet as PNG. Raises InputError, about `field`, if it cannot be written."""
         with writing(f"{path}: {field}"):
             path.parent.mkdir(parents=True, exist_ok=True)
-        buffer = io.BytesIO()
-        self.page.save(buffer, "PNG")
-        write_file(path, buffer.getvalue())
+        write_file(path, encoded_picture(self.page))
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Measure a capture. Empty masks, which are findings, are taken from it."""
+    """Measure a capture. Empty masks are findings; the other findings are made as if they were not there."""
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     """As `inspect`; `advance` is called after each of its four steps."""
-    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in drop_empty(capture)]
+    capture, empty = without_empty_masks(capture)
+    found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:
         center, radius = capture.sphere()
     except NoHull as error:

@@ -1,8 +1,7 @@
-"""A scene for Mitsuba without mi_ring: textures and stock plugins alone."""
+"""A scene for Mitsuba without mi_ring: textures and stock plugins only."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -14,45 +13,45 @@ from mi_ring.images import write_image
 from mi_ring.output import gltf
 from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
-from mi_ring.rendering.photograph_lights import Lights
-from mi_ring.rendering.spherical_harmonics import room_of, seen_from_within
+from mi_ring.rendering.spherical_harmonics import room_envmap, room_of
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
 
 
-def first_photograph(run: Path) -> tuple[Any, np.ndarray | None]:
-    """The first photograph of a fit, as its scene.xml has it, and the room of that.
+def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
+    """The first photograph in a fit's scene.xml, and the light of the room.
 
-    Raises InputError if there is none, or if nothing of what lights it can be exported.
+    Raises InputError if there is no such file, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
-    scene, sensors = open_scene(run / "scene.xml")
+    scene, shots = open_scene(run / "scene.xml")
     room = room_of(scene)
-    if room is None and not Lights.of(sensors[:1])[0].rgb.any():
+    if room is None and not shots[0].own_light.rgb.any():
         raise InputError(f"{run}/scene.xml: a scene for Mitsuba takes the photographs' own light, of which there is "
                          "none; give an OBJ or GLB file, and light it yourself")  # fmt: skip
-    return sensors[0], room
+    return shots[0], room
 
 
 def write_scene(
-    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], photograph: Any,
+    path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], shot: Shot,
     room: np.ndarray | None,
 ) -> list[Path]:  # fmt: skip
-    """A scene with the textured object, and the camera and the light of a photograph, of stock plugins alone.
+    """Write a scene with the textured object and a photograph's camera and light; returns the paths of its files.
 
-    If that has none, the light of its `room` (BASIS, 3).
+    If the photograph has no light, the scene has the light of the `room` (BASIS, 3).
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
     params = mi.traverse(mesh)
-    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's know of the seams
+    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's own have seams
     params.update()
     files.append(path.with_name(f"{path.stem}_object.ply"))
     write_ply(mesh, files[-1])
 
     def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray) -> None:
-        """A texture (N, 3) or (N,) of the texels."""
+        """Add a texture with values (N, 3) or (N,) at the texels."""
         files.append(path.with_name(f"{path.stem}_{name}.exr"))
         write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
         texture = ElementTree.SubElement(parent, "texture", name=name, type="bitmap")
@@ -83,13 +82,13 @@ def write_scene(
             parent = next(e for e in element.iter() if texture in e)
             parent.remove(texture)
             bitmap(parent, name, values[name])
-    light = Lights.of([photograph])[0]
-    scene.append(perspective_element(photograph.camera, atlas.vertices))
+    light = shot.own_light
+    scene.append(perspective_element(shot.camera, atlas.vertices))
     if light.rgb.any():
-        scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # for reflectances that were scaled
+        scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # reflectances are scaled
     elif room is not None:
         files.append(path.with_name(f"{path.stem}_environment.exr"))
-        radiance = seen_from_within(room, photograph.camera.to_world).clip(min=0) / scale
+        radiance = room_envmap(room, shot.camera.to_world).clip(min=0) / scale
         write_image(radiance.astype(np.float32), files[-1])
         environment = ElementTree.SubElement(scene, "emitter", type="envmap")
         ElementTree.SubElement(environment, "string", name="filename", value=files[-1].name)

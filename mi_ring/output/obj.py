@@ -12,7 +12,7 @@ from mi_ring.system.files import write_file
 
 
 def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
-    """OBJ with MTL and PNG. Positions and normals are those of the closed mesh, seams exist only in the texture."""
+    """Write OBJ, MTL and PNG files; returns their paths. Only texture coordinates are split along seams."""
     baked, files = gltf.textures(material, texels), {}
     for name, image in {
         "diffuse": baked["baseColorTexture"], "normal": baked["normalTexture"],
@@ -29,9 +29,8 @@ def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material)
         "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
         f"norm {files['normal'].name}", "",
     ]))  # fmt: skip
-    closed, first = np.unique(atlas.whole, return_index=True)
-    whole = np.searchsorted(closed, atlas.whole)
-    corners = np.stack([whole, np.arange(len(whole)), whole], 1)[atlas.faces] + 1
+    _, first, uncut = np.unique(atlas.uncut, return_index=True, return_inverse=True)
+    corners = np.stack([uncut, np.arange(len(uncut)), uncut], 1)[atlas.faces] + 1
     text = io.StringIO()
     text.write(f"mtllib {library.name}\no object\nusemtl fitted\n")
     np.savetxt(text, atlas.vertices[first], "v %.9g %.9g %.9g")

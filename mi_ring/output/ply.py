@@ -8,17 +8,16 @@ import torch
 
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.scene.plain_mesh import mesh_of
-from mi_ring.scene.visibility import View, seen_of
+from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.system.files import write_file
 
 
 def write_mesh(
-    ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[View] | None = None
+    ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[MaskedCamera] | None = None
 ) -> float | None:
-    """The surface as PLY in scene units, with the parameters of its BSDF as vertex attributes (vertex_diffuse, …).
+    """Write the surface as PLY in scene units, with the BSDF's parameters as vertex attributes (vertex_diffuse, …).
 
-    With `views` also vertex_seen: 1 where one of them shows the object, 0 where none does. Returns the share of the
-    object's area that none does.
+    With `views`, vertex_seen is 1 where a view shows the object; returns the share of the area that no view shows.
     """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():
@@ -27,7 +26,7 @@ def write_mesh(
     mesh = mesh_of(vertices.cpu().numpy(), faces)
     unseen = None
     if views is not None:
-        seen, unseen = seen_of(ring, s.cpu().numpy(), faces, views)
+        seen, unseen = visible_points(ring, s.cpu().numpy(), faces, views)
         material = {"seen": torch.from_numpy(seen).float(), **material}
     for name, value in material.items():
         mesh.add_attribute(f"vertex_{name}", value[0].numel(), value.cpu().numpy().ravel())
@@ -36,7 +35,7 @@ def write_mesh(
 
 
 def write_ply(mesh: mi.Mesh, path: Path) -> None:
-    """A mesh as PLY, whole or not at all."""
+    """Write a mesh as PLY, by `write_file`."""
     stream = mi.MemoryStream()
     mesh.write_ply(stream)
     write_file(path, stream.raw_buffer())

@@ -24,20 +24,25 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.metrics.image_errors import comparable
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.output import calibration_panel
+from mi_ring.output.calibration_panel import held_out_text, panel
+from mi_ring.output.fit_result import FitResult
 from mi_ring.output.svg import svg_uri
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
-from mi_ring.system.machine import in_turn
+from mi_ring.system.machine import pipelined
 from mi_ring.version import __version__
 
-REGISTERED = 1024  # width and height of the pictures whose shift is measured, at most [px]
+REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
 TOGETHER = 4  # photographs that are drawn at once
-PICTURE = 480  # width and height of the pictures, at most [px]
-MISFIT, COVERED = 3.0, 0.9  # a PSNR this far below the others' [dB], IoU: say so
-UNTRUE, TELLING = 0.3, 60  # share of the object's light, of fits with so many iterations; good ones end at .07 to .15
-SATURATED = 0.25  # share of the object's pixels: more than mi_ring.check allows, for that is of the median photograph
-SHIFTED, ALL_SHIFTED = 1.0, 0.25  # the same of one photograph's shift from the others', and of all of them [px]
+PICTURE = 480  # largest side of the pictures on the page [px]
+
+# From these values on the page says that something stands out.
+LOW_PSNR, LOW_IOU = 3.0, 0.9  # PSNR below the median of all photographs [dB]; overlap of prediction and mask
+UNEXPLAINED = 0.3  # share of the object's light; good fits end at 0.07 to 0.15
+FEW_ITERATIONS = 60
+SATURATED = 0.25  # share of the object's pixels; mi-ring check allows less, but in the median photograph
+SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph from the others, and of all photographs [px]
 
 
 @dataclass
@@ -50,29 +55,25 @@ class PhotographPanel:
     saturated: float  # share of the object's pixels
     shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
     pictures: dict[str, str]
-    kept_out: bool = False  # of the fit: what is wrong with it, its pose for instance, is not told
+    held_out: bool = False  # of the fit; then the page does not say what is wrong with it
 
 
-def report_html(
-    fit: Any, glb: bytes | None = None, unseen: float | None = None, refined: dict[str, Any] | None = None
-) -> str:
-    """The page for a `Fit` whose surface is shown at its final resolution; `glb`: the object, for the viewer.
-
-    `unseen`: the share of its area that no photograph shows; `refined`: its `summary`.
-    """
-    capture, ring = fit.calibrated(), fit.ring
+def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
+    """The page of a fit. `glb`: the object, for the viewer. `unseen`: share of its area that no photograph shows."""
+    capture, ring, refined = result.capture, result.ring, result.calibration
+    surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = in_turn(partial(predicted, fit, capture), partial(panels_of, fit, capture), some)
+    parts = pipelined(partial(predicted, result, surface), partial(panels_of, result), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
-    # Of many photographs those that are shown may all be kept out.
-    fitted, errors = zip(*([panel for panel in panels if not panel[0].kept_out] or panels))
+    # All photographs on the page may be held-out ones.
+    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     made = f"sRGB, {pixels}, 4 samples each"
-    if any(scale_of(fit, size) > 1 for size in capture.sizes):
-        made += f", at most {fit.config.widths[-1]} px wide"
+    if any(scale_of(result, size) > 1 for size in capture.sizes):
+        made += f", at most {result.width} px wide"
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
@@ -82,9 +83,9 @@ def report_html(
             if masked
             else "no masks of the whole object"
         ),
-        "Iterations": f"{fit.iteration} of {fit.iterations}",
-        "Fit time": f"{fit.seconds:.0f} s",
-        **({"Photographs kept out": calibration_panel.held_out_text(fit.confirmed)} if len(fit.held_out) else {}),
+        "Iterations": f"{result.iteration} of {result.iterations}",
+        "Fit time": f"{result.seconds:.0f} s",
+        **({"Photographs kept out": held_out_text(result.validation)} if len(result.held_out) else {}),
         "Mesh": f"{len(s):,} vertices, {len(faces):,} triangles, closed",
         **({} if unseen is None else {"Seen by no photograph": f"{unseen:.1%} of the surface's area"}),
         "Made by": f"mi_ring {__version__}",
@@ -93,18 +94,18 @@ def report_html(
     files = resources.files("mi_ring.output")
     template = jinja2.Environment(autoescape=True).from_string(files.joinpath("report.html.jinja").read_text("utf-8"))
     return template.render(
-        name=scene_name(fit.capture.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(fit),
-        settings=fit.config.settings(),
-        findings=fit_findings(fitted, fit.iteration, fit.iterations, refined, fit.restraint.unexplained),
-        refined=refined and calibration_panel.panel(fit.capture, capture, refined),
+        name=scene_name(result.given.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(result),
+        settings=result.settings,
+        findings=fit_findings(fitted, result.iteration, result.iterations, refined, result.unexplained),
+        refined=refined and panel(result.given, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         saturated=SATURATED, viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip
 
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
-    """How the viewer begins, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
-    eye = capture.sensors[0].camera.position
+    """The viewer's first view, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
+    eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
         irradiance = np.ones(3)
@@ -115,26 +116,26 @@ def fit_findings(
     rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
-    """What stands out, each in one sentence that says what to do.
+    """Sentences about what stands out, each with what to do about it.
 
     `refined`: the fit's `summary`; `unexplained`: share of the object's light that is not as predicted.
     """
     found = []
-    if iteration == iterations >= TELLING and unexplained > UNTRUE:
+    if iteration == iterations >= FEW_ITERATIONS and unexplained > UNEXPLAINED:
         found.append(f"{unexplained:.0%} of the object's light is not as predicted: this surface is not to be trusted. "
                      "Cameras, masks or lights are wrong; look at the contact sheet of mi-ring check.")  # fmt: skip
-    if iteration == iterations < TELLING:
+    if iteration == iterations < FEW_ITERATIONS:
         found.append(f"The fit had {iterations} iterations, too few for a surface that is to be trusted.")
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
 
     typical, scatter = middle([row.psnr for row in rows])
-    limit = typical - max(MISFIT, 3 * scatter)
+    limit = typical - max(LOW_PSNR, 3 * scatter)
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
         found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
                      "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
     covers = [(row.iou, row.name) for row in rows if row.iou is not None]
-    if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < COVERED):
+    if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < LOW_IOU):
         found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
                      "and pose are right.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
@@ -161,44 +162,45 @@ def fit_findings(
 
 
 def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Median of values (n, ...) and, from the median absolute deviation, their standard deviation."""
+    """Median of values (n, ...), and their standard deviation estimated by the median absolute deviation."""
     median = np.median(values, axis=0)
     return median, 1.4826 * np.median(np.abs(np.subtract(values, median)), axis=0)
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """Names and numbers of the lowest (rank, name, number), in one line; empty if there are none."""
+    """One line with names and numbers of the lowest (rank, name, number); empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """A shift in words."""
+    """Words for a shift [px]."""
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
 class Prediction(NamedTuple):
-    """What a photograph should look like."""
+    """The prediction of one photograph."""
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
     coverage: np.ndarray  #: (H, W), in [0, 1]
-    maps: dict[str, np.ndarray]  #: normals and material, as `bridge.maps`, smaller
+    maps: dict[str, np.ndarray]  #: normals and material, as `prediction.maps` returns them, smaller
 
 
-def scale_of(fit: Any, size: tuple[int, int]) -> int:
-    """By how much photographs of this size are compared smaller than they are: as the fit has seen them at last."""
-    return -(-size[0] // fit.config.widths[-1])
+def scale_of(result: FitResult, size: tuple[int, int]) -> int:
+    """How many times smaller photographs of this size are compared: as in the last stage of the fit."""
+    return -(-size[0] // result.width)
 
 
-def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]:
-    """Photographs `index` of the calibrated capture, all of one size, as the surface that is shown predicts them."""
-    size = capture.sensors[index[0]].size
-    scale = scale_of(fit, size)
-    rgb, coverage = bridge.draw(
-        fit.surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=fit.ring.indirect, paths=4
+def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Prediction]:
+    """Predictions of photographs `index`, all of one size."""
+    capture, ring = result.capture, result.ring
+    size = capture.shots[index[0]].size
+    scale = scale_of(result, size)
+    rgb, coverage = prediction.draw(
+        surface, capture.selected(index, scale), spp=4, shadows=capture.shadows, indirect=ring.indirect, paths=4
     )
     small = capture.selected(index, max(scale, max(size) // PICTURE))
-    maps = bridge.maps(fit.surface, small, fit.ring.brdf_net.bsdf_parameters)
+    maps = prediction.maps(surface, small, ring.brdf_net.bsdf_parameters)
     return [
         Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
         for n in range(len(index))
@@ -206,21 +208,22 @@ def predicted(fit: Any, capture: Capture, index: np.ndarray) -> list[Prediction]
 
 
 def panels_of(
-    fit: Any, capture: Capture, index: np.ndarray, predictions: Sequence[Prediction]
+    result: FitResult, index: np.ndarray, predictions: Sequence[Prediction]
 ) -> list[tuple[PhotographPanel, float]]:
     """`panel_of` of several photographs."""
-    return [panel_of(fit, capture, int(k), prediction) for k, prediction in zip(index, predictions)]
+    return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
-def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k` of the calibrated capture, and its mean squared error as sRGB, as `comparable`."""
-    scale = scale_of(fit, capture.sensors[k].size)
+def panel_of(result: FitResult, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
+    """The row of photograph `k`, and its mean squared error in sRGB over the pixels that are `comparable`."""
+    capture, brdf_net = result.capture, result.ring.brdf_net
+    scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
     valid = np.ones(mask.shape, bool) if seen.valid is None else seen.valid[0].numpy()
-    sensor = capture.sensors[k]
+    shot = capture.shots[k]
     shown = prediction.rgb * valid[..., None]
-    photo, guess = (linear_to_srgb(recorded(linear, sensor, scale)) for linear in (observed, shown))
+    photo, guess = (linear_to_srgb(recorded(linear, shot, scale)) for linear in (observed, shown))
     found = (prediction.coverage > 0.5) & valid
     inside = (mask > 0.5) & valid if masked else found
     normal = np.where((maps["normal"] != 0).any(-1, keepdims=True), maps["normal"] * 0.5 + 0.5, 0)
@@ -232,9 +235,9 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         "4 × difference": 4 * np.abs(photo - guess) * compared[..., None],
         "normals": normal,
     }
-    for p in fit.ring.brdf_net.bsdf_parameters:
+    for p in brdf_net.bsdf_parameters:
         if math.isinf(p.high):
-            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(fit.ring.brdf_net.scale)))
+            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(brdf_net.scale)))
         else:
             value = (maps[p.name] - p.low) / (p.high - p.low)
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
@@ -246,7 +249,7 @@ def panel_of(fit: Any, capture: Capture, k: int, prediction: Prediction) -> tupl
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
         shift=by and (scale * by[0], scale * by[1]),
-        kept_out=k in fit.held_out,
+        held_out=k in result.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )
     return row, error
@@ -273,24 +276,24 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def loss_curve(fit: Any) -> str:
+def loss_curve(result: FitResult) -> str:
     """The loss and its weighted terms over the iterations as an SVG data URI."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()
-    for term in ("loss", *fit.terms):
+    for term in ("loss", *result.terms):
         points = []
-        for entry in fit.log:
+        for entry in result.log:
             weight = 1.0 if term == "loss" else entry["weights"].get(term, 0.0)
             points.append((entry["iteration"], weight * entry.get(term, 0.0)))
         points = [(iteration, value) for iteration, value in points if value > 0]
         if points:
             label = "loss" if term == "loss" else f"weighted {term}"
             axes.semilogy(*zip(*points), label=label, linewidth=2 if term == "loss" else 1)
-    for stage in fit.stages[1:]:
-        if stage.first < fit.iteration:
-            axes.axvline(stage.first, color="0.7", linewidth=1, linestyle=":")
+    for first in result.stage_starts[1:]:
+        if first < result.iteration:
+            axes.axvline(first, color="0.7", linewidth=1, linestyle=":")
     axes.set_xlabel("iteration (dotted: next stage)")
     axes.grid(alpha=0.3)
-    if fit.log:
+    if result.log:
         figure.legend(loc="outside right upper")
     return svg_uri(figure)

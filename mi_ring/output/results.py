@@ -5,7 +5,6 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -17,18 +16,19 @@ from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
+from mi_ring.output.fit_result import FitResult
 from mi_ring.output.ply import write_mesh
-from mi_ring.rendering import bridge
-from mi_ring.rendering.spherical_harmonics import seen_from_within
-from mi_ring.scene.assembly import lamp_lights
+from mi_ring.rendering import prediction
+from mi_ring.rendering.spherical_harmonics import room_envmap
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import shared_emitters
-from mi_ring.scene.visibility import View
+from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system.command import scene_name
 from mi_ring.system.files import locked, read_json, relative_to, write_file, write_state, writing
 
-ROUNDED = 1e-5  #: share of an environment by which a room may differ from it and be nothing but it
-PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is not overwritten
-VIEWED, TEXELS = 5, 1024  #: level of the report's object at most, and texels across its textures then
+PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is moved aside
+OWN_SCENE = Path("capture", "scene.xml")  #: in the folder of a fit: the scene file of a capture from arrays
+VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, and width of its textures [px]
 
 
 def default_folder(scene: Path) -> Path:
@@ -43,14 +43,18 @@ def default_folder(scene: Path) -> Path:
 
 
 def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the folder and write config.json: the options as used, the scene's file relative to the folder.
+    """Make the folder and write config.json: the options, and the scene file relative to the folder.
 
     A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
     written or holds the scene.
     """
-    folder = folder.resolve()
-    if folder in scene.resolve().parents:
-        raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")
+    if folder.resolve() in scene.resolve().parents:
+        raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
+    make_folder(folder.resolve(), scene, options, resume)
+
+
+def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
+    """As `prepare_folder`, for a scene file that may be in the folder."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -62,41 +66,50 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def move_aside(folder: Path) -> None:
-    """Rename a folder, so that other results can go to its place."""
+    """Rename a folder to make room for other results."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
 
 
-def save_fit(folder: Path, fit: Any) -> None:
-    """All results of a `Fit`, finished or not, into a folder of its own."""
-    scene = fitted_scene(fit, folder)
-    ring_state(fit.ring)  # before anything is moved: it may have no name for a network
+def save(folder: Path, result: FitResult) -> None:
+    """Write all results of a fit into a folder of its own. Earlier results there are moved aside.
+
+    A capture from arrays is written as well: as the scene file capture/scene.xml in the folder.
+    """
+    capture = result.given
+    ring_state(result.ring)  # raises for networks without a name before anything is moved
+    if not capture.in_memory:
+        fitted_scene(capture, result.ring, folder)  # raises for a scene that cannot be rewritten
     with locked(folder):
-        prepare_folder(folder, fit.capture.path, fit.config.settings())
-        write_log(folder, fit.log)
-        write(folder, fit, scene)
+        if capture.in_memory:
+            make_folder(folder.resolve(), folder / OWN_SCENE, result.settings)
+            capture = capture.save(folder / OWN_SCENE)
+        else:
+            prepare_folder(folder, capture.path, result.settings)
+        write_log(folder, result.log)
+        write(folder, result, fitted_scene(capture, result.ring, folder))
 
 
-def fitted_scene(fit: Any, folder: Path) -> bytes:
-    """scene.xml of a fit. Raises InputError for a scene that cannot be rewritten."""
-    return fitted_scene_xml(fit.capture.path, folder, fit.ring.subdivisions, fit.ring.bsdf)
+def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
+    """scene.xml of a fit of these photographs. Raises InputError for a scene that cannot be rewritten."""
+    return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
 
 
-def write_log(folder: Path, entries: list[dict]) -> None:
-    """log.jsonl of so many entries."""
+def write_log(folder: Path, entries: Iterable[dict]) -> None:
+    """Write log.jsonl."""
     write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def add_to_log(folder: Path, entry: dict) -> None:
-    """One more line of log.jsonl."""
+    """Append an entry to log.jsonl."""
     path = folder / "log.jsonl"
     with writing(path), path.open("a") as file:
         file.write(json.dumps(entry) + "\n")
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The entries of log.jsonl; a line that was cut off, when the process was killed or the disk was full, is none."""
+    """The entries of log.jsonl, without a last line that a kill or a full disk cut off."""
     entries = []
     for line in (folder / "log.jsonl").read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):
@@ -104,23 +117,21 @@ def read_log(folder: Path) -> list[dict]:
     return entries
 
 
-def write_inputs(path: Path, fit: Any) -> None:
-    """inputs.png: the start surface drawn over photographs, in green, where mask or pose errors show at once."""
-    s, faces = fit.ring.domain.sample(4)
-    fit.surface.show(fit.ring, s, faces)
-    some = fit.capture.spread()
+def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
+    """inputs.png: the start surface drawn over photographs, in green. Wrong masks or poses show at once."""
+    some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
     sheet = Image.new("RGB", (columns * cell, line + -(-len(some) // columns) * cell))
     ImageDraw.Draw(sheet).text((3, 2), "green: where the fit starts", fill=(26, 255, 51))
-    for index in fit.capture.together(some):
-        scale = max(1, max(fit.capture.sensors[index[0]].size) // cell)
-        _, covered = bridge.draw(fit.surface, fit.capture.selected(index, scale), spp=4, shadows=False)
-        for k, observed, coverage in zip(index, fit.capture.observe(index, scale).rgb, covered):
+    for index in capture.together(some):
+        scale = max(1, max(capture.shots[index[0]].size) // cell)
+        _, covered = prediction.draw(start, capture.selected(index, scale), spp=4, shadows=False)
+        for k, observed, coverage in zip(index, capture.observe(index, scale).rgb, covered):
             tint = 0.35 * coverage[..., None].numpy() * np.array([0.1, 1.0, 0.2])
             picture = Image.fromarray(to_bytes(linear_to_srgb(observed.numpy()) * 0.65 + tint))
             picture.thumbnail((cell, cell))
-            ImageDraw.Draw(picture).text((3, 2), fit.capture.names[k], fill=(255, 255, 255))
+            ImageDraw.Draw(picture).text((3, 2), capture.names[k], fill=(255, 255, 255))
             place = some.index(k)
             sheet.paste(picture, (place % columns * cell, line + place // columns * cell))
     buffer = io.BytesIO()
@@ -128,52 +139,38 @@ def write_inputs(path: Path, fit: Any) -> None:
     write_file(path, buffer.getvalue())
 
 
-def write(folder: Path, fit: Any, scene: bytes) -> None:
+def write(folder: Path, result: FitResult, scene: bytes) -> None:
     """ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
 
-    `scene`: its `fitted_scene`, of which cameras and lights are those from before the fit.
+    `scene`: its `fitted_scene`, with cameras and lights as before the fit.
     """
-    write_state(ring_state(fit.ring, fit.config.settings()), folder / "ring.pt")
-    capture = fit.calibrated()
+    ring, capture = result.ring, result.capture
+    write_state(ring_state(ring, result.settings), folder / "ring.pt")
     views = capture.views
-    unseen = write_mesh(fit.ring, fit.ring.subdivisions, folder / "mesh.ply", views=views)
-    if fit.calibration:
-        frames = None if fit.lighting.kind == "capture" else fit.calibration.room.frames
-        lamps = lamp_lights(capture.scene) if "lamps" in fit.calibration.refined else None
-        scene = recalibrated_xml(scene, capture.sensors, found_room(fit, capture), frames, lamps)
-    if fit.outlines:
-        scene = remasked_xml(scene, capture.sensors, write_masks(folder / "masks", capture, fit.outlines))
+    unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
+    if result.calibration:
+        scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps)
+    if result.masks:
+        scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))
     write_file(folder / "scene.xml", scene)
-    if capture.photographs.dark and capture.photographs.room is not None and not shared_emitters(capture.scene):
-        # It is all the light there is.
-        radiance = seen_from_within(capture.photographs.room, np.eye(4)).clip(min=0)
+    if capture.photographs.dark and capture.room is not None and not shared_emitters(capture.scene):
+        # The room is the only light.
+        radiance = room_envmap(capture.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
-    s, faces = fit.ring.domain.sample(fit.ring.subdivisions)
-    fit.surface.show(fit.ring, s, faces)
     print("Writing the report", flush=True)
-    refined = fit.summary(capture) if fit.calibration else None
-    if refined or fit.confirmed:
-        names = [capture.names[k] for k in fit.held_out]
-        record = refined or {"refined": [], "unknowns": {}, "photographs": {}}
-        record |= {"held_out": {"photographs": names, **fit.confirmed}} if names else {}
+    names = [capture.names[k] for k in result.held_out]
+    if result.calibration or result.validation:
+        record = result.calibration or {"refined": [], "unknowns": {}, "photographs": {}}
+        record = record | ({"held_out": {"photographs": names, **result.validation}} if names else {})
         write_file(folder / "calibration.json", json.dumps(record, indent=1))
-    if len(fit.held_out):
-        print(f"Photographs kept out: {calibration_panel.held_out_text(fit.confirmed)}")
-    write_file(folder / "report.html", report.report_html(fit, viewed(fit.ring, views), unseen, refined))
+    if names:
+        print(f"Photographs kept out: {calibration_panel.held_out_text(result.validation)}")
+    write_file(folder / "report.html", report.report_html(result, viewed(ring, views), unseen))
     print(f"Surface: {folder}/mesh.ply   Report: {folder}/report.html   Scene for Mitsuba: {folder}/scene.xml")
 
 
-def found_room(fit: Any, capture: Capture) -> np.ndarray | None:
-    """The room of a fit's capture without the environment that its scene file has besides."""
-    room = capture.photographs.room
-    if room is None or fit.environment is None:
-        return room
-    own = room - fit.environment
-    return own if np.abs(own).max() > ROUNDED * np.abs(fit.environment).max() else None
-
-
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Files of the masks of these photographs, each called like its photograph with .png added.
+    """Write the masks of these photographs, each named like its photograph with .png added.
 
     Returns their names, by index, as a scene beside `folder` has them.
     """
@@ -189,8 +186,8 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
     return names
 
 
-def viewed(ring: FittedObject, views: Sequence[View] | None = None) -> bytes | None:
-    """The object for the report's viewer as GLB, where that is possible."""
+def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
+    """The object as GLB for the report's viewer; None, with a printed line, if that fails."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)

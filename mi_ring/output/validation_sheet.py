@@ -1,22 +1,20 @@
 """The contact sheet of a comparison with the path tracer."""
 
-import io
-
 import numpy as np
 from matplotlib import colormaps
 from PIL import Image, ImageDraw
 
-from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.metrics.path_tracing import Pictures
 from mi_ring.metrics.renderer_agreement import Comparison, percent, probability
 
-THUMBNAIL = 128  #: width and height of the contact sheet's pictures, at most [px]
+THUMBNAIL = 128  #: largest side of the pictures [px]
 COLUMNS = ("path", "photometric", "8 x difference", "shadows", "4 x interreflection", "32 x unexplained")
 LEGEND = "Each photograph by its own exposure. Differences: red where photometric is brighter, blue where it is darker."
 
 
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
-    """One photograph's line of the contact sheet, exposed for itself. Red: photometric is brighter."""
+    """The row of one photograph, with its own exposure. In differences red means that photometric is brighter."""
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0
 
@@ -48,7 +46,7 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
 
 
 def validation_sheet(strips: list[Image.Image]) -> bytes:
-    """The contact sheet as PNG: the lines below each other, in so many stacks that the sheet is about square."""
+    """The contact sheet as PNG: the rows, in several stacks side by side, so that the sheet is about square."""
     width, height = strips[0].width + 12, max(line.height for line in strips)
     stacks = max(1, round(np.sqrt(len(strips) * height / width)))
     rows = -(-len(strips) // stacks)
@@ -61,6 +59,4 @@ def validation_sheet(strips: list[Image.Image]) -> bytes:
     draw.text((2, 2), LEGEND, fill=(255, 220, 120))
     for k, line in enumerate(strips):
         page.paste(line, (k // rows * width, 32 + k % rows * height))
-    buffer = io.BytesIO()
-    page.save(buffer, "PNG")
-    return buffer.getvalue()
+    return encoded_picture(page)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: around the object in a crop, as a share of its size
@@ -68,11 +70,11 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
         crop, shown = undistort(pixels, posed.lens, picture.encoding == "srgb", window=window)
     picture.close()
 
-    def write_binary(folder: str, mask: np.ndarray) -> str:
+    def write_binary(folder: str, mask: np.ndarray) -> Path:
         return writer.relative(writer.image(f"{folder}/{picture.name}", np.uint8(255) * mask[..., None]))
 
     filename = writer.relative(writer.image(f"images/{picture.name}", crop))
-    encoding = picture.encoding if crop.dtype == np.uint16 else None
+    encoding = picture.encoding if crop.dtype == np.uint16 else "auto"
     mask = None
     if posed.mask is not None:
         values = crop_mask(posed.mask, posed.lens.size, window)
@@ -81,8 +83,8 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
     valid = None if shown.all() else write_binary("valid", shown)
     camera = posed.lens.camera(posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
-    return photograph_element(picture.name, filename, camera, posed.light, mask, encoding, valid=valid,
-                              gamma=posed.gamma, falloff=posed.falloff)  # fmt: skip
+    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, Response(posed.gamma),
+                                   Files(filename, mask, valid), encoding))  # fmt: skip
 
 
 def write_table(
@@ -108,7 +110,7 @@ def write_table(
     if albedo is None:
         return []
     picture = writer.image("table", to_bytes(linear_to_srgb(albedo)))
-    return [table_element(writer.relative(picture), texels.to_world)]
+    return [table_element(writer.relative(picture).as_posix(), texels.to_world)]
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:

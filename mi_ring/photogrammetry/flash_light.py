@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from mi_ring.geometry.hull import evenly
+from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.photogrammetry.marker_sheet import PaperSamples
-from mi_ring.rendering.photograph_lights import SIDEWAYS
+from mi_ring.rendering.photograph_lights import MIN_FLASH_COSINE
 
 PAPER_ALBEDO = 0.8
 #: Standard deviations of the priors. Of the flash's position across and along the lens's axis, in units of the median
@@ -69,7 +69,7 @@ def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, fa
     `normal` (3,): of the surfaces; `forward` (3,) or (n, 3): axis of the flash; `falloff`: exponent of its cone.
     """
     distance = np.linalg.norm(to_light, axis=1)
-    cosine = np.maximum(-(to_light * forward).sum(1) / distance, SIDEWAYS)
+    cosine = np.maximum(-(to_light * forward).sum(1) / distance, MIN_FLASH_COSINE)
     return cosine**falloff * np.maximum(to_light @ normal, 0) / distance**3
 
 
@@ -151,7 +151,7 @@ def fit_parameters(
 
     `prior` (count,) each: log exposures of the photographs and their standard deviations; else as `calibrate_flash`.
     """
-    some = evenly(len(observations), MAX_PHOTOGRAPHS)
+    some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
     seen = Observations(*(np.concatenate(parts) for parts in zip(*(observations[k] for k in some))))
     index = np.repeat(np.arange(len(some)), [len(observations[k].points) for k in some])

@@ -12,10 +12,11 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import reading, require_room
-from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, opened, read_image, srgb_to_linear
+from mi_ring.foreign import reading, require_plausible_size
+from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
+from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
@@ -50,7 +51,7 @@ class Picture:
         """`pixels` before they are turned."""
 
         def develop(raw: Any) -> np.ndarray:
-            require_room(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
+            require_plausible_size(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
             # Linear radiance in sRGB's primaries, with the camera's white balance.
             return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
@@ -65,9 +66,11 @@ class Picture:
         """The result of `read` on the file, opened by LibRaw if it is raw, else by Pillow, which turns HEIF upright."""
         register_heif(self.path)
         raw = self.suffix in RAW
-        with reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"):
-            with need("rawpy", f"{self.path}").imread(str(self.path)) if raw else opened(self.path) as file:
-                return read(file)
+        with (
+            reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
+            need("rawpy", f"{self.path}").imread(str(self.path)) if raw else open_image(self.path) as file,
+        ):
+            return read(file)
 
     @cached_property
     def camera_orientation(self) -> int:
@@ -94,7 +97,7 @@ class Picture:
         """EXIF data; empty if there are none."""
         try:
             register_heif(self.path)
-            with opened(self.path) as image:
+            with open_image(self.path) as image:
                 exif = image.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
                 return exif
@@ -112,7 +115,7 @@ class Picture:
         return exposure if exposure > 0 else np.nan
 
     @property
-    def encoding(self) -> str:
+    def encoding(self) -> Encoding:
         """`linear` or `srgb`: the encoding of `pixels`."""
         return "linear" if self.suffix in RAW else "srgb"
 

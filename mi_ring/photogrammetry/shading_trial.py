@@ -1,18 +1,12 @@
 """Finds the object by its shading alone: a short fit without masks, which starts from a sphere of sparse points."""
 
-import tempfile
-from pathlib import Path
-from xml.etree.ElementTree import SubElement
-
 import numpy as np
-from PIL import Image
 
-from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
+from mi_ring.capture.capture import Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.photogrammetry.reduced_photographs import Views
-from mi_ring.rendering import bridge
+from mi_ring.rendering import prediction
 from mi_ring.scene.lights import Light
 from mi_ring.system.progress import Progress
 
@@ -40,22 +34,14 @@ def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progres
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.valid].mean() for view in views]))
     intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)
-    with tempfile.TemporaryDirectory() as name:
-        folder, elements = Path(name), []
-        for k, view in enumerate(views):
-            Image.fromarray(view.rgb).save(folder / f"{k}.png")
-            Image.fromarray(view.valid.astype(np.uint8) * 255).save(folder / f"{k}.valid.png")
-            light = Light("point", view.camera.position, intensity)
-            elements.append(photograph_element(f"{k}", f"{k}.png", view.camera, light, valid=f"{k}.valid.png"))
-        scene = scene_element(elements)
-        shape = next(scene.iter("shape"))
-        SubElement(shape, "point", {"name": "center", **dict(zip("xyz", map(str, center)))})
-        SubElement(shape, "float", name="radius", value=str(radius))
-        (folder / "scene.xml").write_bytes(scene_bytes(scene))
-        capture = load_capture(folder / "scene.xml")
-        fit = Fit(capture, SETTINGS)
-        for _ in progress(fit, "a trial fit", fit.iterations):
-            pass
-    fit.surface.show(fit.ring, *fit.ring.domain.sample(SETTINGS.subdivisions))
-    drawn = (bridge.draw(fit.surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
+    lights = [Light("point", view.camera.position, intensity) for view in views]
+    capture = Capture.from_arrays(
+        [view.rgb for view in views], valid=[view.valid for view in views], cameras=[view.camera for view in views],
+        lights=lights, center=center, radius=radius, name="a trial fit",
+    )  # fmt: skip
+    fit = Fit(capture, SETTINGS)
+    for _ in progress(fit, "a trial fit", fit.iterations):
+        pass
+    surface = fit.renderer.showing(fit.model, SETTINGS.subdivisions)
+    drawn = (prediction.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]

@@ -76,7 +76,7 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """The sheet, with squares of this size [mm]; None if few photographs show it. Raises InputError if one is bad."""
+    """The sheet with squares of this size [mm]; None if few photographs show it. InputError if one is damaged."""
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
 

@@ -1,4 +1,4 @@
-"""The Mitsuba plugins, one file each, named like it.
+"""The Mitsuba plugins, each in a file of its name.
 
 May import: mitsuba, drjit, numpy, torch; rendering, objects, scene, geometry.
 """
@@ -6,12 +6,12 @@ May import: mitsuba, drjit, numpy, torch; rendering, objects, scene, geometry.
 import importlib
 import sys
 
-#: In the order in which they need each other.
+#: Ordered so that each comes after those that it imports.
 PLUGINS = ("photograph", "flash", "room", "cooktorrance", "merl", "shapenet", "table", "photometric")
 
 
 def register() -> None:
-    """Define the plugins for the current variant of Mitsuba: classes belong to one variant."""
+    """Define the plugins for the current variant of Mitsuba. Each variant needs its own classes."""
     for name in PLUGINS:
         module = f"{__name__}.{name}"
         if module in sys.modules:

@@ -9,9 +9,12 @@ import mitsuba as mi
 
 from mi_ring.rendering.direct_light import MIN_COSINE
 
-MIN_ROUGHNESS = 0.02  #: below it the highlight is narrower than float32 can integrate
+MIN_ROUGHNESS = 0.02  #: a highlight of less is too narrow for float32
 DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Beckmann}
-NODES, SIDE = 32, 32  #: of the table of gloss, in each direction; its samples in each
+GLOSS_NODES, GLOSS_SAMPLES = (
+    32,
+    32,
+)  #: of `gloss_table`: nodes along each axis, and samples of each node along each axis
 
 
 class CookTorrance(mi.BSDF):
@@ -22,33 +25,35 @@ class CookTorrance(mi.BSDF):
     ================ ================= ================================================================= =====
     ``diffuse``      rgb or texture    ρᵈ; the diffuse term has no 1/π. Default: the mesh attribute      P, ∂
                                        ``vertex_diffuse``
-    ``specular``     float or texture  ρᵞ; Fresnel is constant and folded in. Default: the mesh          P, ∂
-                                       attribute ``vertex_specular``
-    ``roughness``    float or texture  r, the width α of the distribution itself, 0.02 at the least.     P, ∂
-                                       Default: the mesh attribute ``vertex_roughness``
-    ``distribution`` string            D and the G that belongs to it: ``ggx`` or ``beckmann``.
-                                       Default: ``ggx``
-    ``fresnel``      boolean           is more reflected at grazing angles? Default: false, the paper's
+    ``specular``     float or texture  ρᵞ; it contains the Fresnel factor, which is constant. Default:   P, ∂
+                                       the mesh attribute ``vertex_specular``
+    ``roughness``    float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
+                                       mesh attribute ``vertex_roughness``
+    ``distribution`` string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
+    ``fresnel``      boolean           does the surface reflect more at grazing angles? Default: false,
+                                       as in the paper
     ================ ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
-    Rough Surfaces): D is equation 33 (GGX) or 25 (Beckmann) without its 1/π, G Smith's product of equations 34 or 27,
-    the latter Walter's rational fit to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor`` with F = 1.
+    Rough Surfaces). D is equation 33 (GGX) or 25 (Beckmann) without its 1/π. G is Smith's product of equation 34 or 27;
+    for the latter it is Walter's rational fit, to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor``
+    with F = 1.
 
-    With ``fresnel`` ρᵞ rises to 1/4, as of a mirror, with the angle between o and h, by "An Inexpensive BRDF Model for
-    Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ of F₀ = 4 ρᵞ, which must be the true one.
-    A light next to the camera does not see it; light from a table does.
+    With ``fresnel``, ρᵞ grows with the angle between o and h up to 1/4, the value of a mirror, by "An Inexpensive BRDF
+    Model for Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ with F₀ = 4 ρᵞ. This needs the
+    true ρᵞ. It makes no difference for a light next to the camera, but it does for light from a table.
 
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
-    and narrow lobes reach it, without ``fresnel``. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel thus conserves
-    energy. Nothing enforces that: ρ also holds the scale of lamp and camera.
+    and narrow lobes reach this bound without ``fresnel``. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel conserves
+    energy. Nothing enforces this: ρ also contains the scale of lamp and camera.
 
-    With interpolated normals a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer.
-    Black there would be a discontinuity that corrupts gradients at the outline; the strip is lit instead, with n·o
-    clamped. What it does not do: transmission, two-sided surfaces, anisotropy, light between microfacets.
+    With interpolated normals, a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer. If
+    it were black, this discontinuity would make gradients at the outline wrong. It is lit instead, with n·o clamped.
+
+    What it does not do: transmission, two-sided surfaces, anisotropy, light between microfacets.
 
     Raises ValueError if ``distribution`` is neither of the two.
 
@@ -71,7 +76,7 @@ class CookTorrance(mi.BSDF):
             }
     """
 
-    channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1}  #: of each parameter
+    channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1}  #: number of channels of each parameter
 
     def __init__(self, props):
         super().__init__(props)
@@ -92,23 +97,23 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """(ρᵈ, ρᵞ, r) at a surface interaction."""
+        """(ρᵈ, ρᵞ, r) at surface interactions."""
         diffuse = self.textures["diffuse"].eval(si, active)
         specular = self.textures["specular"].eval_1(si, active)
         return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)
 
     @staticmethod
     def front(si, wo):
-        """Do the viewer and `wo` see the front? By the shading or by the geometric normal."""
+        """Are the viewer and `wo` on the front side, by the shading normal or by the geometric normal?"""
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
-    def lobe(self, r):
-        """D / π, G and the visible normals of a roughness, by Mitsuba."""
+    def microfacets(self, r):
+        """Mitsuba's D / π, G and visible normals for a roughness."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
-    def at(self, specular, cosine):
-        """ρᵞ where o·h is a `cosine`."""
+    def with_fresnel(self, specular, cosine):
+        """ρᵞ for o·h = `cosine`."""
         if not self.fresnel:
             return specular
         return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
@@ -117,52 +122,55 @@ class CookTorrance(mi.BSDF):
         """B (n·i) of equation 1 [1/sr]."""
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
-        h.z = dr.abs(h.z)  # at the rim h may lie below; Mitsuba's D would jump to 0 there
-        lobe, specular = self.lobe(r), self.at(specular, dr.dot(si.wi, h))
-        # G for m = n: it asks nothing of m but the side, which is for `front` to say.
-        gloss = specular * lobe.eval(h) * lobe.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
+        h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
+        facets, specular = self.microfacets(r), self.with_fresnel(specular, dr.dot(si.wi, h))
+        # G with m = n: G only uses the side of m, and `front` tests the side.
+        gloss = specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
         value = diffuse * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
     def lobes(self, si, order, active=True):
-        """What is reflected of light that varies slowly: of each lobe its direction in the world, and by how much each
-        degree of spherical harmonics about that is, a list of `order` + 1.
+        """How the surface reflects light that varies slowly: for each lobe its direction in the world and its factors.
 
-        The diffuse lobe by "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan
-        2001). That of gloss is taken to be round about its mean direction; how wide it is says a table.
+        The `order` + 1 factors are for the degrees of spherical harmonics about this direction. The diffuse lobe is
+        that of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The
+        specular lobe is approximated as symmetric about its mean direction, by `gloss_table`.
         """
         diffuse, specular, r = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
         diffuse, specular = dr.select(active, diffuse, 0), dr.select(active, specular, 0)
         across = [(r - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), dr.maximum(si.wi.z, MIN_COSINE)]
-        at = mi.Point2f(*(x * (1 - 1 / NODES) + 0.5 / NODES for x in across))
-        tilt, height, *shares = gloss_table(mi.variant(), self.distribution, order).eval(at)
+        at = mi.Point2f(*(x * (1 - 1 / GLOSS_NODES) + 0.5 / GLOSS_NODES for x in across))
+        tilt, height, *factors = gloss_table(mi.variant(), self.distribution, order).eval(at)
         toward = dr.normalize(mi.Vector3f(-tilt * si.wi.x, -tilt * si.wi.y, height))
-        specular = self.at(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
+        specular = self.with_fresnel(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
         return [
-            (si.sh_frame.n, [diffuse * share for share in cosine_shares(order)]),
-            (si.to_world(toward), [specular * share for share in shares]),
+            (si.sh_frame.n, [diffuse * factor for factor in cosine_factors(order)]),
+            (si.to_world(toward), [specular * factor for factor in factors]),
         ]
 
     def gloss_probability(self, ctx, si, diffuse, specular):
-        """Probability of sampling the specular lobe, in proportion to the bounds of the two albedos, π ρᵈ and 4 ρᵞ.
+        """Probability of sampling the specular lobe, proportional to the bounds of the two albedos, π ρᵈ and 4 ρᵞ.
 
-        Detached: the choice of a lobe does not move with the parameters, so that its probability must not either.
+        Detached, because the choice of a lobe is not differentiated with respect to the parameters either.
         """
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         if not (has_diffuse and has_gloss):
             return mi.Float(1.0 if has_gloss else 0.0)
-        d, s = dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(diffuse))), dr.detach(4 * self.at(specular, si.wi.z))
+        d, s = (
+            dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(diffuse))),
+            dr.detach(4 * self.with_fresnel(specular, si.wi.z)),
+        )
         return dr.select(d + s > 0, s / (d + s), 0.5)
 
     def density(self, si, wo, r, gloss, active):
-        """Density [1/sr] of the mixture of the cosine and the visible-normal lobe, as `sample` draws it."""
-        lobe = self.lobe(r)
+        """Density [1/sr] of the directions that `sample` draws, from the cosine lobe or by visible normals."""
+        facets = self.microfacets(r)
         h = dr.normalize(wo + si.wi)
         # The density of visible normals is D G₁ (o·h) / (n·o), the Jacobian of the reflection 1 / (4 (o·h)).
-        reflected = lobe.eval(h) * lobe.smith_g1(si.wi, h) / (4 * si.wi.z)
+        reflected = facets.eval(h) * facets.smith_g1(si.wi, h) / (4 * si.wi.z)
         pdf = (1 - gloss) * mi.warp.square_to_cosine_hemisphere_pdf(wo) + gloss * reflected
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), pdf, 0)
 
@@ -182,7 +190,7 @@ class CookTorrance(mi.BSDF):
         diffuse, specular, r = self.parameters(si, active)
         gloss = self.gloss_probability(ctx, si, diffuse, specular)
         chosen = sample1 < gloss
-        normal, _ = self.lobe(r).sample(si.wi, sample2)
+        normal, _ = self.microfacets(r).sample(si.wi, sample2)
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = dr.select(chosen, mi.reflect(si.wi, normal), mi.warp.square_to_cosine_hemisphere(sample2))
         bs.pdf = self.density(si, bs.wo, r, gloss, active)
@@ -204,53 +212,56 @@ class CookTorrance(mi.BSDF):
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
 
 
-def cosine_shares(order):
-    """By how much a surface of B = 1 reflects each degree of spherical harmonics, up to `order`."""
-    shares = [math.pi, 2 * math.pi / 3]
+def cosine_factors(order):
+    """The factors by which a surface of B = 1 reflects the degrees of spherical harmonics, up to `order`."""
+    factors = [math.pi, 2 * math.pi / 3]
     for degree in range(2, order + 1):
         half = degree // 2
         central = math.comb(degree, half) / 2**degree
         sign = (-1) ** (half - 1)
-        shares.append(0.0 if degree % 2 else 2 * math.pi * sign / ((degree + 2) * (degree - 1)) * central)
-    return shares[: order + 1]
+        factors.append(0.0 if degree % 2 else 2 * math.pi * sign / ((degree + 2) * (degree - 1)) * central)
+    return factors[: order + 1]
 
 
 @functools.lru_cache(maxsize=8)
 def gloss_table(variant, distribution, order):
-    """The lobe of gloss for ρᵞ = 1, as a texture over (roughness, n·o) from (0.02, 0) to (1, 1).
+    """The specular lobe for ρᵞ = 1, as a texture over (roughness, n·o) from (0.02, 0) to (1, 1).
 
-    Its channels: how much its mean direction leans away from the viewer, by how much the viewer leans, and how high it
-    is; and for each degree the lobe's integral with that degree's Legendre polynomial about this direction. By the
-    visible normals of `CookTorrance.sample`, a grid of them.
+    Its first two channels are the mean direction: its tangential part over that of the viewer, on the other side of the
+    normal, and its part along the normal. The others are the integrals of the lobe times the Legendre polynomial of
+    each degree about this direction. All are means over a grid of visible normals, as in `CookTorrance.sample`.
     """
     with dr.suspend_grad():
-        count = SIDE**2
-        lane = dr.arange(mi.UInt32, NODES**2 * count)
+        count = GLOSS_SAMPLES**2
+        lane = dr.arange(mi.UInt32, GLOSS_NODES**2 * count)
         node, sample = lane // count, lane % count
-        r = MIN_ROUGHNESS + mi.Float(node % NODES) / (NODES - 1) * (1 - MIN_ROUGHNESS)
-        cosine = dr.clip(mi.Float(node // NODES) / (NODES - 1), MIN_COSINE, 1 - 1e-4)
+        r = MIN_ROUGHNESS + mi.Float(node % GLOSS_NODES) / (GLOSS_NODES - 1) * (1 - MIN_ROUGHNESS)
+        cosine = dr.clip(mi.Float(node // GLOSS_NODES) / (GLOSS_NODES - 1), MIN_COSINE, 1 - 1e-4)
         o = mi.Vector3f(dr.sqrt(1 - cosine**2), 0, cosine)
-        lobe = mi.MicrofacetDistribution(DISTRIBUTIONS[distribution], r, True)
-        h, _ = lobe.sample(o, mi.Point2f((sample % SIDE + 0.5) / SIDE, (sample // SIDE + 0.5) / SIDE))
+        facets = mi.MicrofacetDistribution(DISTRIBUTIONS[distribution], r, True)
+        h, _ = facets.sample(
+            o,
+            mi.Point2f((sample % GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES, (sample // GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES),
+        )
         i = mi.reflect(o, h)
-        weight = dr.select(i.z > 0, 4 * lobe.G(i, o, mi.Normal3f(0, 0, 1)) / lobe.smith_g1(o, h), 0)
+        weight = dr.select(i.z > 0, 4 * facets.G(i, o, mi.Normal3f(0, 0, 1)) / facets.smith_g1(o, h), 0)
         mean = [dr.block_sum(weight * part, count) for part in (i.x, i.z)]
         length = dr.rsqrt(mean[0] ** 2 + mean[1] ** 2)
         x, z = mean[0] * length, mean[1] * length
         toward = mi.Vector3f(dr.gather(mi.Float, x, node), 0, dr.gather(mi.Float, z, node))
-        away = dr.gather(mi.Float, o.x, dr.arange(mi.UInt32, NODES**2) * count)
+        away = dr.gather(mi.Float, o.x, dr.arange(mi.UInt32, GLOSS_NODES**2) * count)
         polynomials = legendre(dr.dot(i, toward), order)
         channels = [-x / away, z, *(dr.block_sum(weight * p, count) / count for p in polynomials)]
-        table = dr.zeros(mi.Float, NODES**2 * len(channels))
+        table = dr.zeros(mi.Float, GLOSS_NODES**2 * len(channels))
         for k, channel in enumerate(channels):
-            dr.scatter(table, channel, dr.arange(mi.UInt32, NODES**2) * len(channels) + k)
+            dr.scatter(table, channel, dr.arange(mi.UInt32, GLOSS_NODES**2) * len(channels) + k)
         return mi.Texture2f(
-            mi.TensorXf(table, (NODES, NODES, len(channels))), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+            mi.TensorXf(table, (GLOSS_NODES, GLOSS_NODES, len(channels))), use_accel=False, wrap_mode=dr.WrapMode.Clamp
         )
 
 
 def legendre(x, order):
-    """Legendre's polynomials up to a degree, by Bonnet's recursion."""
+    """The Legendre polynomials of x up to a degree, by Bonnet's recursion."""
     found = [mi.Float(1), x]
     for n in range(1, order):
         found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))

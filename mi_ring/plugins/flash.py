@@ -1,57 +1,35 @@
-"""The `flash` emitter: through it other integrators see a photograph's light (Mitsuba plugin)."""
+"""The `flash` emitter: it shows a photograph's light to stock integrators (Mitsuba plugin)."""
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.plugins.photograph import SHUTTER, Photograph
-from mi_ring.rendering.photograph_lights import FAR, cone
+from mi_ring.rendering.photograph_lights import DISTANT, flash_falloff
 
 
 def flash_light(it, sample=(0, 0), active=True):
-    """The light at `it` of the photograph whose rays arrive there: (DirectionSample3f, radiance · d⁻²).
+    """The light of the current photograph at interactions `it`: (DirectionSample3f, radiance · d⁻²).
 
-    Black where the rays of another kind of sensor arrive.
+    Black for the rays of another kind of sensor.
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
     light, falloff = Photograph.current.light, Photograph.current.falloff
     ds, weight = light.sample_direction(it, mi.Point2f(sample), active)
-    if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite):  # being nested, it was never told how large the scene is
-        ds.dist = mi.Float(FAR)
-        ds.p = it.p + FAR * ds.d
+    if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite):  # a nested emitter does not know the size of the scene
+        ds.dist = mi.Float(DISTANT)
+        ds.p = it.p + DISTANT * ds.d
     else:
-        weight = weight * cone(ds.d, Photograph.current.to_world.matrix, falloff)
+        weight = weight * flash_falloff(ds.d, Photograph.current.to_world.matrix, falloff)
     return ds, dr.select(it.time == SHUTTER, weight, 0)
 
 
-class Flash(mi.Emitter):
-    """The light of whichever `photograph` is being rendered; black while another kind of sensor is.
-
-    Nested emitters light only their own photograph, so they are no emitters of the scene and stock integrators would
-    see none. `shapenet` therefore carries this one, which hands every question on to the light of the current
-    photograph. It has no parameters.
-
-    Of use in itself only in a scene of `photograph` sensors without a `shapenet` shape:
-
-    .. tab-set-code::
-
-        .. code-block:: xml
-
-            <emitter type="flash"/>
-
-        .. code-block:: python
-
-            {"type": "flash"}
-    """
-
-    of_photographs = True  #: to `mi_ring.rendering`, whatever the variant that this class belongs to
+class InvisibleEmitter(mi.Emitter):
+    """An emitter that lights surfaces, and that rays do not see."""
 
     def __init__(self, props):
         super().__init__(props)
         self.m_flags = mi.EmitterFlags.DeltaPosition
-
-    def sample_direction(self, it, sample, active=True):
-        return flash_light(it, sample, active)
 
     def eval(self, si, active=True):
         return mi.Spectrum(0)
@@ -64,6 +42,32 @@ class Flash(mi.Emitter):
 
     def bbox(self):
         return mi.ScalarBoundingBox3f()
+
+
+class Flash(InvisibleEmitter):
+    """The light of whichever `photograph` is rendered; black while another kind of sensor is rendered.
+
+    A nested emitter lights only its own photograph. It is not an emitter of the scene, so stock integrators do not see
+    it. For them `shapenet` carries this emitter, which passes every call on to the light of the current photograph. It
+    has no parameters.
+
+    You need it yourself only in a scene of `photograph` sensors without a `shapenet` shape:
+
+    .. tab-set-code::
+
+        .. code-block:: xml
+
+            <emitter type="flash"/>
+
+        .. code-block:: python
+
+            {"type": "flash"}
+    """
+
+    of_photographs = True  #: for `mi_ring.scene.lights.is_flash`
+
+    def sample_direction(self, it, sample, active=True):
+        return flash_light(it, sample, active)
 
     def traverse(self, callback):
         pass

@@ -5,36 +5,40 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.plugins.properties import beside_scene
-from mi_ring.rendering.measured_brdf import Network, Table
+from mi_ring.rendering.measured_brdf import MerlNetwork, MerlTable
 
-NODES = 180  #: at which the density of half vectors is known, by the square root of their angle
-TYPICAL = np.radians(30)  #: θd for which it is
-STEEPEST = 1e-3  #: sine and root of an angle, below which a half vector is the normal
+HALF_NODES = 180  #: nodes of the density of half vectors, evenly spaced in the square root of θh
+SAMPLED_THETA_D = np.radians(30)  #: θd of this density
+MIN_ROOT = 1e-3  #: the least square root of θh / 90° in this density, and of sin θh; smaller ones are clamped
 
 
 class Merl(mi.BSDF):
-    """A measured, isotropic material: a table of the MERL database, or a network that was fitted to one.
+    """A measured, isotropic material: a table of the MERL database, or a network that was fitted to such a table.
 
     ============ ========= =====================================================================
     Parameter    Type      Description
     ============ ========= =====================================================================
-    ``filename`` string    a ``.binary`` of the MERL database, or an ``.npz`` of such networks
-    ``material`` string    which of the networks, by its name; none of a table
+    ``filename`` string    a ``.binary`` of the MERL database, or an ``.npz`` of networks
+    ``material`` string    name of the network to use; not with a table
     ============ ========= =====================================================================
 
     Values are those of the file, in the coordinates of Rusinkiewicz 1998 (A New Change of Variables for Efficient BRDF
-    Representation). Those of a table are interpolated between its cells, and reciprocal; where nothing was measured the
-    cells around say what there is, and where these have nothing either the material is black. The networks, of the
-    arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3``, take (sin θh, 0, cos θh) and the
-    difference vector, and are reciprocal as far as they fit; beyond θh = 80° or θd = 65° they are held as they are
-    there.
+    Representation).
 
-    Directions are drawn from a mixture of the cosine and of half vectors as bright as the material is at θd = 30°.
+    A table is interpolated between its cells, and is reciprocal. A cell that was not measured has the value of the
+    cells around it, or is black if these were not measured either.
 
-    What it does not do: it has no differentiable parameters, no second side, and no colours but RGB; the files hold no
-    energy balance, and none is enforced. It needs one of Mitsuba's variants ``llvm_*_rgb`` or ``cuda_*_rgb``.
+    A file of networks has the arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3``. A
+    network takes (sin θh, 0, cos θh) and the difference vector. It is reciprocal as far as its fit is. Angles are
+    clamped to θh = 80° and θd = 65°.
 
-    Raises ValueError for a file that is neither, for one that is cut off, and for an unknown material.
+    Directions are sampled from a mixture of the cosine lobe and of half vectors with the brightness that the material
+    has at θd = 30°.
+
+    What it does not do: it has no differentiable parameters, no second side, and only RGB colours. Nothing enforces
+    that it conserves energy. It needs one of Mitsuba's variants ``llvm_*_rgb`` or ``cuda_*_rgb``.
+
+    Raises ValueError for a file of another kind, for a truncated file, and for an unknown material.
 
     .. tab-set-code::
 
@@ -60,16 +64,16 @@ class Merl(mi.BSDF):
         if not self.path.is_file():
             raise ValueError(f'merl "{props.id()}": filename is "{self.path}", which is no file')
         if self.path.suffix == ".npz":
-            self.measured = Network(self.path, self.material)
+            self.measured = MerlNetwork(self.path, self.material)
         elif self.material:
             raise ValueError(f'merl "{props.id()}": material is "{self.material}", but a table holds one alone')
         else:
-            self.measured = Table(self.path)
-        root = np.linspace(0, 1, NODES)
+            self.measured = MerlTable(self.path)
+        root = np.linspace(0, 1, HALF_NODES)
         theta = mi.Float(root**2 * np.pi / 2)
-        typical = mi.Vector3f(float(np.sin(TYPICAL)), 0, float(np.cos(TYPICAL)))
+        typical = mi.Vector3f(float(np.sin(SAMPLED_THETA_D)), 0, float(np.cos(SAMPLED_THETA_D)))
         bright = dr.mean(self.measured.value(theta, typical)).numpy()
-        # Of half vectors by their root t, θh = t² π/2: f times the projected solid angle of a ring.
+        # The density of t, θh = t² π/2: f times the projected solid angle of a ring of half vectors.
         density = (bright + 1e-3 * bright.max() + 1e-9) * np.sin(2 * theta.numpy()).clip(0) * root
         self.half = mi.ContinuousDistribution(mi.ScalarVector2f(0, 1), mi.Float(density))
         self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
@@ -90,11 +94,11 @@ class Merl(mi.BSDF):
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), value, 0)
 
     def density(self, si, wo, active):
-        """Density [1/sr] of directions as `sample` draws them."""
+        """Density [1/sr] of the directions that `sample` draws."""
         h = dr.normalize(si.wi + wo)
-        sin = dr.maximum(dr.sqrt(h.x * h.x + h.y * h.y), STEEPEST**2)
+        sin = dr.maximum(dr.sqrt(h.x * h.x + h.y * h.y), MIN_ROOT**2)
         root = dr.sqrt(dr.minimum(dr.atan2(sin, h.z) / (dr.pi / 2), 1))
-        ring = self.half.eval_pdf_normalized(root) / (dr.pi * dr.maximum(root, STEEPEST)) / (dr.two_pi * sin)
+        ring = self.half.eval_pdf_normalized(root) / (dr.pi * dr.maximum(root, MIN_ROOT)) / (dr.two_pi * sin)
         mixed = 0.5 * mi.warp.square_to_cosine_hemisphere_pdf(wo) + 0.5 * ring / (4 * dr.abs(dr.dot(si.wi, h)))
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), mixed, 0)
 

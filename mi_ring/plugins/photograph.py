@@ -1,17 +1,18 @@
 """The `photograph` sensor: a calibrated photograph and the light it was taken under (Mitsuba plugin)."""
 
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.geometry.camera import Camera, distortion_range
+from mi_ring.errors import SceneError
+from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
 from mi_ring.rendering.pinhole import camera_ray
+from mi_ring.scene.lights import LAMP_CLASSES, light_of
+from mi_ring.scene.shot import Files, Response, Shot
 
-SHUTTER = -1.0  #: time of a photograph's rays, by which the flash knows them from those of other sensors (0 and later)
-FARTHEST = 50  #: sizes of the film from which a principal point may be
+#: Time of a photograph's rays. Other sensors have times of 0 and later: by the time the flash tells them apart.
+SHUTTER = -1.0
 
 
 class Photograph(mi.Sensor):
@@ -20,43 +21,40 @@ class Photograph(mi.Sensor):
     ================ ============ ====================================================================== =====
     Parameter        Type         Description                                                            Flags
     ================ ============ ====================================================================== =====
-    ``filename``     string       image file, relative to the XML; read by the fit, never by an
-                                  integrator
+    ``filename``     string       image file, relative to the XML. A fit reads it, integrators never do
     ``mask``         string       mask file of the same size: 0 background, 255 object. If it is
-                                  ``filename`` itself: its alpha channel. Default: none
+                                  ``filename`` itself, its alpha channel is the mask. Default: none
     ``valid``        string       mask file of the same size: 0 where the photograph shows nothing, for
                                   instance beyond the border of a lens whose distortion was undone.
                                   Default: none, all of it shows something
-    ``ambient``      string       image file of the same view without the photograph's own light, and
-                                  as long exposed: is subtracted, so that this light alone is left.
-                                  Default: none
+    ``ambient``      string       image file of the same view and the same exposure, without the
+                                  photograph's own light. A fit subtracts it. Default: none
     ``fx``, ``fy``   float        focal lengths [px]
-    ``cx``, ``cy``   float        principal point [px]; the image spans [0, W] × [0, H], so that the
-                                  centre of the first pixel is (0.5, 0.5). Default: the middle of the
-                                  film
-    ``distortion``   float        first radial one of the lens: what a pinhole would have at r focal     P, ∂
-                                  lengths from the principal point is at r (1 + ``distortion`` r²), as
-                                  COLMAP's SIMPLE_RADIAL and OpenCV's k1 have it. Default: 0
+    ``cx``, ``cy``   float        principal point [px]. The image spans [0, W] × [0, H]: the centre of
+                                  the first pixel is (0.5, 0.5). Default: the middle of the film
+    ``distortion``   float        first radial coefficient k of the lens: a point that a pinhole has     P, ∂
+                                  r focal lengths from the principal point is r (1 + k r²) from it.
+                                  The same as k of COLMAP's SIMPLE_RADIAL and k1 of OpenCV. Default: 0
     ``to_world``     transform    camera-to-world, Mitsuba's axes: x left, y up, z forward; no scale.    P, ∂
                                   Default: the identity
     ``encoding``     string       ``srgb`` or ``linear``; linear data of 8 bits is refused. Default:
                                   ``srgb`` for 8-bit files, ``linear`` for 16-bit PNG/TIFF and EXR
-    ``saturation``   float        pixels at or above it (encoded value, 1 = full scale) are clipped:
-                                  they only say "at least this bright". Default: 1
-    ``gamma``        float        exponent of the camera's curve: a pixel, decoded as ``encoding`` says,
-                                  is radiance to this power. Default: 1
-    ``contrast``     float        of the camera's curve: the encoding v of what ``gamma`` has made of
-                                  radiance is recorded as vᶜ / (vᶜ + (1 − v)ᶜ). Default: 1, as it is
-    ``vignetting``   float        how much darker the lens is toward the borders of the picture: like
-                                  the cosine of the angle from the optical axis to this power.
+    ``saturation``   float        encoded value (1 = full scale) from which a pixel is clipped. A
+                                  clipped pixel only says "at least this bright". Default: 1
+    ``gamma``        float        exponent of the camera's curve: a pixel, decoded by ``encoding``, is
+                                  radiance to this power. Default: 1
+    ``contrast``     float        exponent c of the camera's S-curve: after ``gamma``, an sRGB value v
+                                  is recorded as vᶜ / (vᶜ + (1 − v)ᶜ). Default: 1, no S-curve
+    ``vignetting``   float        exponent of the lens' vignetting: a pixel records radiance times the
+                                  cosine between its ray and the optical axis to this power.
                                   Default: 0, none
-    ``gain``         string       how much of the radiance is recorded, by exposure and white balance: a
-                                  factor, or one each for R, G, B. Default: 1
-    ``falloff``      float        how much less a point light, taken to be a flash that looks where the  P, ∂
-                                  camera looks, shines to the sides: like the cosine of the angle from
-                                  that direction to this power. Default: 0, alike in all directions
-    ``calibrated``   boolean      are camera and light exact? Then a fit leaves them alone unless told
-                                  otherwise. Default: false
+    ``gain``         string       factor of the recorded radiance, by exposure and white balance: one
+                                  number, or one each for R, G, B. Default: 1
+    ``falloff``      float        exponent of the flash's cone: a point light shines in a direction by   P, ∂
+                                  its intensity times the cosine between this direction and where the
+                                  camera looks, to this power. Default: 0, the same in all directions
+    ``calibrated``   boolean      are camera and light exact? Then a fit does not refine them by
+                                  default. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P
     (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone;      P, ∂
                                   exposed as ``light``. Default: a point light of intensity 1 at the
@@ -104,85 +102,60 @@ class Photograph(mi.Sensor):
 
     def __init__(self, props):
         super().__init__(props)
+        what = f'photograph "{props.id()}"'
         for name in ("filename", "fx", "fy"):
             if name not in props:
-                raise ValueError(f'photograph "{props.id()}": {name} is missing')
-        self.filename = beside_scene(props["filename"])
-        self.mask = beside_scene(props["mask"]) if "mask" in props else None
-        self.valid = beside_scene(props["valid"]) if "valid" in props else None
-        self.ambient = beside_scene(props["ambient"]) if "ambient" in props else None
+                raise ValueError(f"{what}: {name} is missing")
+        self.files = Files(*(beside_scene(props[name]) if name in props else None for name in Files._fields))
         self.encoding = props.get("encoding", "auto")
         if self.encoding not in ("auto", "srgb", "linear"):
-            raise ValueError(f'photograph "{props.id()}": encoding is "{self.encoding}", must be "srgb" or "linear"')
+            raise ValueError(f'{what}: encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = number(props, "saturation", 1.0, positive=True)
-        self.gamma = number(props, "gamma", 1.0, positive=True)
-        self.contrast = number(props, "contrast", 1.0, positive=True)
-        self.vignetting = number(props, "vignetting", 0.0)
+        curve = (number(props, name, 1.0, positive=True) for name in ("gamma", "contrast"))
+        vignetting = number(props, "vignetting", 0.0)
         gain = number_list(props, "gain", (1, 3)) if "gain" in props else [1.0]
         if min(gain) < 1 / LARGEST:
-            raise ValueError(f'photograph "{props.id()}": gain is "{props["gain"]}", must be above 0')
-        self.gain = np.broadcast_to(gain, 3)
+            raise ValueError(f'{what}: gain is "{props["gain"]}", must be above 0')
+        self.response = Response(*curve, vignetting, tuple(np.broadcast_to(gain, 3).tolist()))
         self.falloff = mi.Float(number(props, "falloff", 0.0))
         self.calibrated = props.get("calibrated", False)
 
         width, height = (int(s) for s in self.film().size())
         self.focal = mi.Point2f(*(number(props, name, positive=True) for name in ("fx", "fy")))
         self.centre = mi.Point2f(number(props, "cx", width / 2), number(props, "cy", height / 2))
-        if (far := np.abs(np.ravel(self.centre) / [width, height])).max() > FARTHEST:
-            name = ("cx", "cy")[int(far.argmax())]
-            raise ValueError(f'photograph "{props.id()}": {name} is {number(props, name):g}, which is more than '
-                             f"{FARTHEST} times its film away; is it in pixels?")  # fmt: skip
         self.distortion = mi.Float(number(props, "distortion", 0.0))
-        least, most = distortion_range(np.ravel(self.focal), np.ravel(self.centre), np.array([width, height]))
-        if not least <= self.bend <= most:
-            raise ValueError(f'photograph "{props.id()}": distortion is {self.bend:.6g}, must be within {least:.6g} '
-                             f"and {most:.6g}: below, its corners would show what is elsewhere, too")  # fmt: skip
         matrix = np.array(props["to_world"].matrix) if "to_world" in props else np.eye(4)
-        rotation = matrix[:3, :3]
-        rigid = np.isfinite(matrix).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
-        if not rigid or np.linalg.det(rotation) < 0:
-            raise ValueError(
-                f'photograph "{props.id()}": to_world must be a rotation and a translation, without scale or mirror'
-            )
         self.to_world = mi.AffineTransform4f(mi.Matrix4f(matrix))
+        if fault := self.camera.fault():
+            raise ValueError(f"{what}: {fault}")
 
         lights = [value for _, value in props.objects() if isinstance(value, mi.Emitter)]
         if len(lights) > 1:
-            raise ValueError(f'photograph "{props.id()}": {len(lights)} nested emitters, must be at most one')
+            raise ValueError(f"{what}: {len(lights)} nested emitters, must be at most one")
         position = [float(v) for v in matrix[:3, 3]]
         self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
         if self.light.class_name() != "PointLight" and "falloff" in props:
-            raise ValueError(
-                f'photograph "{props.id()}": falloff is for point lights, not for {self.light.class_name()}'
-            )
+            raise ValueError(f"{what}: falloff is for point lights, not for {self.light.class_name()}")
         dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff, self.distortion)
 
     @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]"""
-        width, height = self.film().size()
-        return int(width), int(height)
-
-    @property
-    def cone(self) -> float:
-        """``falloff`` as a number."""
-        return float(np.ravel(self.falloff)[0])
-
-    @property
-    def bend(self) -> float:
-        """``distortion`` as a number."""
-        return float(np.ravel(self.distortion)[0])
-
-    @property
-    def files(self) -> set[Path]:
-        """All that it names, resolved."""
-        return {file.resolve() for file in (self.filename, self.mask, self.valid, self.ambient) if file}
-
-    @property
     def camera(self) -> Camera:
-        """The camera as numpy arrays."""
-        matrix = np.array(self.to_world.matrix).reshape(4, 4)
-        return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), self.size, self.bend)
+        """The camera as plain values, by its parameters as they are now."""
+        matrix, distortion = np.array(self.to_world.matrix).reshape(4, 4), float(np.ravel(self.distortion)[0])
+        size = tuple(map(int, self.film().size()))
+        return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), size, distortion)
+
+    @property
+    def shot(self) -> Shot:
+        """The photograph as plain values, by its parameters as they are now.
+
+        Raises SceneError if its light is neither a point light nor a distant one.
+        """
+        if (kind := self.light.class_name()) not in LAMP_CLASSES:
+            raise SceneError(f'photograph "{self.id()}": nested emitter is a {kind}, must be "point" or "directional"')
+        falloff = float(np.ravel(self.falloff)[0])
+        return Shot(self.id(), self.camera, light_of(self.light), falloff, self.response, self.files, self.encoding,
+                    self.saturation, self.calibrated)  # fmt: skip
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         Photograph.current = self
@@ -212,7 +185,7 @@ class Photograph(mi.Sensor):
         dr.make_opaque(self.falloff, self.distortion)
 
     def to_string(self):
-        return f"Photograph[filename={self.filename}, size={self.size}]"
+        return f"Photograph[filename={self.files.filename}, size={self.camera.size}]"
 
 
 mi.register_sensor("photograph", Photograph)

@@ -1,4 +1,4 @@
-"""The `photometric` integrator: photographs of the scene, each lit by its own light (Mitsuba plugin)."""
+"""The `photometric` integrator: photographs of a scene, each lit by its own light (Mitsuba plugin)."""
 
 import drjit as dr
 import mitsuba as mi
@@ -7,36 +7,36 @@ from mitsuba.python.ad.integrators.common import ADIntegrator  # `mitsuba.ad` ke
 from mi_ring.plugins.flash import flash_light
 from mi_ring.plugins.photograph import Photograph
 from mi_ring.rendering.direct_light import shade
-from mi_ring.rendering.edge_gradients import boundaries
+from mi_ring.rendering.edge_gradients import boundary_terms
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.scene.mesh_attributes import require_attributes
 
 
 class Photometric(ADIntegrator):
-    """The paper's image formation for photographs (equation 2): camera k sees the object lit by light k alone.
+    """The paper's image formation (equation 2): camera k sees the object lit by light k alone.
 
-    Direct light only: radiance = B · max(0, n·i) · intensity / d² for the nested point light of the photograph being
-    rendered, B · max(0, n·i) · irradiance for a directional one. Emitters at the top level of the scene (an environment
-    map, a lamp) light every photograph, one emitter sample each.
+    Direct light only: radiance is B · max(0, n·i) · intensity / d² for the nested point light of the rendered
+    photograph, and B · max(0, n·i) · irradiance for a nested directional light. Emitters at the top level of the scene,
+    like an environment map or a lamp, light every photograph, by one emitter sample each.
 
     =========== ======= =============================================================================== =====
     Parameter   Type    Description                                                                     Flags
     =========== ======= =============================================================================== =====
-    ``shadows`` boolean is a point lit only if it sees the light of its photograph? Default: true
+    ``shadows`` boolean do the photographs' own lights cast shadows? Default: true
     =========== ======= =============================================================================== =====
 
-    Samples per pixel come from ``spp``. Alpha is the object's coverage, background included.
+    The number of samples per pixel is that of the sampler. Alpha is the coverage of the pixel by all shapes.
 
-    Gradients, through `mi.render` and through `render_photographs`, are those with respect to vertices, BSDFs, cameras,
-    lights and the placement of other shapes: shading by automatic differentiation, and the motion of outlines, creases
-    and edges of cast shadows, of all meshes, rectangles, disks, spheres and cylinders, by sampling these edges (Li et
-    al. 2018, "Differentiable Monte Carlo Ray Tracing through Edge Sampling").
+    Gradients, by `mi.render` and by `render_photographs`, are those with respect to vertices, BSDFs, cameras, lights
+    and the placement of other shapes. Those of shading are by automatic differentiation. Those of moving outlines,
+    creases and edges of cast shadows are by edge sampling (Li et al. 2018, "Differentiable Monte Carlo Ray Tracing
+    through Edge Sampling"), for meshes, rectangles, disks, spheres and cylinders.
 
-    What it does not do: interreflection; lamps that are shapes cast light but are black to the camera; ``shadows`` is
-    about the photographs' own lights, others always cast shadows. What Mitsuba's integrators have in common
-    (``max_depth``, ``hide_emitters``, …) is accepted and has no effect. Gradients need an RGB variant and a
-    `photograph` sensor; the soft shadows of area lights and environment maps give none when they move.
+    What it does not do: interreflection. Shapes that are emitters give light, but the camera sees them black. Emitters
+    at the top level always cast shadows. The common parameters of Mitsuba's integrators (``max_depth``,
+    ``hide_emitters``, …) are accepted and have no effect. Gradients need an RGB variant and a `photograph` sensor. Soft
+    shadows of area lights and environment maps have no gradients of their motion.
 
     .. tab-set-code::
 
@@ -63,15 +63,15 @@ class Photometric(ADIntegrator):
         return radiance, si.is_valid(), [], None
 
     def require_attributes(self, scene):
-        """Refuse a scene that would silently render black, once per scene."""
-        shapes = scene.shapes()  # not the scene, which holds this integrator: nobody would free the two
+        """`require_attributes` for all shapes, once per scene."""
+        shapes = scene.shapes()  # keeping the scene, which holds this integrator, would be a cycle
         if shapes != self.checked:
             for shape in shapes:
                 require_attributes(shape)
             self.checked = shapes
 
     def differentiable(self, scene, sensor, seed, spp):
-        """The image of `render`, attached, the motion of edges included."""
+        """The image of `render`, attached to all parameters, with the boundary terms of moving edges."""
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         if not (mi.is_rgb and isinstance(sensor, Photograph)):
@@ -89,8 +89,8 @@ class Photometric(ADIntegrator):
         one = Photographs.attached(sensor)
         border = film.rfilter().border_size() if film.sample_border() else 0
         low = mi.Point2f(film.crop_offset()) - border
-        window = low, low + mi.Point2f(film.crop_size()) + 2 * border  # where `sample_rays` puts its samples
-        for where, _, step, active in boundaries(scene, one, self.edges, seed, self.shadows, window):
+        window = low, low + mi.Point2f(film.crop_size()) + 2 * border  # the range of `sample_rays`
+        for where, _, step, active in boundary_terms(scene, one, self.edges, seed, self.shadows, window):
             block = film.create_block()
             block.set_coalesce(False)
             # The film divides by the sum of the weights, `spp` per pixel.

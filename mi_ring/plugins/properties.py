@@ -1,4 +1,4 @@
-"""What the plugins read of their properties."""
+"""Reading the properties of plugins: files, numbers, vectors."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,17 +8,17 @@ import numpy as np
 
 
 def beside_scene(name: str) -> Path:
-    """A file that a scene names, relative to the scene's own folder (to the working directory outside of a file)."""
+    """The path of a file that a scene names relative to its own folder; without a scene file, to the working folder."""
     return Path(str(mi.file_resolver()[0])) / name
 
 
-LARGEST = 1e18  #: number whose square is finite in float32, in which all is computed
+LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """A property of a plugin that is a finite number, and so are its square and, if it must be positive, its inverse.
+    """A property of a plugin that is a number. Its square is finite, and if it must be positive its inverse, too.
 
-    Raises ValueError, which names it, if it is anything else.
+    Raises ValueError if it is anything else.
     """
     value = props.get(name, default)
     least = 1 / LARGEST if positive else -LARGEST
@@ -29,9 +29,9 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
 
 
 def vector(props, name: str, kind: str) -> np.ndarray | None:
-    """A property of a plugin that is a <point> or <vector>, `kind`, (3,); None if there is none.
+    """A property of a plugin that is a <point> or <vector> (`kind`), (3,); None if it is missing.
 
-    Raises ValueError, which names it, if it is anything else.
+    Raises ValueError if it is anything else.
     """
     if name not in props:
         return None
@@ -42,7 +42,10 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
 
 
 def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
-    """A property of a plugin that is one of so many finite numbers. Raises ValueError, which names it, if it is not."""
+    """A property of a plugin that is a text of numbers, as many as one of `counts`.
+
+    Raises ValueError if it is anything else.
+    """
     text = str(props.get(name, ""))
     try:
         values = [float(word) for word in text.replace(",", " ").split()]

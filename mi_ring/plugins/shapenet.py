@@ -7,12 +7,12 @@ from mi_ring.plugins.properties import beside_scene, number, vector
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
-#: What says where a fit starts and what its result is to other programs; finished ones have it in them.
+#: Parameters for a fit and for exports of its result. A finished fit in ``weights`` has its own.
 FOR_FITS = "center", "radius", "domain", "ground", "up", "metres"
 
 
 class ShapeNetMesh(mi.Mesh):
-    """The reconstructed surface: Shape-Net's deformation of a domain, sampled at any resolution.
+    """The reconstructed surface: Shape-Net's deformation of a domain, sampled as a mesh of any resolution.
 
     ================ ========= ========================================================================== =======
     Parameter        Type      Description                                                                Flags
@@ -20,24 +20,22 @@ class ShapeNetMesh(mi.Mesh):
     ``weights``      string    a saved fit (``ring.pt``). Default: none, the shape is the undeformed
                                domain
     ``subdivisions`` integer   level of the icosphere, 0 to 8: 10 · 4ⁿ + 2 vertices. Default: 5
-    ``domain``       string    mesh file (scene units), closed: the canonical surface instead of the
-                               sphere. Not together with ``weights``, which carry their own. Default:
-                               none
-    ``center``       point     centre of the normalising sphere [scene units]; with ``weights`` theirs.
-                               Default: the middle of ``domain``, else the origin, but a fit estimates
-                               it from masks or cameras
-    ``radius``       float     its radius [scene units]; likewise. Default: the mean radius of
-                               ``domain``, else 1
-    ``ground``       point     on the table that the object stands on [scene units]: the surface does
-                               not go below, where no photograph shows it. Not together with
-                               ``weights``. Default: none
-    ``up``           vector    normal of the table, or what else is up, for exports. Not together with
-                               ``weights``. Default: z for ``ground``; exports leave the object as it is
-    ``metres``       float     length of a scene unit, for exports. Not together with ``weights``.
+    ``domain``       string    file of a closed mesh [scene units] that replaces the sphere as domain.
+                               Not together with ``weights``. Default: none
+    ``center``       point     centre of the normalising sphere [scene units]. Not together with
+                               ``weights``. Default: the middle of ``domain``, else the origin; a fit
+                               estimates it from masks or cameras
+    ``radius``       float     radius of the normalising sphere [scene units]. Not together with
+                               ``weights``. Default: the mean radius of ``domain``, else 1
+    ``ground``       point     point of the table on which the object stands [scene units]. A fit keeps
+                               the surface above it. Not together with ``weights``. Default: none
+    ``up``           vector    normal of the table, and up direction of exports. Not together with
+                               ``weights``. Default: z for the table; exports are not turned
+    ``metres``       float     length of a scene unit [m], for exports. Not together with ``weights``.
                                Default: not known
-    ``to_world``     transform applied on top of everything. Default: none
-    ``flash``        boolean   let every integrator see the light of the `photograph` it renders. Set it
-                               to false to place a fit into a scene of your own. Default: true
+    ``to_world``     transform applied to the surface at the end. Default: none
+    ``flash``        boolean   show every integrator the light of the `photograph` it renders. Set it to
+                               false to place a fit into a scene of your own. Default: true
     (nested)         bsdf      usually `cooktorrance`, which reads the attributes below; exposed as       P, ∂
                                ``bsdf``
     ================ ========= ========================================================================== =======
@@ -46,18 +44,20 @@ class ShapeNetMesh(mi.Mesh):
     Exposed              Type  Description                                                                Flags
     ==================== ===== ========================================================================== =======
     ``vertex_positions`` float 3 per vertex [scene units]                                                 P, ∂, D
-    ``vertex_normals``   float 3 per vertex; computed anew whenever positions change                      P, ∂, D
+    ``vertex_normals``   float 3 per vertex; recomputed when positions change                             P, ∂, D
     ``faces``            int   3 vertices per triangle                                                    P
-    ``vertex_diffuse``   float 3 per vertex; this and the next two: of a fit with `cooktorrance`          P, ∂
+    ``vertex_diffuse``   float 3 per vertex; this and the next two if the fit has a `cooktorrance`        P, ∂
     ``vertex_specular``  float 1 per vertex                                                               P, ∂
     ``vertex_roughness`` float 1 per vertex                                                               P, ∂
     ==================== ===== ========================================================================== =======
 
-    The mesh carries smooth normals and, for each parameter that the fit of ``weights`` predicts, the attribute
-    ``vertex_<parameter>``: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
-    ``vertex_roughness`` (1). Without ``weights`` it has these, 0.5, 0 and 0.5. A nested BSDF that asks for another
-    attribute, or for one with another number of channels, is an error. What it does not do: texture coordinates;
-    colours in spectral variants, where Mitsuba takes three-channel attributes for the coefficients of a spectrum.
+    The mesh has smooth normals, and an attribute ``vertex_<parameter>`` for each parameter that the fit in ``weights``
+    predicts: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and ``vertex_roughness`` (1).
+    Without ``weights`` it has these three, with the values 0.5, 0 and 0.5. A nested BSDF that reads another attribute,
+    or an attribute with another number of channels, is an error.
+
+    What it does not do: texture coordinates; colours in spectral variants, where Mitsuba reads attributes of three
+    channels as coefficients of a spectrum.
 
     .. tab-set-code::
 
@@ -77,7 +77,7 @@ class ShapeNetMesh(mi.Mesh):
     """
 
     def __init__(self, props):
-        import torch  # here, with all that needs it: `import mi_ring` is quick
+        import torch  # imported here so that `import mi_ring` is quick
 
         from mi_ring.geometry.domain import Sphere, closed_domain
         from mi_ring.geometry.meshes import load_closed_mesh
@@ -95,13 +95,13 @@ class ShapeNetMesh(mi.Mesh):
             raise ValueError(f'shapenet "{props.id()}": to_world is {to_world}, must be a <transform>')
         to_world = np.array(to_world.matrix)
         if props.get("flash", True):
-            # The scene collects the emitter of each shape: this is how stock integrators come to see nested lights.
+            # The scene collects the emitters of its shapes. So stock integrators see nested lights.
             props["flash"] = mi.load_dict({"type": "flash"})
 
-        #: What the XML says of the normalising sphere, for the fit; None where it says nothing.
+        #: The given normalising sphere, for the fit; None if it is not given.
         self.center = vector(props, "center", "point")
         self.radius = number(props, "radius", positive=True) if "radius" in given else None
-        #: (3,) what is up, and the length of a scene unit, for exports; None where it says nothing.
+        #: Unit vector (3,) and length of a scene unit [m], for exports; None if they are not given.
         self.up, self.metres = vector(props, "up", "vector"), None
         if self.up is not None:
             if not self.up.any():
@@ -109,11 +109,11 @@ class ShapeNetMesh(mi.Mesh):
             self.up = self.up / np.linalg.norm(self.up)
         if "metres" in given:
             self.metres = number(props, "metres", positive=True)
-        #: (2, 3) a point on the table that the object stands on, and its unit normal, for the fit; or None.
+        #: (2, 3) a point of the table and its unit normal, for the fit; None if they are not given.
         self.ground = vector(props, "ground", "point")
         if self.ground is not None:
             self.ground = np.stack([self.ground, [0.0, 0.0, 1.0] if self.up is None else self.up])
-        #: The domain that it names, with its own normalising sphere, or None.
+        #: The given domain with its normalising sphere, and its file; None if it is not given.
         self.domain, self.domain_file = None, None
         if "domain" in given:
             self.domain_file = beside_scene(given["domain"])
@@ -138,7 +138,7 @@ class ShapeNetMesh(mi.Mesh):
         matrix = torch.tensor(to_world, dtype=torch.float32)
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(to_world[:3, :3]) < 0:
-            faces = np.fliplr(faces)  # a mirror would turn the surface inside out
+            faces = np.fliplr(faces)  # a mirror turns the surface inside out
 
         super().__init__(props.id(), len(vertices), len(faces), props, True, False)
         if not self.id():

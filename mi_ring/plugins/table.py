@@ -1,4 +1,4 @@
-"""The `table` shape: what the object stands on, which reflects light onto it (Mitsuba plugin)."""
+"""The `table` shape: a surface below the object that reflects light onto it (Mitsuba plugin)."""
 
 import mitsuba as mi
 import numpy as np
@@ -10,20 +10,20 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
 class Table(mi.Mesh):
-    """What the object stands on: a rectangle whose reflected light, and the room's that it hides, reach the object.
+    """A rectangle on which the object stands. It reflects light onto the object and hides the room's light from it.
 
-    ============ ========= ===================================================================== =====
-    Parameter    Type      Description                                                           Flags
-    ============ ========= ===================================================================== =====
-    ``to_world`` transform of the square from −1 to 1 in x and y that faces z. Default: none
-    (nested)     bsdf      usually diffuse, with a bitmap, whose first row is at y = −1          P, ∂
-    ============ ========= ===================================================================== =====
+    ============ ========= ========================================================================= =====
+    Parameter    Type      Description                                                               Flags
+    ============ ========= ========================================================================= =====
+    ``to_world`` transform of the square from −1 to 1 in x and y that faces z. Default: the identity
+    (nested)     bsdf      usually diffuse with a bitmap; the first row of a bitmap is at y = −1     P, ∂
+    ============ ========= ========================================================================= =====
 
-    Mitsuba's integrators see it like any other rectangle. In what a fit predicts of photographs it is one of the ways
-    of light between surfaces, and nothing that a camera sees: the object is what the masks say, and photographs show
-    more of a table than its reflectance. `mi_ring.photos` writes it where the printed sheet is seen.
+    Stock integrators render it like any other rectangle. In the photographs that a fit predicts it is part of
+    interreflection only, and cameras do not see it: a fit compares the object inside of its mask. ``mi-ring photos``
+    writes a table if it finds the printed sheet.
 
-    What it does not do: it hides nothing from a camera or a lamp in these predictions.
+    What it does not do: in these predictions it hides nothing from a camera or a lamp.
 
     .. tab-set-code::
 
@@ -42,7 +42,7 @@ class Table(mi.Mesh):
             }
     """
 
-    of_tables = True  #: to `mi_ring.rendering`, whatever the variant that this class belongs to
+    of_tables = True  #: for `mi_ring.scene.assembly.is_table`
 
     def __init__(self, props):
         to_world = props.get("to_world", mi.ScalarTransform4f())

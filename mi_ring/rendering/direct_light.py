@@ -1,35 +1,37 @@
-"""Direct light: what a surface reflects toward the viewer (equation 2 of the paper)."""
+"""Direct light: the light of lamps that a surface reflects once, toward the camera (equation 2 of the paper)."""
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.rendering.edge_curves import leave
+from mi_ring.rendering.edge_curves import ray_offset
 from mi_ring.scene.lights import shared_emitters
 
-MIN_COSINE = 1e-3  #: grazing cosines are clamped here: see `CookTorrance`
+MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones are clamped: see `CookTorrance`
 
 
-def shade(scene, si, light, next_2d, shadows, rooms=False, around=None):
-    """Radiance leaving `si` toward the viewer under `light(si)` → (DirectionSample3f, radiance · d⁻²), if not None.
+def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
+    """Radiance that leaves surface interactions `si` toward the viewer, attached.
 
-    `around(si)`: radiance that is added, of light from everywhere. `rooms`: and under the scene's `room` emitters, by
-    one sample each; `render_indirect` does so with less noise.
+    `light(si)`, or None: (DirectionSample3f, radiance · d⁻²) of the photograph's own light. Other emitters take one
+    sample each, by `next_2d`. `shadows`: does the own light cast shadows? Other emitters always do.
+    `room_radiance(si)`, if it is not None, is radiance to add. `rooms` samples the scene's `room` emitters;
+    `render_indirect` has their light with less noise.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
-    # At an outline interpolated normals turn away before the faces do. Black there would be an edge of its own.
+    # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
     rim = (si.wi.z < MIN_COSINE) & (dr.dot(si.wi, si.to_local(si.n)) > 0)
     si.wi = dr.normalize(mi.Vector3f(si.wi.x, si.wi.y, dr.select(rim, MIN_COSINE, si.wi.z)))
 
     def reflected(ds, weight, shadows):
         lit = active & dr.any(weight != 0)
         if shadows:
-            lit &= sees(scene, si, ds, lit)
+            lit &= light_visible(scene, si, ds, lit)
         value = bsdf.eval(context, si, si.to_local(ds.d), lit)
         return dr.select(lit, value * weight, 0)
 
     radiance = reflected(*light(si), shadows) if light else dr.zeros(mi.Color3f, dr.width(si.t))
-    if around:
-        radiance += dr.select(active, around(si), 0)
+    if room_radiance:
+        radiance += dr.select(active, room_radiance(si), 0)
     for emitter in shared_emitters(scene, rooms):
         radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
@@ -37,34 +39,35 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, around=None):
     return radiance
 
 
-def sees(scene, si, ds, active=True):
-    """Does the surface at `si` see the light at `ds`?"""
+def light_visible(scene, si, ds, active=True):
+    """Is there nothing between the surface at `si` and the light at `ds`?"""
     n, d = dr.detach(si.n), dr.detach(ds.d)
-    origin = dr.detach(si.p) + n * dr.mulsign(leave(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
+    origin = dr.detach(si.p) + n * dr.mulsign(ray_offset(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
     to_light = dr.detach(ds.p) - origin
     distance = dr.norm(to_light)
-    # Short of the light, which may be a surface
+    # The ray ends before the light, which may be a surface.
     ray = mi.Ray3f(origin, to_light / distance, (1 - 2.0**-10) * distance, si.time, si.wavelengths)
     return ~scene.ray_test(ray, active)
 
 
 def next_2d(seed, lanes, stream=None):
-    """A source of 2-D samples: independent streams, the lane's own or the one that `stream` (UInt32) says."""
-    # Hashed as in Mitsuba's samplers: neighbouring streams would otherwise resemble each other.
+    """A function that returns 2-D samples: each lane has the random stream of its number, or of `stream` (UInt32)."""
+    # Hashed as in Mitsuba's samplers: without this, neighbouring streams are correlated.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
-    # Of size 1: of another it would add the lane to the stream.
+    # Of size 1: a larger generator would add the lane's number to the stream.
     rng = mi.PCG32(1, *mi.sample_tea_32(dr.opaque(mi.UInt32, seed), stream))
     return lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """[R, G, B, coverage] along `ray`, each lane under the light of its own photograph; zero where not `active`.
+    """[R, G, B, coverage] along rays, each lane lit by the light of its own photograph; 0 where not `active`.
 
-    And under the light of the photographs' room as if nothing were in its way: what is, `render_indirect` knows.
+    The light of the photographs' room is included without occlusion. `render_indirect` has the occlusion.
     """
-    shadows = shadows and photographs.cast
+    shadows = shadows and photographs.casts_shadows
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     dr.eval(hit)  # one traversal serves the image and its gradient
     si = hit.compute_surface_interaction(ray, active=active)
-    radiance = shade(scene, si, photographs.lighting(view), next_2d, shadows, around=photographs.around(scene, view))
+    room_radiance = photographs.room_radiance(scene, view)
+    radiance = shade(scene, si, photographs.lighting(view), next_2d, shadows, room_radiance=room_radiance)
     return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]

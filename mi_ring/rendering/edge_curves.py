@@ -1,41 +1,41 @@
-"""Curves in space: samples of outlines, borders and edges of shadows, and those of shapes that are no meshes."""
+"""Edges as curves in space: their samples, and the outlines and borders of shapes that are not meshes."""
 
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-CURVE_SAMPLES = 256  #: samples per curve of any other shape
-LEAVE = 2.0**-19  #: see `leave`
-#: How far to both sides of an edge one has to look for the jump [px]. Radiance grows like the square root of the
-#: distance to an outline, so that there it must be little; the edge of a shadow is known with less precision.
-ROOT, JUMP = 1e-4, 1e-2
+CURVE_SAMPLES = 256  #: samples per curve of such a shape
+RELATIVE_OFFSET = 2.0**-19  #: see `ray_offset`
+#: Distance from an edge to the rays on both of its sides [px]. It is small for outlines, from which radiance grows like
+#: the square root of this distance. The place of a shadow's edge is less precise.
+OUTLINE_OFFSET, SHADOW_OFFSET = 1e-4, 1e-2
 
 
-def leave(point, distance):
-    """How far from `point` a ray must start so as not to meet the surface that it leaves [scene units].
+def ray_offset(point, distance):
+    """Distance from `point` at which a ray must start in order not to hit the surface that it leaves [scene units].
 
-    In proportion to the rounding error of a point that was found `distance` away from where one looked.
+    It is proportional to the rounding error of the point, which a ray of length `distance` has found.
     """
-    return LEAVE * (dr.max(dr.abs(point)) + distance)
+    return RELATIVE_OFFSET * (dr.max(dr.abs(point)) + distance)
 
 
 @dataclass
-class Curve:
+class EdgeSamples:
     """Samples of curves in space, any number per photograph."""
 
     view: mi.UInt32  #: the photograph
-    lane: mi.UInt32  #: the number of the sample, alike whichever photographs are rendered together
-    point: mi.Point3f  #: attached to what moves the curve
-    tangent: mi.Vector3f  #: detached: the piece of the curve that the sample stands for [scene units]
-    inside: mi.Point3f  #: detached: what the curve bounds lies on this side of it
+    lane: mi.UInt32  #: the number of the sample, the same whichever photographs are rendered together
+    point: mi.Point3f  #: attached
+    tangent: mi.Vector3f  #: detached: the piece of the curve that the sample represents [scene units]
+    inside: mi.Point3f  #: detached: a point of the shape that the curve bounds
     active: mi.Bool
-    offset: float  #: how far to both sides of it one has to look [px]
-    shadow: bool = False  #: is it an edge of light and not of a shape?
+    offset: float  #: distance to the rays on both sides [px]
+    shadow: bool = False  #: is it the edge of a shadow?
 
 
-# Curves of the other shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in
-# [0, 1), and of the eye: a point for w = 1, a direction for w = 0.
+# Curves of such shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in [0, 1) and
+# of the eye e, which is a point for w = 1 and a direction for w = 0.
 def circle(u, v, t):
     """A unit circle in the plane of `u` and `v`."""
     s, c = dr.sincos(2 * dr.pi * t)
@@ -65,7 +65,7 @@ def cylinder_border(e, w, t, z):
 
 
 def sphere_outline(e, w, t):
-    """Points of the unit sphere with p · e = w, where its normal is at right angles to the view."""
+    """Points of the unit sphere with p · e = w, where its normal is perpendicular to the view."""
     e2 = dr.squared_norm(e)
     frame = mi.Frame3f(e * dr.rsqrt(e2))
     p, dp = circle(frame.s, frame.t, t)
@@ -74,7 +74,7 @@ def sphere_outline(e, w, t):
 
 
 def cylinder_outline(e, w, t, side=1.0):
-    """A line along the cylinder x² + y² = 1, 0 < z < 1, where its normal is at right angles to the view."""
+    """A line on the cylinder x² + y² = 1, 0 < z < 1, where its normal is perpendicular to the view."""
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
     p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)
@@ -94,8 +94,11 @@ CURVES = {
 }
 
 
-def outline_of(shape, eye, views, seed, before=0) -> list[Curve]:
-    """The outline and the border of a shape that is no mesh, as `views` eyes see it, others `before` them."""
+def outline_of(shape, eye, views, seed, before=0) -> list[EdgeSamples]:
+    """Samples of the outline and border of a shape that is not a mesh, for the eyes of `views` photographs.
+
+    `eye`: see `Edges`; `before`: see `Photographs`.
+    """
     to_world = mi.traverse(shape)["to_world"]
     curves = []
     for k, curve in enumerate(CURVES[shape.class_name()]):
@@ -112,5 +115,5 @@ def outline_of(shape, eye, views, seed, before=0) -> list[Curve]:
             tangent = dr.detach(to_world) @ mi.Vector3f(tangent) / CURVE_SAMPLES
             inside = dr.detach(to_world) @ inside
             dr.eval(p, tangent, inside)
-        curves.append(Curve(view, lane, to_world @ p, tangent, inside, dr.isfinite(p.x), ROOT))
+        curves.append(EdgeSamples(view, lane, to_world @ p, tangent, inside, dr.isfinite(p.x), OUTLINE_OFFSET))
     return curves

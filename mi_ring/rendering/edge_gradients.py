@@ -1,38 +1,40 @@
-"""What moving edges add to the gradient of a photograph."""
+"""The boundary terms of a photograph's gradient: what it is because edges move."""
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.rendering.direct_light import next_2d, trace
-from mi_ring.rendering.edge_curves import JUMP, Curve, leave
+from mi_ring.rendering.edge_curves import SHADOW_OFFSET, EdgeSamples, ray_offset
 from mi_ring.rendering.pinhole import camera_ray, project, project_tangent
-from mi_ring.scene.lights import place_of
+from mi_ring.scene.lights import position_of
 
-EDGE_ROUNDINGS = 16  #: the least offset to either side of an edge, in rounding errors of a pixel's coordinate
+EDGE_ROUNDINGS = 16  #: the least distance to rays beside an edge, in rounding errors of a pixel coordinate
 
 
-def boundaries(scene, photographs, edges, seed, shadows=True, window=None):
-    """What edges add to the gradient of photographs: (where [px], view, step, active) of samples along each curve.
+def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
+    """The boundary terms of photographs: (where [px], view, step, active) of samples along each curve.
 
-    An edge that moves by n·dq [px] swaps the radiance beyond it for that before it over length · n·dq square pixels:
-    dI = (L_before − L_beyond) · n·dq · length. Rays to either side of the edge see occlusion, background, coverage and
-    shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative is dI, to be added to the pixel at
-    `where`. Edges count within `window`, the (lowest, highest) corner [px] of what is rendered, the whole by default.
+    An edge that moves by n·dq [px] changes radiance over length · n·dq square pixels: from L_beyond to L_before. So
+    dI = (L_before − L_beyond) · n·dq · length. Both are traced along rays beside the edge, which see occlusion,
+    background, coverage and shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative is dI, and
+    must be added to the pixel at `where`. Only edges in `window` count, the (lowest, highest) corner [px] of what is
+    rendered; by default all of it.
     """
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views, before = len(photographs), photographs.before
     curves, fronts = edges.outlines(photographs.eye, views, seed, before)
-    sources = [photographs.source] if shadows and photographs.cast else []
-    for source in filter(None, map(place_of, scene.emitters())):
+    sources = [photographs.source] if shadows and photographs.casts_shadows else []
+    for source in filter(None, map(position_of, scene.emitters())):
         sources.append(lambda view, source=source: (source[0], mi.Bool(source[1])))
     for k, source in enumerate(sources, 1):
         casters, terminators = edges.shadow_casters(source, views, seed + k, fronts, before)
-        curves += terminators + [cast(scene, curve, source, photographs.eye) for curve in casters]
-    return [b for curve in curves if (b := boundary(scene, photographs, curve, seed + 2, shadows, window)) is not None]
+        curves += terminators + [cast_shadow(scene, curve, source, photographs.eye) for curve in casters]
+    terms = (boundary_term(scene, photographs, curve, seed + 2, shadows, window) for curve in curves)
+    return [term for term in terms if term is not None]
 
 
-def boundary(scene, photographs, curve: Curve, seed, shadows, window):
-    """`boundaries` of one curve; None if nothing moves it."""
+def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window):
+    """`boundary_terms` of one curve; None if nothing moves it."""
     camera = photographs.camera(curve.view)
     where, depth = project(*camera, curve.point)
     if not dr.grad_enabled(where):
@@ -52,34 +54,34 @@ def boundary(scene, photographs, curve: Curve, seed, shadows, window):
         view = dr.gather(mi.UInt32, curve.view, pair)
         pixel = dr.gather(mi.Point2f, q, pair) + sign * dr.gather(mi.Vector2f, shift, pair)
         ray = mi.Ray3f(*camera_ray(*photographs.camera(view), pixel))
-        # Where there is no edge rays may not be finite, which OptiX must not meet.
-        meant = dr.gather(mi.Bool, active, pair)
-        # The same random numbers on both sides: only what jumps must differ.
+        # Rays of inactive samples may not be finite: OptiX must not trace them.
+        traced = dr.gather(mi.Bool, active, pair)
+        # The same random numbers on both sides: only the edge must make a difference.
         random = next_2d(seed, 2 * n, dr.gather(mi.UInt32, curve.lane, pair))
-        sides = trace(scene, ray, view, photographs, shadows, random, meant)
+        sides = trace(scene, ray, view, photographs, shadows, random, traced)
         dr.eval(sides)
         before = 2 * dr.arange(mi.UInt32, n)
         jumps = [dr.gather(mi.Float, s, before, active) - dr.gather(mi.Float, s, before + 1, active) for s in sides]
-        if curve.shadow:  # no edge of light covers more: between the two sides there is an outline, which is not meant
+        if curve.shadow:  # coverage only differs at outlines: one is between the two sides, and is sampled elsewhere
             active &= jumps[3] == 0
         dr.eval(jumps, active)
     moved = dr.dot(dr.select(active, across, 0), where)
     return q, curve.view, [dr.replace_grad(mi.Float(0), jump * moved) for jump in jumps], active
 
 
-def cast(scene, curve: Curve, light, camera) -> Curve:
-    """The shadow of a curve: where the rays that leave the light and graze the curve arrive.
+def cast_shadow(scene, curve: EdgeSamples, light, camera) -> EdgeSamples:
+    """The shadow of a curve: where rays from the light that graze the curve hit the scene.
 
-    Attached to the light, to the curve and to what the shadow falls on. `light` and `camera` are eyes.
+    Attached to the light, to the curve and to the surface that the shadow falls on. `light` and `camera` are eyes.
     """
     where, finite = light(curve.view)
     d = dr.normalize(dr.select(finite, curve.point - where, -where))
     away = dr.detach(dr.select(finite, dr.norm(curve.point - where), 0))
-    start = leave(dr.detach(curve.point), away)
+    start = ray_offset(dr.detach(curve.point), away)
     ray = mi.Ray3f(curve.point, d)
     with dr.suspend_grad():
-        # A ray that grazes the shape may not meet it again: it passes a little outside. Where the shape is hollow that
-        # is inside it, and such an edge casts no shadow.
+        # A ray that grazes the shape must not hit it, so it passes a little outside. Where the shape is concave this is
+        # inside of it: the ray then hits the shape, and the edge casts no shadow.
         aside = dr.normalize(dr.cross(curve.tangent, ray.d))
         aside *= dr.mulsign(start, dr.dot(aside, ray.o - curve.inside))
         origin = dr.detach(curve.point) + dr.select(dr.isfinite(aside.x), aside, 0)
@@ -89,18 +91,17 @@ def cast(scene, curve: Curve, light, camera) -> Curve:
     si = hit.compute_surface_interaction(ray, active=active)
     d, n, t = dr.detach(d), dr.detach(si.n), dr.detach(si.t)
     slope = dr.dot(n, d)
-    # The shadow of a step along the curve: stretched by the distance from the light, and sheared into the plane that
-    # it falls on.
+    # The shadow of the tangent: scaled by the distance from the light, and sheared into the plane that it falls on.
     tangent = curve.tangent - d * (dr.dot(n, curve.tangent) / slope)
     tangent *= dr.select(finite, 1 + t / away, 1)
     with dr.suspend_grad():
         to_camera = dr.detach(camera(curve.view)[0] - si.p)
-        above = leave(dr.detach(si.p), dr.norm(to_camera))
-        # What hides the shadow from the camera would not jump, but its shading differs between the two sides as well.
+        above = ray_offset(dr.detach(si.p), dr.norm(to_camera))
+        # The shadow must be visible. What hides it has no jump here, but its shading differs between the two sides.
         start = dr.detach(si.p) + n * dr.mulsign(above, dr.dot(n, to_camera))
         active &= si.is_valid() & (dr.abs(slope) > 1e-4)
         active &= ~scene.ray_test(mi.Ray3f(start, to_camera, 1 - 2.0**-10, 0, []), active)
-        # Whether a point is in shadow is asked a little above the surface.
+        # Shadow rays start a little above the surface.
         above = dr.mulsign(above, -slope)
         shift = d * (above / slope) - n * above
-    return Curve(curve.view, curve.lane, si.p + shift, tangent, curve.inside, active, JUMP, shadow=True)
+    return EdgeSamples(curve.view, curve.lane, si.p + shift, tangent, curve.inside, active, SHADOW_OFFSET, shadow=True)

@@ -1,28 +1,28 @@
-"""Edges of meshes along which a photograph jumps and whose motion shading does not see: outlines, creases, shadows."""
+"""The edges of meshes at which a photograph is discontinuous: outlines, creases, edges of shadows."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_ring.errors import SceneError
-from mi_ring.rendering.edge_curves import CURVES, ROOT, Curve, outline_of
+from mi_ring.rendering.edge_curves import CURVES, OUTLINE_OFFSET, EdgeSamples, outline_of
 
-SMOOTH, CREASE, BORDER = 0, 1, 2  # edges of a mesh where the normals of both sides agree or differ, or where it ends
-SAMPLES, SAMPLES_IN_ALL = 4, 2048  #: per edge of a mesh, and at least of all edges together, were all of them seen
+SMOOTH, CREASE, BORDER = 0, 1, 2  # kinds of edges: normals of both sides agree, they differ, there is only one side
+SAMPLES, MIN_SAMPLES = 4, 2048  #: per edge of a mesh, and at least for all edges of the scene together
 
 
 class Edges:
-    """The edges of all shapes of a scene, and which of them an eye sees as outlines.
+    """The edges of all shapes of a scene, and which of them are outlines for an eye.
 
-    An eye is a function of the photograph (UInt32) that returns (Vector3f, Bool): a point and True, or the direction
-    toward an eye that is infinitely far away and False. It may be attached.
+    An eye is a camera or a light: a function of the photograph (UInt32) that returns (Vector3f, Bool), a point and
+    True, or the direction toward an eye that is infinitely far away and False. It may be attached.
 
     Raises SceneError for a kind of shape whose outline is not known.
     """
 
     def __init__(self, scene):
         self.shapes = list(scene.shapes())
-        # Mitsuba's rectangle is a mesh as well, whose vertices are not attached to its `to_world`.
+        # Mitsuba's rectangle is also a mesh, but its vertices are not attached to its `to_world`.
         self.others = [shape for shape in self.shapes if shape.class_name() in CURVES]
         self.meshes = [shape for shape in self.shapes if shape not in self.others]
         for shape in self.meshes:
@@ -31,10 +31,10 @@ class Edges:
                     f'photometric: no gradients with shape "{shape.id()}", a {shape.class_name()}: '
                     f"use meshes or {', '.join(CURVES)}"
                 )
-        # While they are held, no other array can have their indices.
+        # `of` compares the indices of these arrays. No other array can have them while these exist.
         self.buffers = [mesh.faces_buffer() for mesh in self.meshes]
         meshes_faces = [np.array(buffer).reshape(-1, 3) for buffer in self.buffers]
-        vertices, triangles = 0, 0  # of the meshes before
+        vertices, triangles = 0, 0  # numbers of those of the meshes before
         corners, tables = [np.zeros((0, 3))], [np.zeros((5, 0))]
         for mesh, faces in zip(self.meshes, meshes_faces):
             corners.append(faces + vertices)
@@ -47,7 +47,7 @@ class Edges:
 
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
-        """The edges of a scene: `known`, if they are still those."""
+        """The edges of a scene; `known`, without any work, if its shapes and faces are still the same."""
         if known is not None and list(scene.shapes()) == known.shapes:
             now = (mesh.faces_buffer() for mesh in known.meshes)
             if all(a.index == b.index for a, b in zip(now, known.buffers)):
@@ -55,12 +55,12 @@ class Edges:
         return cls(scene)
 
     def positions(self):
-        """Vertices of all meshes, one after another (Float), attached."""
+        """The vertices of all meshes in one Float, attached."""
         buffers = [mesh.vertex_positions_buffer() for mesh in self.meshes]
         return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
 
     def fronts(self, eye, views):
-        """Which triangles show their front to the eye: Bool, all triangles of photograph 0, those of 1, …"""
+        """Which triangles face the eye: Bool, all triangles for photograph 0, then for photograph 1, …"""
         count = dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views)
         where, finite = eye(lane // count)
@@ -72,7 +72,10 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """(edge, do its first and its second triangle show their fronts?) of these lanes, or of all `views`."""
+        """(edge, does its first triangle face the eye, does its second?) by `fronts`.
+
+        For `lanes` (UInt32: photograph · number of edges + edge), or for all edges in `views` photographs.
+        """
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
         view, edge = lane // count, lane % count
@@ -81,23 +84,23 @@ class Edges:
         )
         return edge, first, second
 
-    def sample(self, lanes, seed, before=0, shadow=False) -> Curve:
-        """Stratified points on each of these edges (UInt32: photograph · number of edges + edge)."""
+    def sample(self, lanes, seed, before=0, shadow=False) -> EdgeSamples:
+        """Stratified points on each of these edges, `lanes` as in `sides`."""
         count = dr.width(self.kind)
-        each = max(SAMPLES, SAMPLES_IN_ALL // count)
+        each = max(SAMPLES, MIN_SAMPLES // count)
         local = dr.arange(mi.UInt32, dr.width(lanes) * each)
-        each = dr.opaque(mi.UInt32, each)  # it changes: no part of the kernel
+        each = dr.opaque(mi.UInt32, each)  # it changes, so it must not be part of the kernel
         chosen = dr.gather(mi.UInt32, lanes, local // each)
         lane = (chosen + dr.opaque(mi.UInt32, before * count)) * each + local % each
         t = (mi.Float(local % each) + mi.sample_tea_float32(lane, dr.opaque(mi.UInt32, seed))) / mi.Float(each)
         positions, edge = self.positions(), chosen % count
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, v, edge)) for v in (self.v0, self.v1))
         piece = dr.detach(b - a) / mi.Float(each)
-        p = a * (1 - t) + b * t  # dr.lerp would add its two gradients of `a` in an order that is not always the same
-        return Curve(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), ROOT, shadow)
+        p = a * (1 - t) + b * t  # dr.lerp would add its two gradients of `a` in an order that varies
+        return EdgeSamples(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), OUTLINE_OFFSET, shadow)
 
     def middle(self, edge):
-        """The centre of the two triangles at an edge, detached."""
+        """The centre of the two triangles of an edge, detached."""
         positions, corners = dr.detach(self.positions()), mi.Point3f(0)
         for face in (self.f0, self.f1):
             for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
@@ -105,7 +108,7 @@ class Edges:
         return corners
 
     def outlines(self, eye, views, seed, before=0):
-        """(curves, fronts): what may be an outline or a crease to the eye of each of so many photographs."""
+        """(curves, fronts): samples of all edges that can be outlines or creases for the eyes of `views`."""
         curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
         fronts = None
         if self.meshes:
@@ -118,11 +121,11 @@ class Edges:
         return curves, fronts
 
     def shadow_casters(self, light, views, seed, seen, before=0):
-        """(casters, terminators): what may cast the edge of a shadow, and where one may begin on a shape itself.
+        """(casters, terminators): samples of edges that can cast the edge of a shadow, or be one themselves.
 
-        `light` is an eye; `seen` are the `fronts` of the cameras. Casters are the outlines that the light sees.
-        Terminators are those edges of meshes among them that a camera sees from the front on both sides: the triangle
-        that turns away from the light is black even where interpolated normals still face it.
+        `light` is an eye; `seen` are the `fronts` of the cameras. Casters are the outlines for the light. Terminators
+        are those of them that are inside the object for the camera: both triangles face it. The triangle that does not
+        face the light is black, even where interpolated normals face it.
         """
         casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []
@@ -141,26 +144,26 @@ class Edges:
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
-    """Edges of a mesh: (5, E), the vertices v0 and v1, the triangles that hold (v0, v1) and (v1, v0), and the kind."""
+    """Edges of a mesh (5, E): vertices v0 and v1, the triangles with (v0, v1) and with (v1, v0), and the kind."""
     weld = np.arange(mesh.vertex_count())
-    table = paired(faces, weld)
-    if (table[4] == BORDER).any():  # perhaps only a seam, where vertices are there twice
+    table = paired_edges(faces, weld)
+    if (table[4] == BORDER).any():  # some may be seams, where vertices are duplicated
         positions = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
         weld = np.unique(positions, axis=0, return_inverse=True)[1].ravel()
-        table = paired(faces, weld)
+        table = paired_edges(faces, weld)
     if not mesh.has_vertex_normals():
         table[4] = np.maximum(table[4], CREASE)
     return table
 
 
-def paired(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """`edge_table` with smooth normals; vertices of equal `weld` (V,) are the same point."""
+def paired_edges(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
+    """The `edge_table` of a mesh with smooth normals. Vertices of equal `weld` (V,) are the same point."""
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
     triangle = np.repeat(np.arange(len(faces)), 3)
     a, b = weld[start], weld[end]
     key = np.minimum(a, b) * len(weld) + np.maximum(a, b)
     order = np.lexsort((a > b, key))
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))  # of each group of half-edges at the same place
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))  # of each group of half-edges between the same points
     size = np.diff(first, append=len(order))
     h0 = order[first]
     h1 = order[np.minimum(first + 1, len(order) - 1)]

@@ -1,28 +1,29 @@
-"""Photographs of a scene in one launch, each under its own light: radiance, coverage, maps."""
+"""Image formation: photographs of a scene, each lit by its own light, and maps of its surface."""
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.rendering.direct_light import next_2d, trace
-from mi_ring.rendering.edge_gradients import boundaries
+from mi_ring.rendering.edge_gradients import boundary_terms
 from mi_ring.rendering.photographs import center_rays, pixel_rays
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
     """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, attached.
 
-    Box-filtered linear radiance. Without `edges` the gradient is that of shading between the edges. `pixels`: only this
-    range (first, last + 1) of them, counted through all photographs; not together with `edges`.
+    Box-filtered linear radiance. With `edges`, gradients have the boundary terms of moving edges; without them only
+    those of shading. `pixels`: a range (first, last + 1) of pixels to render, numbered through all photographs; not
+    together with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
-    lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.lanes_before(spp, pixels[0] if pixels else 0)
+    lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.first_lane(spp, pixels[0] if pixels else 0)
     channels = trace(scene, ray, view, photographs, shadows, next_2d(seed, dr.width(ray), lane))
-    dr.schedule(channels)  # together: block_sum would otherwise render once per channel
+    dr.schedule(channels)  # together: else block_sum renders once for each channel
     channels = [dr.block_sum(c, spp) / spp for c in channels]
     if edges is None:
         return channels
     width, height = photographs.size
-    for where, view, step, active in boundaries(scene, photographs, edges, seed, shadows):
+    for where, view, step, active in boundary_terms(scene, photographs, edges, seed, shadows):
         pixel = view * (width * height) + mi.UInt32(where.y) * width + mi.UInt32(where.x)
         for k, value in enumerate(step):
             motion = dr.zeros(mi.Float, dr.width(channels[k]))
@@ -32,10 +33,10 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
 
 
 def render_maps(scene, photographs, attributes, pixels=None):
-    """Normals, and mesh attributes (channels by name) of the shapes that have them, at the centres of pixels.
+    """Normals and mesh attributes at the centres of pixels, 0 where there is no surface or no such attribute.
 
-    Returns Floats of N·H·W pixels: [nx, ny, nz, first attribute, …], normals in world space, zero where there is none;
-    of this range (first, last + 1) of `pixels` or of all.
+    `attributes`: numbers of channels by name. `pixels`: as in `render_photographs`. Returns Floats of N·H·W pixels,
+    [nx, ny, nz, first attribute, …]; normals are in world space.
     """
     si = scene.ray_intersect(center_rays(photographs, pixels)[0])
     maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]

@@ -1,47 +1,49 @@
-"""Interreflection, light that reaches the camera by way of more than one point of the scene; and that of the room."""
+"""Indirect light: interreflection, and the light of the room with its occlusion, by path tracing without gradients."""
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_ring.rendering.direct_light import next_2d, shade
 from mi_ring.rendering.photographs import pixel_rays
-from mi_ring.rendering.spherical_harmonics import harmonics_toward, reflected, reflecting
+from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, evaluated_harmonics, reflected_harmonics
 
-BOUNCES = 3  # after the first surface
+BOUNCES = 3  #: points of a path after the first surface
 
 
-def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=(), table=None):
-    """Light that has been reflected more than once: [R, G, B, coverage], Floats of N·H·W pixels, no gradients.
+def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=(), table=None):
+    """Interreflection: [R, G, B, coverage], box-filtered linear radiance, Floats of N·H·W pixels without gradients.
 
-    Paths are traced from the camera, the BSDFs sampled, and shaded directly lit wherever they arrive (the light of
-    each photograph casts shadows); `bounces` more points after the first. Box-filtered linear radiance, unbiased but
-    for the light of longer paths. `table`: a scene that paths meet, too, after their first point; it casts no shadow.
+    Paths start at the camera and sample BSDFs. At each of the `bounces` points after the first one the direct light is
+    added; the own light of each photograph casts shadows there. This is unbiased but for longer paths. `table`: a scene
+    that paths also hit after their first point; it casts no shadows.
 
-    `room`: followed by R, G, B for each of these harmonics of `mi_ring.rendering.spherical_harmonics`, of what the
-    surface shows of a room whose radiance is that harmonic, as what paths meet that escape after at most `bounces`
-    points; and then by as many of what it would show if nothing were in the light's way, by `reflected`. Of the former,
-    what leaves the scene at once is taken from there, so that only what is in the way makes noise.
+    For n `harmonics` of `mi_ring.rendering.spherical_harmonics`, 6 n more Floats follow. The first 3 n are R, G, B of
+    the radiance transfer of each harmonic: the radiance in a room whose radiance is the harmonic, with occlusion and
+    with paths of at most `bounces` points. The last 3 n are the same without occlusion and interreflection, by
+    `reflected_harmonics`. Both have the same noise-free part; only occlusion and interreflection have noise.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
         covered = dr.select(hit.is_valid(), mi.Float(1), 0)
-        lane = dr.compress(hit.is_valid())  # the background costs nothing from here on
-        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3 + 6 * len(room))]
+        lane = dr.compress(hit.is_valid())  # the background takes no time from here on
+        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3 + 6 * len(harmonics))]
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
-            random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.lanes_before(spp))
+            random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.first_lane(spp))
             pose = photographs.camera(view)[0]
-            bsdfs = reflecting(scene) if room else []
-            free = reflected(bsdfs, si, pose, room, si.is_valid()) if room else []
-            radiance, escaped, direction, first = reflect(scene, si, view, photographs, bounces, random, table, bsdfs)
+            bsdfs = bsdfs_with_lobes(scene) if harmonics else []
+            unoccluded = reflected_harmonics(bsdfs, si, pose, harmonics, si.is_valid()) if harmonics else []
+            radiance, escaped, blocked = trace_paths(scene, si, view, photographs, bounces, random, table, bsdfs)
             values = [*radiance]
-            if room:
-                weight, toward = first  # of what `reflected` has, but is not so
-                shown = [f + e * escaped - b * weight for f, e, b in zip(
-                    free, harmonics_toward(direction, pose, room), harmonics_toward(toward, pose, room))]  # fmt: skip
-                values += [value for colour in (*shown, *free) for value in colour]
+            if harmonics:
+                added, removed = (
+                    [value * throughput for value in evaluated_harmonics(direction, pose, harmonics)]
+                    for throughput, direction in (escaped, blocked)
+                )
+                transfer = [u + a - r for u, a, r in zip(unoccluded, added, removed)]
+                values += [value for colour in (*transfer, *unoccluded) for value in colour]
             for channel, value in zip(channels, values):
                 dr.scatter(channel, value, lane)
         channels.insert(3, covered)
@@ -49,19 +51,23 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, room=(), tab
         return [dr.block_sum(c, spp) / spp for c in channels]
 
 
-def reflect(scene, si, view, photographs, bounces, random, table=None, known=()):
-    """Radiance toward the viewer that arrives at surface interactions `si` from other surfaces, one path per lane.
+def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=()):
+    """Light that arrives at surface interactions `si` from other surfaces, by one path per lane.
 
-    Returns (radiance, throughput and direction of the paths that escape, 0 for others, `first`). If the BSDF at `si` is
-    one of the `known`, paths that escape at once are left out, for `reflected` has them; it also has those that do not
-    escape at once, of which `first` are throughput and direction. `random`: a source of 2-D samples.
+    Returns (radiance, escaped, blocked). Radiance leaves `si` toward the viewer. `escaped` and `blocked` are each a
+    throughput and a direction: of paths that leave the scene, and of paths that hit another surface next to `si`. Both
+    throughputs are 0 for other paths.
+
+    `known`: BSDFs that `reflected_harmonics` has. Paths from these that leave the scene at once are not in `escaped`,
+    and only paths from these are in `blocked`: `reflected_harmonics` has the former, and must not have the latter.
+    `random`: a source of 2-D samples.
     """
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
     escaped, direction = mi.Color3f(0), mi.Vector3f(0, 0, 1)
-    told, first = mi.Bool(False), (mi.Color3f(0), mi.Vector3f(0, 0, 1))
+    is_known, blocked = mi.Bool(False), (mi.Color3f(0), mi.Vector3f(0, 0, 1))
     for bsdf in known:
-        told |= si.bsdf() == mi.BSDFPtr(bsdf)
+        is_known |= si.bsdf() == mi.BSDFPtr(bsdf)
     lighting = photographs.lighting(view)
     for bounce in range(bounces):
         sample, weight = si.bsdf().sample(context, si, random().x, random(), active)
@@ -70,23 +76,23 @@ def reflect(scene, si, view, photographs, bounces, random, table=None, known=())
         active &= dr.any(throughput > 0)
         si = scene.ray_intersect(out, active)
         if table is not None:
-            apart(si)
+            separate_kernels(si)
             below = table.ray_intersect(out, active)
             si = dr.select(below.t < si.t, below, si)
-            apart(si)
+            separate_kernels(si)
         leaves = active & ~si.is_valid()
         if known and bounce == 0:
-            leaves &= ~told
-            first = dr.select(told & active & si.is_valid(), throughput, 0), out.d
+            leaves &= ~is_known
+            blocked = dr.select(is_known & active & si.is_valid(), throughput, 0), out.d
         escaped, direction = dr.select(leaves, throughput, escaped), dr.select(leaves, out.d, direction)
         active = si.is_valid()
-        # Rays that escape to an environment bring nothing: its light was counted where the surface was shaded.
+        # Paths that leave toward an environment add nothing: `shade` has its light at each surface.
         lit = shade(scene, si, lighting, random, True)
         radiance += dr.select(active, throughput * lit, 0)
-    return radiance, escaped, direction, first
+    return radiance, (escaped, direction), blocked
 
 
-def apart(values) -> None:
-    """On a GPU, have values computed before what follows: OptiX refuses rays through two scenes in one kernel."""
+def separate_kernels(values) -> None:
+    """Compute values before what follows, on a GPU: OptiX cannot trace rays through two scenes in one kernel."""
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
         dr.eval(values)

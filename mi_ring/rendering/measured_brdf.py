@@ -1,4 +1,4 @@
-"""Reflectance as it was measured: tables of the MERL database, and networks that were fitted to them."""
+"""Measured reflectance: tables of the MERL database, and networks that were fitted to such tables."""
 
 from pathlib import Path
 
@@ -9,17 +9,19 @@ import numpy as np
 from mi_ring.errors import InputError
 from mi_ring.foreign import load_npz
 
-CELLS = 90, 90, 180  #: of a table: θh, θd, φd
-SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its planes, red, green, blue
-TRUSTED = np.radians([80.0, 65.0])  #: θh and θd, beyond which the networks were fitted to little
+CELLS = 90, 90, 180  #: of a table: numbers of cells of θh, θd, φd
+SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its red, green and blue plane
+FITTED_ANGLES = np.radians([80.0, 65.0])  #: θh and θd up to which the networks were fitted to enough data
 LAYERS = {"w1": (6, 21), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3), "b3": (3,)}  #: of each network
 
 
-class Table:
-    """A ``.binary`` of the MERL database (Matusik et al. 2003), between whose cells values are interpolated.
+class MerlTable:
+    """A ``.binary`` file of the MERL database (Matusik et al. 2003), interpolated between its cells.
 
-    Cell i of θh is the angle (i / 90)² · 90°, those of θd and φd are a degree each; by reciprocity φd and φd + π are
-    one. Negative values say that nothing was measured: the cells around speak for them.
+    Cell i of θh is at the angle (i / 90)² · 90°; cells of θd and φd are 1° wide. By reciprocity φd and φd + π are the
+    same. Cells with negative values were not measured: they have the value of the cells around them.
+
+    Raises ValueError for a file that is not such a table.
     """
 
     def __init__(self, path: Path):
@@ -34,12 +36,12 @@ class Table:
         measured = (np.isfinite(planes) & (planes >= 0)).all(0)
         planes = np.where(measured, planes * SCALES[:, None, None, None], 0)
         weights = np.concatenate([planes, measured[None]]).transpose(1, 2, 3, 0)
-        weights = np.concatenate([weights, weights[:, :, :1]], 2)  # after the last φd comes the first
+        weights = np.concatenate([weights, weights[:, :, :1]], 2)  # the first φd follows the last
         tensor = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
 
     def value(self, theta, d):
-        """f (3) [1/sr] of half vectors at an angle `theta` from the normal and difference vectors `d`."""
+        """The BRDF f (3) [1/sr] for half vectors at an angle `theta` from the normal and difference vectors `d`."""
         half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
         difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
         turn = dr.atan2(d.y, d.x) / dr.pi
@@ -49,8 +51,11 @@ class Table:
         return mi.Color3f(red, green, blue) / dr.maximum(weight, 1e-6)
 
 
-class Network:
-    """A network of 6-21-21-3 neurons that was fitted to such a table ("Neural BRDF Representation", Sztrajman 2021)."""
+class MerlNetwork:
+    """A network of 6-21-21-3 neurons that was fitted to a table ("Neural BRDF Representation", Sztrajman 2021).
+
+    Raises InputError for a file that does not hold such networks, and for an unknown material.
+    """
 
     def __init__(self, path: Path, material: str):
         arrays = load_npz(path)
@@ -67,20 +72,20 @@ class Network:
         self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
-        """As `Table.value`."""
-        theta = dr.minimum(theta, float(TRUSTED[0]))
+        """Like `MerlTable.value`."""
+        theta = dr.minimum(theta, float(FITTED_ANGLES[0]))
         sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
-        narrowed = dr.minimum(sin, float(np.sin(TRUSTED[1])))
+        narrowed = dr.minimum(sin, float(np.sin(FITTED_ANGLES[1])))
         share = narrowed / dr.maximum(sin, 1e-9)
         x = [dr.sin(theta), mi.Float(0), dr.cos(theta), d.x * share, d.y * share, dr.sqrt(1 - narrowed * narrowed)]
         w1, b1, w2, b2, w3, b3 = self.layers
-        y = [dr.maximum(sum_, 0) for sum_ in layer(x, w1, b1)]
-        y = [dr.maximum(sum_, 0) for sum_ in layer(y, w2, b2)]
-        return dr.maximum(dr.exp(mi.Color3f(*layer(y, w3, b3))) - 1, 0)
+        y = [dr.maximum(sum_, 0) for sum_ in dense_layer(x, w1, b1)]
+        y = [dr.maximum(sum_, 0) for sum_ in dense_layer(y, w2, b2)]
+        return dr.maximum(dr.exp(mi.Color3f(*dense_layer(y, w3, b3))) - 1, 0)
 
 
-def layer(x: list, weights: list, biases: list) -> list:
-    """Weighted sums of x (n) by weights (n, m), and biases (m). Dr.Jit's own layers need half precision on a GPU."""
+def dense_layer(x: list, weights: list, biases: list) -> list:
+    """x (n) times weights (n, m) plus biases (m). Dr.Jit's own layers need half precision on a GPU."""
     sums = [mi.Float(bias) for bias in biases]
     for value, row in zip(x, weights):
         sums = [dr.fma(value, weight, sum_) for weight, sum_ in zip(row, sums)]

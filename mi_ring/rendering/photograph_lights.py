@@ -1,4 +1,4 @@
-"""The lights of many photographs as Dr.Jit buffers: what each brings to a surface."""
+"""The lights of many photographs as Dr.Jit buffers, and the light that a surface receives from each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,40 +8,49 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.errors import SceneError
-from mi_ring.scene.lights import LAMPS, Light, place_of, strength_of
+from mi_ring.scene.lights import Light, position_of, strength_of
+from mi_ring.scene.shot import Shot
 
-SIDEWAYS = 1e-3  #: the least cosine from the axis of a flash; beyond, its light is what it is there
-FAR = 1e9  #: distance of a directional light [scene units]
+MIN_FLASH_COSINE = 1e-3  #: the least cosine between the axis of a flash and a direction; smaller ones are clamped
+DISTANT = 1e9  #: distance of a directional light [scene units]
 
 
 @dataclass(frozen=True)
 class Lights:
-    """The lights of N photographs, as Dr.Jit buffers that may be attached; and what numpy asks of them."""
+    """The lights of N photographs as Dr.Jit buffers, which may be attached."""
 
-    places: object  #: Float, 3 per light: position [scene units], or unit direction toward a distant one
-    finite: object  #: Bool: a point light? Else it is distant
+    places: object  #: Float, 3 per light: position [scene units], or unit direction toward a distant light
+    finite: object  #: Bool: is it a point light? Else it is distant
     strengths: object  #: Float, 3 per light: intensity [W/sr], or irradiance [W/m²]
 
     @classmethod
-    def of(cls, sensors: Sequence) -> "Lights":
-        """The nested lights of `photograph` sensors, all positive, or all 0. Raises SceneError for one that is not."""
-        # By way of numpy: Dr.Jit would compile a kernel for each number of photographs.
-        columns = [[np.ravel(part) for part in parts_of(sensor)] for sensor in sensors]
-        places, finite, strengths = (np.concatenate(column) for column in zip(*columns))
-        lit = strengths.reshape(-1, 3).any(1)
+    def of(cls, shots: Sequence[Shot]) -> "Lights":
+        """The photographs' own lights. Raises SceneError if one is not finite, or if some are black but not all."""
+        lights = [shot.own_light for shot in shots]
+        finite = np.array([light.kind == "point" for light in lights])
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
+            places = np.stack([light.vector if light.kind == "point" else toward(light) for light in lights])
+            places, strengths = places.astype(np.float32), np.stack([light.rgb for light in lights]).astype(np.float32)
+        for shot, place, rgb in zip(shots, places, strengths):
+            what = f'photograph "{shot.name}": its light is'
+            if not (np.isfinite(rgb) & (rgb >= 0)).all():
+                raise SceneError(f"{what} {rgb} strong, must be positive, or 0 in all")
+            if not np.isfinite(place).all():
+                raise SceneError(f"{what} at {place}, must be finite")
+        lit = strengths.any(1)
         if lit.any() and not lit.all():
-            name = sensors[int(lit.argmin())].id()
+            name = shots[int(lit.argmin())].name
             raise SceneError(f'photograph "{name}": its light is 0 strong, must be positive, or 0 in all photographs')
-        return cls(mi.Float(places), mi.Bool(finite), mi.Float(strengths))
+        return cls(mi.Float(places.ravel()), mi.Bool(finite), mi.Float(strengths.ravel()))
 
     @classmethod
-    def attached(cls, sensor) -> "Lights":
-        """The light of one photograph, attached to the sensor's parameters."""
-        place, finite, strength = parts_of(sensor)
-        return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength)))
+    def attached(cls, emitter) -> "Lights":
+        """One point light or distant light, attached to the parameters of its emitter."""
+        place, finite = position_of(emitter)
+        return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Light `k`, one per lane, as an eye of `Edges`: (where, is that a point and not a direction?)."""
+        """Light `k`, one per lane, as an eye of `Edges`."""
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
@@ -52,7 +61,7 @@ class Lights:
         to_light = dr.select(finite, where - si.p, where)
         distance2 = dr.squared_norm(to_light)
         ds.d = to_light * dr.rsqrt(distance2)
-        ds.dist = dr.select(finite, dr.sqrt(distance2), FAR)
+        ds.dist = dr.select(finite, dr.sqrt(distance2), DISTANT)
         ds.p = si.p + ds.d * ds.dist
         return ds, strength * dr.select(finite, dr.rcp(distance2), 1)
 
@@ -64,51 +73,43 @@ class Lights:
         return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
 
     def is_finite(self) -> np.ndarray:
-        """Which are point lights, (N,) bool."""
+        """(N,) bool: which are point lights?"""
         return np.array(self.finite)
 
     def positions(self) -> np.ndarray:
-        """(N, 3) positions [scene units]; of distant lights the unit directions toward them."""
+        """(N, 3) positions [scene units], or unit directions toward distant lights."""
         return np.array(self.places).reshape(-1, 3).astype(float)
 
     def rgb(self) -> np.ndarray:
-        """(N, 3) intensities [W/sr], of distant lights irradiances [W/m²]."""
+        """(N, 3) intensities [W/sr], or irradiances of distant lights [W/m²]."""
         return np.array(self.strengths).reshape(-1, 3).astype(float)
 
     def toward(self, point: np.ndarray) -> np.ndarray:
-        """(N, 3) from a point (3,) to the lights [scene units]; of distant ones the unit directions."""
+        """(N, 3) vectors from a point (3,) to the lights [scene units], or unit directions toward distant lights."""
         places = self.positions()
         return np.where(self.is_finite()[:, None], places - point, places)
 
     def distances(self, point: np.ndarray) -> np.ndarray:
-        """(N,) from a point (3,) [scene units]; infinite for distant lights."""
+        """(N,) distances from a point (3,) [scene units], infinite for distant lights."""
         return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """(N, 3) what each light brings to a point (3,), on a surface that faces it: equation 2's intensity / d²."""
+        """(N, 3) irradiance of a surface at a point (3,) that faces the light: intensity / d² of equation 2."""
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
 
 
-def cone(direction, to_world, falloff):
-    """What a flash that looks where the camera looks gives, of its intensity, to where it is in this `direction`."""
-    cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
-    return dr.power(dr.maximum(cosine, SIDEWAYS), falloff)
+def flash_falloff(direction, to_world, falloff):
+    """The share of its intensity that a flash has in a direction: a power, `falloff`, of the cosine from its axis.
 
-
-def parts_of(sensor):
-    """The light of a photograph, attached: (Vector3f place, is it a point light?, Color3f strength).
-
-    Of one that has none the strength is 0.
+    `direction` is the unit vector to the flash. The axis is the optical axis of the camera with pose `to_world`.
     """
-    light = sensor.light
-    kind = light.class_name()
-    if kind not in LAMPS:
-        raise SceneError(f'photograph "{sensor.id()}": nested emitter is a {kind}, must be "point" or "directional"')
-    where, finite = place_of(light)
-    strength = strength_of(light)
-    if not dr.all(dr.isfinite(strength) & (strength >= 0)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is {strength} strong, must be positive, or 0 in all')
-    if not dr.all(dr.isfinite(where)):
-        raise SceneError(f'photograph "{sensor.id()}": its light is at {where}, must be finite')
-    return where, finite, strength
+    cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
+    return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)
+
+
+def toward(light: Light) -> np.ndarray:
+    """The unit direction (3,) toward a distant light."""
+    length = np.linalg.norm(light.vector)
+    # What Mitsuba has read is of unit length, but for the rounding of float32.
+    return -light.vector if abs(length - 1) < 1e-6 else -light.vector / length

@@ -1,23 +1,23 @@
-"""Pinhole cameras in Dr.Jit, perhaps with a lens: rays through pixels and back."""
+"""Pinhole cameras with radial distortion in Dr.Jit: rays of pixels, and pixels of points."""
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.geometry.camera import bending, straightening
+from mi_ring.geometry.camera import distortion_factor, undistortion_factor
 
-OUTSIDE = 1e6  #: a factor of places in the picture
+OUTSIDE = 1e6  #: factor of picture coordinates that puts a point outside of every picture
 
 
 def camera_ray(to_world, focal, centre, distortion, pixel):
-    """Ray through continuous pixel coordinates, Mitsuba's camera frame (x left, y up, z forward).
+    """The ray through continuous pixel coordinates: (origin, unit direction).
 
-    `to_world`: Matrix4f camera-to-world; `focal`, `centre`: Point2f (fx, fy), (cx, cy) [px]; `distortion`: Float as
-    `mi_ring.geometry.camera.Camera` has it, None for none; `pixel`: Point2f [px], x right, y down. Arguments may hold
-    one camera or one camera per lane. Returns (origin, unit direction).
+    `to_world`: Matrix4f camera-to-world, Mitsuba's camera axes (x left, y up, z forward); `focal`, `centre`: Point2f
+    (fx, fy), (cx, cy) [px]; `distortion`: Float as in `mi_ring.geometry.camera.Camera`, or None; `pixel`: Point2f [px],
+    x right, y down. Arguments have one camera, or one camera per lane.
     """
     x, y = (pixel.x - centre.x) / focal.x, (pixel.y - centre.y) / focal.y
     if distortion is not None:
-        factor = straightening(distortion, x * x + y * y)
+        factor = undistortion_factor(distortion, x * x + y * y)
         x, y = x * factor, y * factor
     m = to_world
     direction = mi.Vector3f(
@@ -29,8 +29,8 @@ def camera_ray(to_world, focal, centre, distortion, pixel):
 
 
 def camera_coordinates(to_world, vector):
-    """A direction in the world in the axes of a camera: the inverse of the upper left 3 × 3 of `to_world`."""
-    # Not its transpose, though it is a rotation: its entries are differentiated one by one.
+    """A direction of the world in the axes of a camera, by the inverse of the upper left 3 × 3 of `to_world`."""
+    # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
     return dr.rcp(mi.Matrix3f([[to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
 
@@ -39,15 +39,15 @@ def project(to_world, focal, centre, distortion, point):
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     x, y = x / z, y / z
     if distortion is not None:
-        factor, shown = bending(distortion, x * x + y * y)
-        # What is not shown is outside every picture, and finite for the sake of gradients.
+        factor, shown = distortion_factor(distortion, x * x + y * y)
+        # Points that the lens does not show are outside of the picture. They are finite, so that gradients are, too.
         factor = dr.select(shown, factor, OUTSIDE)
         x, y = x * factor, y * factor
     return mi.Point2f(centre.x - focal.x * x, centre.y - focal.y * y), z
 
 
 def project_tangent(to_world, focal, distortion, point, tangent):
-    """Pixels that a point moves in the picture for a step `tangent` in the world: the derivative of `project`."""
+    """How far a point moves in the picture [px] for a step `tangent` in the world: the derivative of `project`."""
     x, y, z = camera_coordinates(to_world, point - mi.Point3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]))
     dx, dy, dz = camera_coordinates(to_world, tangent)
     moved = mi.Vector2f(dx * z - x * dz, dy * z - y * dz) / (z * z)

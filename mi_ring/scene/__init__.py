@@ -1,4 +1,4 @@
-"""Mitsuba scenes: how they are put together and lit, mesh attributes, and rays against meshes.
+"""Mitsuba scenes: their parts, lights and mesh attributes, and rays against their meshes.
 
 May import: mitsuba, drjit, numpy, torch; objects, geometry.
 """

@@ -1,26 +1,27 @@
-"""Mitsuba scenes, put together anew of the parts of another."""
+"""Scenes made of the parts of other scenes: with other lamps, another surface, or without tables."""
 
 from collections.abc import Iterable
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.scene.lights import LAMPS, Light, emitter_of, light_of
+from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.xml_elements import load_bsdf
 
-REACH = 4.0  #: radii of the normalising sphere, within which the object is
+MAX_EXTENT = 4.0  #: radius of a ball that holds the object during a fit, in radii of the normalising sphere
 
 
-def own_emitters(scene) -> list:
-    """The emitters of a scene that are no part of its shapes, and so do not come along with them."""
+def top_level_emitters(scene) -> list:
+    """The emitters of a scene that are not part of its shapes."""
     of_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
     return [emitter for emitter in scene.emitters() if emitter not in of_shapes]
 
 
 def lamps_of(scene) -> list:
-    """The point lights and directional ones at the top level of a scene."""
-    return [emitter for emitter in own_emitters(scene) if emitter.class_name() in LAMPS]
+    """The point lights and directional lights at the top level of a scene, as emitters."""
+    return [emitter for emitter in top_level_emitters(scene) if emitter.class_name() in LAMP_CLASSES]
 
 
 def lamp_lights(scene) -> list[Light]:
@@ -29,10 +30,19 @@ def lamp_lights(scene) -> list[Light]:
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """A scene with these lamps in the place of its `lamps_of`; it shares all else."""
+    """A scene with these lamps instead of its `lamps_of`."""
     before = lamps_of(scene)
-    others = [emitter for emitter in own_emitters(scene) if emitter not in before]
-    return assembled(scene.shapes(), [*others, *map(emitter_of, lamps)], scene.sensors(), scene.integrator())
+    others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
+    return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
+
+
+def move_lamps(scene, places, strengths) -> None:
+    """Give new positions or directions and strengths to the `lamps_of` a scene, Floats of 3 numbers for each lamp.
+
+    The lamps must be made by `with_lamps`. The Floats may be attached.
+    """
+    for k, lamp in enumerate(lamps_of(scene)):
+        move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
@@ -41,16 +51,23 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
     scene = mi.load_dict(everything, optimize=False, parallel=False)
-    for part, name in zip(parts, ids):  # which Mitsuba has changed to the keys
+    for part, name in zip(parts, ids):  # Mitsuba has changed the ids to the keys
         part.set_id(name)
     return scene
 
 
-def dressed(scene: mi.Scene, shape: mi.Mesh, ring, unit: float = 1.0) -> tuple[mi.Scene, mi.Mesh]:
-    """A scene with a new shape in the place of `shape`, with the BSDF and the attributes of a ring; and that shape.
+def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
+    """A scene with other shapes or other top-level emitters. It shares all other objects with the given scene."""
+    shapes = scene.shapes() if shapes is None else shapes
+    emitters = top_level_emitters(scene) if emitters is None else emitters
+    return assembled(shapes, emitters, scene.sensors(), scene.integrator())
 
-    It is to be drawn in units of `unit` scene units, and is a ball about the object until it is written to: distant
-    emitters take nothing to be farther away than a scene reaches when it is put together.
+
+def with_fitted_shape(scene: mi.Scene, shape: mi.Mesh, ring, unit: float = 1.0) -> tuple[mi.Scene, mi.Mesh]:
+    """A scene with a new shape instead of `shape`, with the BSDF and attributes of a `FittedObject`; and that shape.
+
+    The shape is in units of `unit` scene units. At first it is a ball about the object: when a scene is assembled, its
+    distant emitters are placed outside of what it contains.
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
@@ -65,27 +82,25 @@ def dressed(scene: mi.Scene, shape: mi.Mesh, ring, unit: float = 1.0) -> tuple[m
     require_attributes(new)
     params = mi.traverse(new)
     points = np.array(params["vertex_positions"]).reshape(-1, 3)
-    ball = ring.center.numpy(force=True) + REACH * float(ring.radius) * points
+    ball = ring.center.numpy(force=True) + MAX_EXTENT * float(ring.radius) * points
     params["vertex_positions"] = mi.Float((ball / unit).astype(np.float32).ravel())
     params.update()
-    shapes = [new if other == shape else other for other in scene.shapes()]
-    return assembled(shapes, own_emitters(scene), scene.sensors(), scene.integrator()), new
+    return changed_scene(scene, shapes=[new if other == shape else other for other in scene.shapes()]), new
 
 
-def parted(scene) -> tuple[mi.Scene, mi.Scene | None]:
-    """A scene without its `table` shapes, the same if it has none, and a scene of these alone, None likewise."""
+def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
+    """A scene without its `table` shapes, and a scene of these alone; the same scene and None if there are none."""
     tables = [shape for shape in scene.shapes() if is_table(shape)]
     if not tables:
         return scene, None
-    others = [shape for shape in scene.shapes() if not is_table(shape)]
-    return assembled(others, own_emitters(scene), scene.sensors(), scene.integrator()), assembled(tables)
+    return changed_scene(scene, shapes=[s for s in scene.shapes() if not is_table(s)]), assembled(tables)
 
 
 def has_table(scene) -> bool:
-    """Has a scene a `table`?"""
+    """Does a scene have a `table`?"""
     return any(is_table(shape) for shape in scene.shapes())
 
 
 def is_table(shape) -> bool:
-    """Is it a `table`, whatever the variant that its class belongs to?"""
+    """Is it a `table`, of any variant of Mitsuba?"""
     return getattr(shape, "of_tables", False)

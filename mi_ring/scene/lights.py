@@ -1,4 +1,4 @@
-"""The lights of a scene: point lights and directional ones as numbers and as Mitsuba's emitters."""
+"""Point lights and directional lights, as numbers and as emitters of Mitsuba; which emitters light every photograph."""
 
 from typing import Literal, NamedTuple
 
@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-LAMPS = "PointLight", "DirectionalEmitter"  #: classes of emitters that `Light` is one of
+LAMP_CLASSES = "PointLight", "DirectionalEmitter"  #: Mitsuba's classes of emitters that can be a `Light`
 
 
 class Light(NamedTuple):
@@ -17,10 +17,10 @@ class Light(NamedTuple):
     rgb: np.ndarray  #: (3,) intensity [W/sr], or irradiance [W/m²]
 
 
-def place_of(emitter):
-    """Where a lamp is, attached: (Vector3f, True), or (direction toward it, False) if it is infinitely far away.
+def position_of(emitter):
+    """Position of an emitter and True, or the direction toward it and False if it is infinitely far away; attached.
 
-    None for lamps that are neither: area lights, environment maps.
+    None for other emitters, like area lights and environment maps.
     """
     params = mi.traverse(emitter)
     match emitter.class_name():
@@ -35,8 +35,8 @@ def place_of(emitter):
 
 
 def light_of(emitter) -> Light:
-    """One of `LAMPS` as numbers."""
-    where, finite = place_of(emitter)
+    """A point light or directional light as numbers."""
+    where, finite = position_of(emitter)
     vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
     return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
 
@@ -49,10 +49,10 @@ def emitter_of(light: Light) -> mi.Emitter:
     return mi.load_dict({"type": light.kind, **where, strength: {"type": "rgb", "value": light.rgb.tolist()}})
 
 
-def place_lamp(emitter, place, strength) -> None:
-    """Change an emitter that `emitter_of` has made: its position, or the unit direction toward it, and its RGB.
+def move_lamp(emitter, place, strength) -> None:
+    """Give an emitter made by `emitter_of` a new position, or unit direction toward it, and a new RGB strength.
 
-    All may be attached.
+    Both may be attached.
     """
     params = mi.traverse(emitter)
     if emitter.class_name() == "PointLight":
@@ -66,24 +66,24 @@ def place_lamp(emitter, place, strength) -> None:
 
 
 def strength_of(emitter):
-    """The RGB of a point light or of a directional one, attached."""
+    """RGB intensity of a point light, or irradiance of a directional light, attached."""
     name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
     return mi.Color3f(mi.traverse(emitter)[name])
 
 
 def shared_emitters(scene, rooms: bool = False) -> list:
-    """The emitters of a scene that light every photograph: all but `flash`, which stands for a photograph's own.
+    """The emitters of a scene that light every photograph: all but `flash`, which is the light of one photograph.
 
-    Without `rooms`, which `Photographs` hold, none of `room` either.
+    Without `rooms` also without `room` emitters, whose light is in `Photographs.room`.
     """
     return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
 
 
 def is_flash(emitter) -> bool:
-    """Is it a `flash`, whatever the variant that its class belongs to?"""
+    """Is it a `flash`, of any variant of Mitsuba?"""
     return getattr(emitter, "of_photographs", False)
 
 
 def is_room(emitter) -> bool:
-    """Is it a `room`, whatever the variant that its class belongs to?"""
+    """Is it a `room`, of any variant of Mitsuba?"""
     return getattr(emitter, "of_rooms", False)

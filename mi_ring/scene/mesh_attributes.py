@@ -1,4 +1,4 @@
-"""Mesh attributes and textures: what a BSDF reads of the mesh that it is on."""
+"""The textures of a BSDF, and the mesh attributes that it reads."""
 
 import re
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from mi_ring.errors import SceneError
 
 
 def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
-    """The textures of a BSDF, or of a texture, and of all that is nested in it, each with its name."""
+    """The textures of a BSDF or texture, and of all objects nested in it, each with its name."""
     found = []
 
-    class Collect(mi.TraversalCallback):  # what `mi.traverse` walks by, which keeps the numbers only
+    class Collect(mi.TraversalCallback):  # `mi.traverse` itself only keeps numbers
         def put(self, name, value, *flags):
             found.append((name, value))
 
@@ -26,20 +26,20 @@ def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
 
 
 def attribute_of(texture) -> str | None:
-    """The mesh attribute that a texture reads, None if it is another kind of texture.
+    """The name of the mesh attribute that a texture reads; None for other kinds of textures.
 
-    Raises SceneError if it does not say which.
+    Raises SceneError if the name is not known.
     """
     if texture.class_name() != "MeshAttribute":
         return None
-    name = re.match(r'MeshAttribute\[\s*name = "([^"]+)"', str(texture))  # Mitsuba says it nowhere else
+    name = re.match(r'MeshAttribute\[\s*name = "([^"]+)"', str(texture))  # Mitsuba has it nowhere else
     if not name:
         raise SceneError(f"bsdf: it cannot be told which mesh attribute is read by {' '.join(str(texture).split())}")
     return name[1]
 
 
 def attributes_of(bsdf) -> set[str]:
-    """The mesh attributes that a BSDF reads. Raises SceneError if that cannot be told."""
+    """The names of the mesh attributes that a BSDF reads. Raises SceneError if they are not known."""
     found = {name for _, texture in textures_of(bsdf) if (name := attribute_of(texture))}
     if not found and "MeshAttribute[" in str(bsdf):
         raise SceneError("bsdf: reads mesh attributes, but does not expose which; it cannot be used")
@@ -47,9 +47,9 @@ def attributes_of(bsdf) -> set[str]:
 
 
 def require_attributes(shape) -> None:
-    """Raise SceneError if a BSDF asks `shape` for a mesh attribute that it lacks or has with other channels.
+    """Raise SceneError if the BSDF of a shape reads a mesh attribute that the shape does not have.
 
-    Mitsuba renders such a surface black without a word. Attributes work with 1 or 3 channels only.
+    Also if it has another number of channels. Mitsuba renders such a shape black, without an error.
     """
     bsdf = shape.bsdf()
     for name in sorted(attributes_of(bsdf)):
@@ -57,7 +57,7 @@ def require_attributes(shape) -> None:
             raise SceneError(
                 f'shape "{shape.id()}": its BSDF reads the mesh attribute "{name}", which the shape does not have'
             )
-    for name, expected in getattr(bsdf, "channels", {}).items():  # `cooktorrance` says how many it needs
+    for name, expected in getattr(bsdf, "channels", {}).items():  # of `cooktorrance`
         if attribute := attribute_of(bsdf.textures[name]):
             count = shape.face_count() if attribute.startswith("face_") else shape.vertex_count()
             found = dr.width(mi.traverse(shape)[attribute]) // count
@@ -68,8 +68,8 @@ def require_attributes(shape) -> None:
                 )
 
 
-def constants(bsdf) -> dict[str, list]:
-    """The values of a BSDF's constant textures, by the texture's name; of several where BSDFs are nested."""
+def constant_values(bsdf) -> dict[str, list]:
+    """The values of a BSDF's constant textures by name. A name has several values where BSDFs are nested."""
     values = {}
     for key, value in mi.traverse(bsdf):
         head, _, tail = key.rpartition(".")

@@ -1,14 +1,15 @@
-"""Meshes of Mitsuba's own kind."""
+"""Meshes of Mitsuba's own class."""
 
 import mitsuba as mi
 import numpy as np
 
-# Mitsuba's names of mesh parameters; 3.10 renames them.
+# Mitsuba's names of mesh parameters. Mitsuba 3.10 renames them.
 POSITIONS, FACES = "vertex_positions", "faces"
 
 
 def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
-    """A plain mesh of vertices (V, 3) and faces (F, 3), perhaps with smooth normals and texture coordinates (V, 2)."""
+    """A mesh of vertices (V, 3) and faces (F, 3), with smooth normals or without, and with texture coordinates (V, 2)
+    if they are given."""
     mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
     params = mi.traverse(mesh)
     params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())
@@ -20,5 +21,5 @@ def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
 
 
 def scene_of(vertices, faces) -> mi.Scene:
-    """A scene that holds this mesh alone, with smooth normals."""
+    """A scene of one mesh with smooth normals: vertices (V, 3), faces (F, 3)."""
     return mi.load_dict({"type": "scene", "mesh": mesh_of(vertices, faces)})

@@ -1,24 +1,24 @@
-"""Triangles of a mesh that cross others: where a surface runs through itself."""
+"""Self-intersections of a mesh."""
 
 import mitsuba as mi
 import numpy as np
 
 from mi_ring.scene.plain_mesh import scene_of
 
-STEP = 1e-6  #: past a triangle that was met, for a mesh of size 1: more than what float32 rounds off
+HIT_OFFSET = 1e-6  #: how far past a hit a ray goes on, for a mesh of size 1: more than float32's rounding error
 
 
 def crossing_triangles(vertices, faces) -> np.ndarray:
-    """Which triangles (F,) bool of a mesh without seams, vertices (V, 3) and faces (F, 3), cross another.
+    """Which triangles (F,) bool of a mesh without seams, vertices (V, 3) and faces (F, 3), cross another triangle.
 
-    Two triangles cross where an edge of one pierces the other: all edges are traced as rays. Those that share a vertex
-    with the edge are not pierced by it; triangles that overlap in one plane do not count.
+    Two triangles cross where an edge of one pierces the other, so all edges are traced as rays. An edge does not pierce
+    triangles that share a vertex with it. Triangles that overlap in one plane do not count.
     """
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     low, high = vertices.min(0), vertices.max(0)
     vertices = (vertices - (low + high) / 2) / (high - low).max()  # for float32
     scene, crossing = scene_of(vertices, faces), np.zeros(len(faces), bool)
-    # Each edge once, and the triangles that have it.
+    # Each edge once; `edge_of` has the edges of each triangle.
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges, edge_of = np.unique(sides, axis=0, return_inverse=True)
     pierces = np.zeros(len(edges), bool)
@@ -35,6 +35,6 @@ def crossing_triangles(vertices, faces) -> np.ndarray:
         lanes, t, triangle = lanes[valid], t[valid], triangle[valid]
         apart = (faces[triangle][:, :, None] != edges[lanes][:, None]).all((1, 2))
         crossing[triangle[apart]] = pierces[lanes[apart]] = True
-        reached[lanes] += t + STEP
+        reached[lanes] += t + HIT_OFFSET
         lanes = lanes[reached[lanes] < length[lanes]]
     return crossing | pierces[edge_of].reshape(-1, 3).any(1)

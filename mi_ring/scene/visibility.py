@@ -1,4 +1,4 @@
-"""What the photographs show of a surface, and what none of them does."""
+"""Which parts of a surface the photographs show."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,49 +11,48 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.scene.plain_mesh import mesh_of
 
-STEP = 1e-5  #: off the surface that a ray leaves, for a mesh of size 1: more than what float32 rounds off
+SURFACE_OFFSET = 1e-5  #: of a ray's origin from the surface, for a mesh of size 1: more than float32's rounding error
 
 
-class View(NamedTuple):
-    """From where a photograph sees, and which of its pixels say something."""
+class MaskedCamera(NamedTuple):
+    """The camera of a photograph, and which of its pixels are valid."""
 
     camera: Camera
-    valid: np.ndarray | None  #: (H, W) uint8, 0 where it shows nothing; None if all of it shows something
+    valid: np.ndarray | None  #: (H, W) uint8, 0 where a pixel is not valid; None if all are
 
 
 class Visibility:
-    """Which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one view shows.
+    """Which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one camera sees.
 
-    A view shows a point that faces its camera, lies within its frame at a pixel that says something, and is not hidden
-    by the mesh itself.
+    A camera sees a point that faces it, projects to a valid pixel, and is not hidden by the mesh.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> None:
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]) -> None:
         self.vertices = np.asarray(vertices, float)
         low, high = self.vertices.min(0), self.vertices.max(0)
-        self.middle, self.size = (low + high) / 2, (high - low).max()
-        self.mesh = mesh_of((self.vertices - self.middle) / self.size, faces)  # for float32
+        self.center, self.size = (low + high) / 2, (high - low).max()
+        self.mesh = mesh_of((self.vertices - self.center) / self.size, faces)  # for float32
         self.scene = mi.load_dict({"type": "scene", "mesh": self.mesh})
         # Photographs that differ in their light alone show the same.
-        keys = [(*(np.asarray(part).tobytes() for part in v.camera), id(v.valid)) for v in views]
+        keys = [(v.camera.key, id(v.valid)) for v in views]
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
-        """Which of its vertices (V,) bool, by the smooth normals there."""
-        return self.of(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
+        """Which vertices are seen, (V,) bool, by their smooth normals."""
+        return self.of_points(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
 
-    def of(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Which of these points (N, 3) [scene units] of the surface, with unit normals (N, 3), (N,) bool."""
+    def of_points(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Which points (N, 3) [scene units] of the surface with unit normals (N, 3) are seen, (N,) bool."""
         points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
         seen = np.zeros(len(points), bool)
-        start = (points - self.middle) / self.size + STEP * normals
+        start = (points - self.center) / self.size + SURFACE_OFFSET * normals
         for view in self.views:
             eye = view.camera.position - points
             lanes = np.flatnonzero(~seen & ((normals * eye).sum(1) > 0))
-            lanes = lanes[shown(view, points[lanes])]
+            lanes = lanes[in_picture(view, points[lanes])]
             if not len(lanes):  # Dr.Jit traces no empty arrays
                 continue
-            along = (view.camera.position - self.middle) / self.size - start[lanes]
+            along = (view.camera.position - self.center) / self.size - start[lanes]
             distance = np.linalg.norm(along, axis=1, keepdims=True)
             origin, direction = (mi.Vector3f(*a.T.astype(np.float32)) for a in (start[lanes], along / distance))
             ray = mi.Ray3f(mi.Point3f(origin), direction)
@@ -62,8 +61,8 @@ class Visibility:
         return seen
 
 
-def shown(view: View, points: np.ndarray) -> np.ndarray:
-    """Which points (N, 3) [scene units] are in front of the camera and at a pixel that says something, (N,) bool."""
+def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) [scene units] are in front of the camera and project to a valid pixel, (N,) bool."""
     pixels, depth = view.camera.project(points)
     inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < view.camera.size).all(1)
     if view.valid is not None:
@@ -72,10 +71,12 @@ def shown(view: View, points: np.ndarray) -> np.ndarray:
     return inside
 
 
-def seen_of(ring: FittedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Which domain points (V, 3) become a part of the object that a view shows, (V,) bool; `faces` (F, 3) join them.
+def visible_points(
+    ring: FittedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
+) -> tuple[np.ndarray, float]:
+    """Which domain points (V, 3), vertices of faces (F, 3), are seen on the object, (V,) bool.
 
-    And the share of the object's area that no view shows.
+    And the share of the object's area that is not seen.
     """
     with torch.no_grad():
         vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()

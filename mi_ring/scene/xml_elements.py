@@ -1,4 +1,4 @@
-"""XML elements as Mitsuba's objects."""
+"""XML elements as objects of Mitsuba."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -8,7 +8,7 @@ from mi_ring.errors import InputError
 
 
 def require_parts(root: ElementTree.Element) -> None:
-    """Raise RuntimeError, as Mitsuba does of what is wrong, for elements that lack what it crashes without."""
+    """Raise RuntimeError for elements that lack a part without which Mitsuba crashes."""
     for element in root.iter():
         if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
             raise RuntimeError("bitmap: filename is missing")
@@ -17,7 +17,7 @@ def require_parts(root: ElementTree.Element) -> None:
 
 
 def load_element(element: ElementTree.Element) -> mi.Object:
-    """The object of Mitsuba's that an element stands for. Raises RuntimeError for what is wrong with it."""
+    """An element as an object of Mitsuba. Raises RuntimeError if Mitsuba refuses it."""
     require_parts(element)
     whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
     whole.extend(element)
@@ -25,7 +25,7 @@ def load_element(element: ElementTree.Element) -> mi.Object:
 
 
 def load_bsdf(xml: str) -> mi.BSDF:
-    """The BSDF of an element as text, as a fit holds it. Raises InputError for what is wrong with it."""
+    """The BSDF of an XML element given as text. Raises InputError if Mitsuba refuses it."""
     try:
         return load_element(ElementTree.fromstring(xml))
     except (ElementTree.ParseError, RuntimeError) as error:

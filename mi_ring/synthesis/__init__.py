@@ -1,4 +1,4 @@
-"""Captures of known objects: their stage, lights and cameras, path traced by stock Mitsuba, and what goes wrong.
+"""Synthetic captures of known objects: scene, lights, cameras, path tracing by stock Mitsuba, and simulated errors.
 
 May import: mitsuba, drjit, numpy, scipy, trimesh, tyro; foreign, images, photogrammetry, capture, plugins,
 rendering, scene, geometry, system.

@@ -1,33 +1,32 @@
-"""What lights the object: the light of each photograph, and the room's or an environment's beside it."""
+"""Lights of a synthetic capture: one for each photograph, further lamps, the room, and environments."""
 
 from typing import Literal
 
-import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera
-from mi_ring.rendering.spherical_harmonics import BASIS, COUNT, seen_from_within
+from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME, room_envmap
 from mi_ring.scene.lights import Light
 
 LightKind = Literal["flash", "point", "distant", "lamp"]
 RoomKind = Literal["constant", "harmonics"]
 
-SLOW = 9  #: harmonics of a room that are not 0, those of order 2
-TINT, WAVES = 0.12, 0.5  #: of the light of a room: how colours differ, and brightness with direction, about 1
-APART = 4  #: directions of which a further lamp has the one that is farthest from the others
-WEAKEST = 0.4  #: of a further lamp, by the first
-DARKEST = 0.15  #: radiance of a room in its darkest direction, by its mean
+LOW_ORDERS = 9  #: number of spherical harmonics of orders 0 to 2; a room has no others
+TINT, CONTRAST = 0.12, 0.5  #: of a room's light: variation of the colours, standard deviation of each harmonic
+CANDIDATES = 4  #: random directions for a further lamp; the one farthest from the other lamps is taken
+WEAKEST = 0.4  #: least intensity of a further lamp, in units of the first lamp's
+DARKEST = 0.15  #: least radiance of a room in any direction, in units of its mean
 
 
 def lights_of(
     kind: LightKind, cameras: list[Camera], offset: tuple[float, float, float], spread: float,
     random: np.random.Generator, distance: float = 1.0,
 ) -> list[Light]:  # fmt: skip
-    """Lights so strong that they bring 1 W/m² to a surface at the origin that faces them, in the median.
+    """A light for each camera. The median irradiance of a surface at the origin that faces its light is 1 W/m².
 
-    Every point light has the same intensity. `offset`: of a flash from the lens, left, up and forward, by the distance
-    from the camera to the origin; `spread`: how far others are from the camera at most, seen from the origin [degrees].
-    A lamp is in one place for all, at this `distance`.
+    All point lights have the same intensity. `offset`: of a flash from the lens, left, up and forward, in units of the
+    camera's distance from the origin. `spread`: largest angle between camera and point or distant light, seen from the
+    origin [deg]. `distance`: of a lamp, which is in one place for all photographs.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
@@ -35,28 +34,28 @@ def lights_of(
         away = random.normal(size=3)
         places = [distance * away / np.linalg.norm(away)] * len(cameras)
     else:
-        places = [strayed(camera.position, np.radians(spread), random) for camera in cameras]
+        places = [near(camera.position, np.radians(spread), random) for camera in cameras]
     if kind == "distant":
         return [Light("directional", -place / np.linalg.norm(place), np.ones(3)) for place in places]
     intensity = np.full(3, np.median([place @ place for place in places] or [0]))
     return [Light("point", place, intensity) for place in places]
 
 
-def others_of(count: int, first: Light, random: np.random.Generator) -> list[Light]:
-    """More lamps than the `first`, as far from the origin, in other directions; each weaker, and of another colour."""
-    distance, toward = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
+def further_lamps(count: int, first: Light, random: np.random.Generator) -> list[Light]:
+    """Lamps at the distance of the `first` from the origin, in other directions, weaker and of other colours."""
+    distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
     lights = []
     for _ in range(count):
-        tries = random.normal(size=(APART, 3))
-        tries /= np.linalg.norm(tries, axis=1, keepdims=True)
-        toward.append(tries[(tries @ np.transpose(toward)).max(1).argmin()])
+        candidates = random.normal(size=(CANDIDATES, 3))
+        candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
+        directions.append(candidates[(candidates @ np.transpose(directions)).max(1).argmin()])
         strength = random.uniform(WEAKEST, 1) * (1 + TINT * random.uniform(-1, 1, 3))
-        lights.append(Light("point", distance * toward[-1], first.rgb * strength))
+        lights.append(Light("point", distance * directions[-1], first.rgb * strength))
     return lights
 
 
-def strayed(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-    """As far from the origin as a position (3,), in a direction within `spread` [radians] of it, all alike likely."""
+def near(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
+    """A random point (3,) as far from the origin as `position`, within an angle of `spread` [rad] from it."""
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -65,25 +64,14 @@ def strayed(position: np.ndarray, spread: float, random: np.random.Generator) ->
     return np.linalg.norm(position) * (cosine * axis + np.sqrt(1 - cosine**2) * across)
 
 
-def room_of(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Radiance (BASIS, 3) as `mi_ring.rendering.spherical_harmonics` has it, whose mean over directions is about 1.
-
-    `in_camera`: it stands still with the camera beside a turntable, not with the object.
-    """
-    harmonics = np.zeros((SLOW, 3))
+def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
+    """Spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera."""
     colour = 1 + TINT * random.uniform(-1, 1, 3)
-    harmonics[0] = colour * np.sqrt(4 * np.pi)  # times the first harmonic, which is 1 / sqrt(4 pi)
-    if kind == "harmonics":
-        waves = random.normal(0, WAVES, (SLOW - 1, 1)) * colour
-        darkest = (seen_from_within(np.vstack([0 * waves[:1], waves]), np.eye(4)) / colour).min()
-        harmonics[1:] = waves * min(1.0, (1 - DARKEST) / -darkest)
     room = np.zeros((BASIS, 3))
-    room[0] = harmonics[0]
-    first = COUNT if in_camera else 1
-    room[first : first + SLOW - 1] = harmonics[1:]
+    room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)
+    if kind == "harmonics":
+        waves = random.normal(0, CONTRAST, (LOW_ORDERS - 1, 1)) * colour
+        darkest = (room_envmap(np.vstack([np.zeros(3), waves]), np.eye(4)) / colour).min()
+        first = PER_FRAME if in_camera else 1
+        room[first : first + LOW_ORDERS - 1] = waves * min(1.0, (1 - DARKEST) / -darkest)
     return room
-
-
-def environment_of(radiance: np.ndarray) -> mi.Emitter:
-    """An environment of radiances (H, W, 3) by latitude and longitude, y up."""
-    return mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance.astype(np.float32))})

@@ -1,10 +1,10 @@
-"""What the object is made of: any BSDF of Mitsuba's, a measured material, or two of them in a pattern."""
+"""Materials of the object: any BSDF of Mitsuba, a measured BRDF, or two of these in a pattern."""
 
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -16,30 +16,30 @@ from mi_ring.foreign import reading
 from mi_ring.images import read_image
 from mi_ring.scene.xml_elements import load_element
 
-COLOURS = "vertex_color"  #: name of the mesh attribute that has the colours of the mesh's file
-COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: what a mesh with colours is made of
-PLAIN = "principled base_color=0.55,0.4,0.25 roughness=0.4"  #: and one without
+COLOURS = "vertex_color"  #: name of the mesh attribute with the colours of the mesh file
+COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: default material of a mesh with colours
+PLAIN = "principled base_color=0.55,0.4,0.25 roughness=0.4"  #: default material of other meshes
 FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin and its parameters"
 
 
 class Pattern(NamedTuple):
-    """How two materials share a surface: a picture that is projected along one axis of the world, repeated or not."""
+    """Where on a surface the second of two materials is: a texture, projected along one axis of the world."""
 
-    weights: np.ndarray  #: (rows, columns) share of the second material
-    uv: np.ndarray  #: (V, 2) of the vertices
+    weights: np.ndarray  #: (rows, columns) share of the second material; repeats
+    uv: np.ndarray  #: (V, 2) texture coordinates of the vertices
 
-    def of(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
-        """Both as one BSDF."""
+    def blend(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
+        """Both materials as one BSDF."""
         pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
         nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
         return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
 
 
 def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
-    """Stripes across the axis `up`, checks, or a picture's bright parts, over the bounding box of vertices (V, 3).
+    """Pattern over the bounding box of vertices (V, 3): "stripes", "checks", or the bright parts of a picture file.
 
-    Texture coordinates are linear in space, so that edges are sharp however coarse the mesh is. Raises InputError,
-    which names the `field`, for a picture that cannot be read.
+    `bands`: number of stripes or checks along the axis `up` (0, 1 or 2). Texture coordinates are linear in space:
+    edges are sharp on coarse meshes, too. Raises InputError, which names the `field`, if a picture cannot be read.
     """
     low, high = vertices.min(0), vertices.max(0)
     across, height = (up + 1) % 3 if up != 1 else 0, max(high[up] - low[up], 1e-9)
@@ -53,73 +53,70 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
         picture = read_image(Path(kind))
     grey = picture[..., :3].astype(np.float32).mean(-1)
     u = (vertices[:, across] - low[across]) / (high[across] - low[across])
-    inside = 0.5 / np.array(grey.shape[::-1])  # the borders are not those of the next repetition
+    inside = 0.5 / np.array(grey.shape[::-1])  # stay away from the borders, where the texture repeats
     return Pattern(grey > 0.5 * grey.max(), np.clip(np.stack([u, 1 - v], 1), inside, 1 - inside))
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """The BSDF that a text means, in one of `FORMS`. Raises InputError, which names the `field`, if it means none."""
+    """The BSDF that a text in one of the `FORMS` describes. `coloured`: has the mesh colours? Raises InputError."""
+    file, _, name = text.partition(".npz:")
+    path = Path(f"{file}.npz" if name else text)
+    found: Any = None
     try:
         if text.lower().endswith(".xml"):
-            return load_snippet(Path(text), field)
-        if ".npz" in text.lower() or text.lower().endswith(".binary"):
-            file, _, material = text.partition(".npz:")
-            path = Path(f"{file}.npz" if material else text)
             require_file(path, FORMS, field)
-            values = {"material": material} if material else {}
-            return mi.load_dict({"type": "merl", "filename": str(path.resolve()), **values})
-        found = mi.load_dict(plugin(text, field, coloured))
+            with reading(f"{path}: {field}", "XML"):
+                root = ElementTree.fromstring(path.read_bytes())
+            if root.tag != "bsdf":
+                raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
+            move_names(root, path.resolve().parent, Path.cwd())  # they are relative to the file
+            found = load_element(root)
+        elif ".npz" in text.lower() or text.lower().endswith(".binary"):
+            require_file(path, FORMS, field)
+            material = {"material": name} if name else {}
+            found = mi.load_dict({"type": "merl", "filename": str(path.resolve()), **material})
+        else:
+            found = mi.load_dict(parse_plugin(text, field, coloured))
     except RuntimeError as error:
-        raise InputError(f"{field}: {text}: {complaint(str(error))}") from error
+        raise InputError(f"{field}: {text}: {explained(str(error))}") from error
     if not isinstance(found, mi.BSDF):
         raise InputError(f"{field}: {text}: is no BSDF; give {FORMS}")
     return found
 
 
-def complaint(said: str) -> str:
-    """What Mitsuba has said about a plugin and its parameters, in the words of a command line."""
-    if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", said, re.M):
+def explained(message: str) -> str:
+    """A message of Mitsuba about a plugin or its parameters, in the words of a command line."""
+    if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
-    if kind := re.search(r"Plugin \"(.*?)\" not found", said):
+    if kind := re.search(r"Plugin \"(.*?)\" not found", message):
         return f"Mitsuba has no plugin {kind[1]}; give {FORMS}"
-    if wrong := re.search(r"property \"(.*?)\" has the wrong type \(expected (.*?), got (.*?)\)", said):
+    if wrong := re.search(r"property \"(.*?)\" has the wrong type \(expected (.*?), got (.*?)\)", message):
         wanted = "a number or a colour R,G,B" if "color" in wrong[2] else wrong[2].replace("float", "a number")
         return f"{wrong[1]} is a {wrong[3]}, must be {wanted}"
-    return re.sub(r"^.*? plugin of type \"\w*\": (\[.*?\] )?", "", reason(RuntimeError(said)))
+    return re.sub(r"^.*? plugin of type \"\w*\": (\[.*?\] )?", "", reason(RuntimeError(message)))
 
 
-def load_snippet(path: Path, field: str) -> mi.BSDF:
-    """The <bsdf> of an XML file, whose file names are relative to it."""
-    require_file(path, FORMS, field)
-    with reading(f"{path}: {field}", "XML"):
-        root = ElementTree.fromstring(path.read_bytes())
-    if root.tag != "bsdf":
-        raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
-    move_names(root, path.resolve().parent, Path.cwd())
-    return cast(mi.BSDF, load_element(root))
-
-
-def plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
-    """A plugin and its parameters as Mitsuba's dictionary: `principled base_color=0.6,0.2,0.1 roughness=0.3`."""
+def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
+    """A text like `principled base_color=0.6,0.2,0.1 roughness=0.3` as a dictionary for `mi.load_dict`."""
     try:
         name, *words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{field}: is {text!r} ({error}); give {FORMS}") from error
-    if name in ("bitmap", "blendbsdf"):  # without what has no place here Mitsuba crashes of them
+    if name in ("bitmap", "blendbsdf"):  # Mitsuba crashes if their nested parts are missing
         raise InputError(f"{field}: {text}: has parts that are no numbers and colours; give {FORMS}")
     result: dict[str, Any] = {"type": name}
     for word in words:
         key, sign, value = word.partition("=")
         if not (key and sign and value):
             raise InputError(f"{field}: {text}: found {word!r}; each parameter must be NAME=VALUE")
-        result[key] = meant(value)
+        result[key] = parse_value(value)
         if value == COLOURS and not coloured:
             raise InputError(f"{field}: {text}: {key} is {COLOURS}, but the mesh's file has no colours")
     return result
 
 
-def meant(value: str) -> Any:
-    """A number, a colour R,G,B, true or false, the colours of the mesh, or a text."""
+def parse_value(value: str) -> Any:
+    """The value of a parameter: a number, a colour R,G,B, true or false, the colours of the mesh, or a string."""
     if value == COLOURS:
         return {"type": "mesh_attribute", "name": COLOURS}
     if value in ("true", "false"):

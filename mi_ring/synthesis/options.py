@@ -1,4 +1,4 @@
-"""What a synthetic capture is to be: the options of `mi-ring synthesize`."""
+"""The options of `mi-ring synthesize`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,125 +15,138 @@ from mi_ring.synthesis.viewpoints import CameraKind
 
 @dataclass(frozen=True)
 class SynthesizeConfig:
-    """Path trace a capture of a mesh: photographs, masks, scene file, and the truth beside them.
+    """Path trace a capture of a mesh: photographs, masks and scene file, with the truth beside them.
 
-    The middle of the mesh's bounding box is moved to the origin and its farthest vertex to --radius; its axes stay.
-    A material is a file .xml with one <bsdf>, a table .binary of MERL, FILE.npz:MATERIAL of networks fitted to such
-    tables, or a plugin of Mitsuba's and its parameters in one text: "principled base_color=0.6,0.2,0.1 roughness=0.3".
-    As a value, vertex_color means the colours of the mesh's file.
+    The middle of the mesh's bounding box is moved to the origin, and its farthest vertex to --radius; its axes stay. A
+    material is one of these: a file .xml with one <bsdf>; a table .binary of MERL; FILE.npz:MATERIAL, networks fitted
+    to such tables; or a plugin of Mitsuba with its parameters, as in "principled base_color=0.6,0.2,0.1 roughness=0.3".
+    The value vertex_color means the colours of the mesh's file.
 
-    Interrupted, the same command goes on.
+    After an interruption the same command continues.
     """
 
     mesh: Positional[Annotated[Path, arg(metavar="MESH")]]
-    """Mesh to photograph: PLY, OBJ, GLB, STL or what else trimesh reads. It should be closed."""
+    """Mesh to photograph: PLY, OBJ, GLB, STL or any other format of trimesh. It should be closed."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder to write."""
 
     material: str | None = None
-    """What the object is made of. Default: principled with the colours of the mesh's file, or with one colour."""
+    """Material of the object.
+    Without it: principled, with the colours of the mesh's file or one colour."""
     second: str | None = None
-    """A second material, which shares the surface with the first as --pattern says."""
+    """A second material, in the places that --pattern says."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
-    """Where the second material is: stripes across the object, checks, or where a picture, projected onto it from the
-    front, is bright."""
+    """Where the second material is.
+    stripes: in stripes across the object. checks: in a checkerboard.
+    PICTURE: where this picture is bright, projected onto the object from the front."""
     bands: int = 8
     """Number of stripes or checks over the height of the object."""
     smooth: bool = False
-    """Subdivide the mesh, by Loop's rule, until it has 10,000 vertices."""
+    """Subdivide the mesh by Loop's rule until it has 10,000 vertices. Use it for coarse meshes of round objects."""
     radius: float = 50.0
-    """Size of the object [scene units, which are millimetres if the sheet is printed]."""
+    """Radius of the object [scene units]. With the printed sheet the unit is the millimetre."""
     up: Literal["x", "y", "z"] = "y"
-    """Axis of the mesh that is up: of a turntable, a table, an environment."""
+    """Axis of the mesh that points up, for turntable, table and environment."""
 
     views: int = 50
     """Number of photographs."""
     novel: int = 10
-    """Number of further ones, truth/images, that a fit does not see: from elsewhere, without noise or error."""
+    """Number of further photographs, in truth/images, to test a fit.
+    They are from other places, without noise and errors."""
     size: tuple[int, int] = (512, 512)
-    """Width and height [px]."""
+    """Width and height of the photographs [px]."""
     fov: float = 60.0
-    """Horizontal field of view [degrees]."""
+    """Horizontal field of view [deg]."""
     cameras: CameraKind = "around"
-    """around: evenly, all looking at the middle; free: as if by hand, leaning, and nearer or farther; turntable: the
-    object turns, camera and --room stand."""
+    """Where the cameras are.
+    around: evenly around the object, aimed at its middle. free: as held by hand, tilted, at varying distances.
+    turntable: the object turns; camera and --room stand still."""
     elevations: tuple[float, ...] = (20.0, 55.0)
-    """Of the rings of a turntable [degrees]."""
+    """Elevation of each ring of cameras of a turntable [deg]."""
     distance: float | None = None
-    """From the cameras to the middle of the object, in its radii. Default: so that it just fills the photograph."""
+    """Distance of the cameras from the middle of the object [radii of the object].
+    Without it: such that the object just fills the photograph."""
 
     light: LightKind = "flash"
-    """flash: a point light at the lens; point: anywhere as far away; distant: parallel light; lamp: a point light
-    that is in one place for all photographs."""
+    """The light of the photographs.
+    flash: a point light at the lens. point: a point light elsewhere, as far away. distant: parallel light.
+    lamp: a point light in one place for all photographs."""
     lamps: int = 1
-    """How many lamps there are with --light lamp. The scene has those beside the first as emitters of its own."""
+    """Number of lamps, for --light lamp.
+    The first is the photographs' light, the others are emitters of the scene."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the flash from the lens: left, up and forward, by the distance from the camera to the object."""
+    """Position of the flash relative to the lens: left, up and forward.
+    The unit is the distance from the camera to the object."""
     spread: float = 40.0
-    """How far point and distant lights are from the camera at most, seen from the object [degrees]."""
+    """Largest angle between a point or distant light and the camera, seen from the object [deg]."""
     room: float = 0.0
-    """Light of the room: what it brings from all sides together to a surface, by the photographs' light that faces
-    it."""
+    """Light of the room: its irradiance, relative to that of the photographs' light on a surface that faces it."""
     room_kind: RoomKind = "constant"
-    """constant: alike from all sides; harmonics: brighter from some, as spherical harmonics of order 2."""
+    """constant: the same from all sides. harmonics: brighter from some sides, spherical harmonics of order 2."""
     pairs: bool = False
-    """Take each view without the photograph's own light, too, by the --room alone: what fits subtract, as `ambient`."""
+    """Take each view a second time, by the light of --room alone.
+    A fit subtracts these photographs (`ambient`)."""
     environment: Path | None = None
-    """Environment, an EXR or HDR file of latitude and longitude, to light the object instead of --light."""
+    """Environment map that lights the object in place of --light: EXR or HDR, latitude and longitude."""
     table: Literal["none", "plain", "sheet"] = "none"
-    """What the object stands on: nothing, a table, or a table with the printed sheet of mi-ring board (--radius is then
-    in millimetres). No camera is below it."""
+    """What the object stands on.
+    none: nothing. plain: a table. sheet: a table with the sheet of mi-ring board, and --radius in millimetres.
+    No camera is below a table."""
 
     format: Format = "exr"
-    """exr: linear, half precision; png16: linear, 16 bits; png8: sRGB, 8 bits."""
+    """Format of the photographs. exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits."""
     exposure: float | None = None
-    """Linear value of a white surface that faces the light from where the object is. Default: such that --clipped."""
+    """Linear pixel value of a white surface at the object that faces the light.
+    Without it: chosen by --clipped."""
     clipped: float = 0.02
-    """Share of the object's pixels at or above full scale."""
+    """Share of the object's pixels that are overexposed."""
     electrons: float = 0.0
-    """Of a pixel at full scale, which makes the shot noise. Default: 0, none."""
+    """Electrons of a pixel at full scale. Fewer electrons give more shot noise.
+    0: no shot noise."""
     read: float = 0.0
-    """Noise of reading, a standard deviation in such electrons; in 1/10,000 of full scale without --electrons."""
+    """Standard deviation of the read noise [electrons].
+    Without --electrons the unit is 1/10,000 of full scale."""
 
     wrong_cameras: float = 0.0
-    """How wrong the scene file says that cameras are: turned about each axis by so many degrees and moved along each by
-    so many per cent of their distance, standard deviations."""
+    """Error of the cameras in the scene file, standard deviation.
+    N turns each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
     wrong_light: float = 0.0
-    """How far beside their place all point lights are said to be, in the camera's axes, by their distance [%]."""
+    """Error of the positions of point lights in the scene file [% of the distance].
+    It is the same for all, in the axes of the cameras."""
     wrong_power: float = 0.0
-    """How wrong the power of each light is said to be, standard deviation [%]."""
+    """Error of the power of each light in the scene file, standard deviation [%]."""
     wrong_exposure: float = 0.0
-    """How differently photographs are exposed, which the scene file does not say: standard deviation of a factor [%],
-    and by a third of that of each colour, for the white balance."""
+    """Variation of the exposure of the photographs that the scene file does not mention, standard deviation [%].
+    A third of it varies the white balance."""
     wrong_room: bool = False
-    """Say nothing of --room, of --environment or of more --lamps than one in the scene file."""
+    """Leave --room, --environment and all --lamps but the first out of the scene file."""
 
     spp: int = 64
-    """Paths per pixel; a square number, or the next one is taken."""
+    """Paths per pixel, rounded up to a square number. More give less noise."""
     depth: int = 5
-    """Longest path, as Mitsuba counts: 2 is direct light alone."""
+    """Longest path, `max_depth` of Mitsuba's path tracer. 2 is direct light alone."""
     seed: int = 0
-    """Of cameras, lights, noise and paths."""
+    """Random seed of cameras, lights, noise and paths."""
 
     @property
     def exact(self) -> bool:
-        """Does the scene file say nothing wrong?"""
+        """Is all calibration in the scene file exact?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
-    def axis(self) -> np.ndarray:
-        """(3,) what is up."""
+    def up_axis(self) -> np.ndarray:
+        """(3,) unit vector that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property
-    def away(self) -> float:
+    def camera_distance(self) -> float:
         """From the cameras to the middle of the object [scene units]."""
         half = np.arctan(min(self.size) / self.size[0] * np.tan(np.radians(self.fov / 2)))
         return float(self.radius * (1.04 / np.sin(half) if self.distance is None else self.distance))
 
 
-#: Least and most of each option that is a number.
+#: Least and greatest value of numeric options.
 RANGES = {
     "views": (1, 10_000), "novel": (0, 10_000), "fov": (1, 150), "bands": (1, 1000), "radius": (1e-6, 1e6),
     "lamps": (1, 8), "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5),
@@ -143,7 +156,7 @@ RANGES = {
 
 
 def require_options(config: SynthesizeConfig) -> None:
-    """Raise InputError for options out of range or that contradict each other."""
+    """Raise InputError for options that are out of range or contradict each other."""
     for name, (least, most) in RANGES.items():
         if not least <= getattr(config, name) <= most:
             raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be {least} to {most}")
@@ -161,12 +174,9 @@ def require_options(config: SynthesizeConfig) -> None:
     if config.pattern != "stripes" and not config.second:
         raise InputError(f"--pattern: is {config.pattern}, for which a second material is missing; give --second")
     if config.light in ("distant", "lamp") and config.wrong_light:
-        raise InputError(
-            f"--wrong-light: is of places in the cameras' axes, which {config.light} has none of; leave it out"
-        )
+        raise InputError(f"--wrong-light: is for point lights near cameras, not for {config.light}; leave it out")
     if config.lamps > 1 and (config.light != "lamp" or config.environment or config.pairs):
-        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp, which must be given, without "
-                         "--environment and without --pairs")  # fmt: skip
+        raise InputError(f"--lamps: is {config.lamps}, which is for --light lamp without --environment and --pairs")
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
@@ -180,7 +190,6 @@ def require_options(config: SynthesizeConfig) -> None:
             raise InputError("--environment: is instead of the photographs' lights and the room; leave out --light, "
                              "--offset, --room, --wrong-light and --wrong-power")  # fmt: skip
     if config.pairs and (config.room == 0 or config.wrong_room):
-        raise InputError("--pairs: need a room whose light fits subtract; give --room, for instance 0.2, and leave out "
-                         "--wrong-room")  # fmt: skip
+        raise InputError("--pairs: need a room; give --room, for instance 0.2, and leave out --wrong-room")
     if not config.environment and config.room == 0 and config.lamps == 1 and config.wrong_room:
         raise InputError("--wrong-room: there is no room; give --room, for instance 0.1, --environment or --lamps")

@@ -1,312 +1,273 @@
-"""A capture of a known object, written picture by picture: photographs, masks, scene file, and the truth."""
+"""A synthetic capture of a known object, picture by picture: photographs, masks, scene file, and ground truth."""
 
 import hashlib
 import json
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.scenefile import (
-    Element,
-    add_pose,
-    emitter_element,
-    move_names,
-    numbers,
-    photograph_element,
-    room_elements,
-    scene_bytes,
-    scene_element,
-)
+from mi_ring.capture import scenefile
+from mi_ring.capture.scenefile import Element, move_names
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
+from mi_ring.rendering.spherical_harmonics import room_envmap
 from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis import light_sources
-from mi_ring.synthesis.degradation import HIGHEST, encoded, exposures, miscalibrated, noisy
+from mi_ring.synthesis.degradation import HALF_LIMIT, encoded, exposures, miscalibrated, noisy
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
+from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object, shape_of, table_elements
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.stage import Stage, load_object, shape_of, table_elements
-from mi_ring.synthesis.tracing import Shot
+from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import poses
 from mi_ring.system.files import quoted, read_json, write_file, writing
 from mi_ring.system.progress import progress
 
-BETWEEN = 100_003  #: seeds of pictures of one photograph by different lamps
-TRIALS, TRIAL = 8, 8  #: photographs, and how many times smaller they are, by which the exposure is found
-SETTINGS = "truth/settings.json"  #: by which an interrupted capture is known
-#: How files of a material or of a mesh, other than XML, name others that are read with them.
-NAMED = {
+LAMP_SEED_STEP = 100_003  #: between the seeds of pictures of one photograph by different lamps
+TRIALS, TRIAL_SCALE = 8, 8  #: number of photographs that determine the exposure, and how much smaller they are
+SETTINGS = "truth/settings.json"  #: the options of a capture, by which the same command continues it
+#: How files other than XML name further files that belong to them.
+REFERENCES = {
     ".obj": rb"^mtllib\s+(.+?)\s*$", ".mtl": rb"^\s*(?i:map_kd)\s+(.+?)\s*$",
     ".gltf": rb"\"uri\"\s*:\s*\"([^\"]{1,500})\"", ".ply": rb"^comment (?i:texturefile) (.+?)\s*$",
 }  # fmt: skip
 
 
-class View(NamedTuple):
-    """A photograph to be taken."""
+class PlannedPhotograph(NamedTuple):
+    """A photograph to take."""
 
     camera: Camera
-    light: Light  #: brings 1 W/m² to the object
+    light: Light  #: irradiance 1 W/m² at the object
     name: str
+    file: str  #: name of the image file
     seed: int
 
 
-class Production:
-    """All that a capture is made of, by its options. Raises InputError for what cannot be read."""
+class Studio:
+    """The object, lights, room and cameras that the options describe. Raises InputError if a file cannot be read."""
 
     def __init__(self, config: SynthesizeConfig) -> None:
         self.config = config
         self.mesh, colours, self.placed = load_object(config.mesh, config.radius, config.smooth)
-        usual = PLAIN if colours is None else COLOURED
-        bsdf, pattern = load_material(config.material or usual, "--material", colours is not None), None
+        default = PLAIN if colours is None else COLOURED
+        bsdf, pattern = load_material(config.material or default, "--material", colours is not None), None
         if config.second:
             second = load_material(config.second, "--second", colours is not None)
             pattern = pattern_of(config.pattern, self.mesh.vertices, config.bands, "xyz".index(config.up), "--pattern")
-            bsdf = pattern.of(bsdf, second)
+            bsdf = pattern.blend(bsdf, second)
         self.shape = shape_of(self.mesh, colours, bsdf, pattern)
-        #: as XML, where it takes the place of the photographs' lights
+        #: as XML; replaces the photographs' lights
         self.environment = self.environment_element() if config.environment else None
-        self.room = light_sources.room_of(config.room_kind, config.cameras == "turntable", self.random(1))
+        self.room = light_sources.random_room(config.room_kind, config.cameras == "turntable", self.random(1))
+        self.room_level = config.room / np.pi  #: mean radiance of the room; the photographs' light brings 1 W/m²
         self.tables: list[Element] = []  #: elements of the scene file
+        self.spp = int(np.ceil(np.sqrt(config.spp))) ** 2  #: paths per pixel, a square number
+        #: (views, 3) exposure of the photographs, relative to their mean
+        self.gains = exposures(config.views, config.wrong_exposure, self.random(6))
 
-    def random(self, *what: int) -> np.random.Generator:
-        """Of one purpose, so that one option changes nothing else."""
-        return np.random.default_rng([self.config.seed, *what])
+    def random(self, *purpose: int) -> np.random.Generator:
+        """A generator for one purpose, so that an option changes nothing but what it is for."""
+        return np.random.default_rng([self.config.seed, *purpose])
 
     @property
     def ground(self) -> np.ndarray:
-        """(3,) the object's lowest point, above the origin or below."""
-        return self.config.axis * (self.mesh.vertices @ self.config.axis).min()
+        """(3,) the point of the vertical axis at the height of the object's lowest point."""
+        return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
-    def views(self, count: int, novel: bool = False) -> list[View]:
-        """Photographs to be taken; `novel`: as if by hand, from elsewhere."""
-        config, random = self.config, self.random(2, novel)
-        kind = "free" if novel else config.cameras
-        place = poses(kind, count, config.radius, config.away, config.axis, random, config.elevations,
-                      config.table != "none")  # fmt: skip
+    def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:
+        """Photographs to take. `novel`: by a hand-held camera, from other places."""
+        config = self.config
+        pose = poses("free" if novel else config.cameras, count, config.radius, config.camera_distance, config.up_axis,
+                     self.random(2, novel), config.elevations, config.table != "none")  # fmt: skip
         focal, size = config.size[0] / 2 / np.tan(np.radians(config.fov / 2)), config.size
-        cameras = [Camera(to_world, np.full(2, focal), np.array(size) / 2, size) for to_world in place]
-        lights = light_sources.lights_of(
-            config.light,
-            cameras,
-            config.offset,
-            config.spread,
-            self.random(3, novel and config.light != "lamp"),
-            config.away,
-        )
-        return [View(camera, light, f"{k:03}", config.seed * 40_009 + 2 * (k + novel * 10_007))
+        cameras = [Camera(to_world, np.full(2, focal), np.array(size) / 2, size) for to_world in pose]
+        lights = light_sources.lights_of(config.light, cameras, config.offset, config.spread,
+                                         self.random(3, novel and config.light != "lamp"),
+                                         config.camera_distance)  # fmt: skip
+        suffix = "exr" if config.format == "exr" else "png"
+        return [PlannedPhotograph(camera, light, f"{k:03}", f"{k:03}.{suffix}",
+                                  config.seed * 40_009 + 2 * (k + novel * 10_007))
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 
-    def lamps_beside(self, view: View) -> list[Light]:
-        """The lamps that light all photographs besides the one that a photograph says is its own."""
-        return light_sources.others_of(self.config.lamps - 1, view.light, self.random(8))
+    def further_lamps(self, first: Light) -> list[Light]:
+        """The lamps that the scene has as emitters of its own, beside the `first`, which photographs name."""
+        return light_sources.further_lamps(self.config.lamps - 1, first, self.random(8))
 
     def environment_element(self, scale: float = 1.0) -> Element:
         """The environment as XML. Raises InputError if its file cannot be read."""
         file = Path(str(self.config.environment)).resolve()
         element = ElementTree.Element("emitter", type="envmap")
         ElementTree.SubElement(element, "string", name="filename", value=str(file))
-        ElementTree.SubElement(element, "float", name="scale", value=numbers(scale))
+        ElementTree.SubElement(element, "float", name="scale", value=scenefile.numbers(scale))
         upright = np.eye(4)
-        upright[:3, :3] = Rotation.align_vectors([self.config.axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
-        add_pose(element, upright)
+        upright[:3, :3] = Rotation.align_vectors([self.config.up_axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
+        scenefile.add_pose(element, upright)
         with reading(f"{file}: --environment", "an EXR or HDR file of latitude and longitude"):
             if file.suffix.lower() == ".exr":
-                read_image(file)  # which bounds its memory
+                read_image(file)  # refuses files that would need too much memory; Mitsuba does not
             load_element(element)
         return element
 
-    def stage(self, folder: Path) -> Stage:
-        """The object, and the tables below it, whose pictures are written into the `folder`."""
+    def build(self, folder: Path) -> ObjectOnTable:
+        """The object, and the table below it, whose pictures are written into the `folder`."""
         config, shapes = self.config, []
         if config.table != "none":
-            self.tables = table_elements(folder, self.ground, config.axis, config.radius, config.table == "sheet")
-        for element in self.tables:
-            own = deepcopy(element)
-            move_names(own, folder, Path.cwd())
-            shapes.append(load_element(own))
-        return Stage(self.shape, self.mesh.vertices, shapes)
+            self.tables = table_elements(folder, self.ground, config.up_axis, config.radius, config.table == "sheet")
+        for element in map(deepcopy, self.tables):
+            move_names(element, folder, Path.cwd())
+            shapes.append(load_element(element))
+        return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
-    def radiance(self, stage: Stage, view: View, camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray | float]:
-        """Linear radiance (H, W, 3) where the photographs' light brings 1 W/m² to the object, and by the room."""
-        config, shot = self.config, Shot(camera)
-        light = view.light if self.environment is None else load_element(self.environment)
-        picture = stage.radiance(shot, light, spp, view.seed, config.depth, hidden=self.environment is None)
-        for n, lamp in enumerate(self.lamps_beside(view), 1):
-            picture = picture + stage.radiance(shot, lamp, spp, view.seed + BETWEEN * n, config.depth)
+    def radiance(self, scene: ObjectOnTable, photograph: PlannedPhotograph, spp: int, scale: int = 1) -> tuple:
+        """Linear radiance (H, W, 3), `scale` times smaller: by lamps, the first of 1 W/m²; and by the room, or 0."""
+        config, view = self.config, LensCamera(photograph.camera.shrunk(scale))
+        light = photograph.light if self.environment is None else load_element(self.environment)
+        picture = scene.radiance(view, light, spp, photograph.seed, config.depth, hidden=self.environment is None)
+        for n, lamp in enumerate(self.further_lamps(photograph.light), 1):
+            picture = picture + scene.radiance(view, lamp, spp, photograph.seed + LAMP_SEED_STEP * n, config.depth)
         if not config.room:
             return picture, 0.0
-        # Apart: paths that choose between two lights are much noisier.
-        seen = light_sources.environment_of(
-            self.room_level * light_sources.seen_from_within(self.room, camera.to_world)
-        )
-        return picture, stage.radiance(shot, seen, spp, view.seed + 1, config.depth)
+        # In a picture of its own: paths that choose between two lights are much noisier.
+        room = self.room_level * room_envmap(self.room, photograph.camera.to_world)
+        light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(room.astype(np.float32))})
+        return picture, scene.radiance(view, light, spp, photograph.seed + 1, config.depth)
 
-    @property
-    def room_level(self) -> float:
-        """Mean radiance of the room where the photographs' light brings 1 W/m²."""
-        return self.config.room / np.pi
-
-    def exposure(self, stage: Stage, views: list[View]) -> float:
-        """By what the radiance is multiplied: as asked for, or such that so much of the object is clipped."""
+    def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
+        """Pixel value of radiance 1: from --exposure, or such that a share --clipped of the object is clipped."""
         config = self.config
         if config.exposure is not None:
             return config.exposure * (1.0 if self.environment is not None else np.pi)
-        values = []
-        scale = max(1, min(TRIAL, min(config.size) // 8))
-        for view in views[:: -(-len(views) // TRIALS)]:
-            camera = view.camera.shrunk(scale)
-            inside = stage.coverage(Shot(camera), 16) > 0.9
-            own, ambient = self.radiance(stage, view, camera, 36)
+        values, scale = [], max(1, min(TRIAL_SCALE, min(config.size) // 8))
+        for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
+            inside = scene.coverage(LensCamera(photograph.camera.shrunk(scale)), 16) > 0.9
+            own, ambient = self.radiance(scene, photograph, 36, scale)
             values.append((own + ambient)[inside].max(-1))
         if not np.concatenate(values).size:
             raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows it alone, by which "
                              "the exposure would be chosen; give --exposure, for instance 0.5")  # fmt: skip
-        bright = np.quantile(np.concatenate(values), 1 - config.clipped)
+        bright = float(np.quantile(np.concatenate(values), 1 - config.clipped))
         if not bright > 0:
             raise InputError(f"{config.mesh}: MESH: is black, whatever the light; do its faces point inward?")
-        return float(1 / bright)
-
-    @cached_property
-    def gains(self) -> np.ndarray:
-        """(views, 3) how the photographs are exposed, by their mean."""
-        return exposures(self.config.views, self.config.wrong_exposure, self.random(6))
-
-    @cached_property
-    def spp(self) -> int:
-        """Paths per pixel: a square number."""
-        return int(np.ceil(np.sqrt(self.config.spp))) ** 2
+        return 1 / bright
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write a capture into its folder, or what is missing of it. The scene file comes last.
-
-    Raises InputError for what cannot be read, and if the folder holds anything else.
-    """
-    out, production = config.out, Production(config)
+    """Write a capture or its missing part, the scene file last. Raises InputError, as `Studio` and `claim` do."""
+    out, studio = config.out, Studio(config)
     claim(out, config)
     for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):
         with writing(out):
             (out / name).mkdir(parents=True, exist_ok=True)
-    write_file(out / SETTINGS, json.dumps(settings_of(config), indent=1))  # by which the same command goes on
-    write_file(out / "truth/mesh.ply", cast(bytes, production.mesh.export(file_type="ply")))
-    stage = production.stage(out)
-    seen, novel = production.views(config.views), production.views(config.novel, novel=True)
-    exposure = production.exposure(stage, seen)
-    found = {"full_scale": 1 / exposure, "placed": production.placed.tolist()}
+    write_file(out / SETTINGS, json.dumps(settings_of(config), indent=1))  # first, so that the same command continues
+    write_file(out / "truth/mesh.ply", cast(bytes, studio.mesh.export(file_type="ply")))
+    scene = studio.build(out)
+    seen, novel = studio.photographs(config.views), studio.photographs(config.novel, novel=True)
+    exposure = studio.exposure(scene, seen)
+    found = {"full_scale": 1 / exposure, "placed": studio.placed.tolist()}
     write_file(out / SETTINGS, json.dumps(settings_of(config) | {"found": found}, indent=1))
-    todo = [(view, out, True) for view in seen] + [(view, out / "truth", False) for view in novel]
-    todo = [(view, folder, fitted) for view, folder, fitted in todo
-            if not (folder / "images" / photograph_name(config, view)).is_file()
-            or not (folder / "masks" / f"{view.name}.png").is_file()]  # fmt: skip
-    for view, folder, fitted in progress(todo, "photographing", unit="photograph", leave=True):
-        own, ambient = production.radiance(stage, view, view.camera, production.spp)
+    todo = [(photograph, folder) for folder, photographs in ((out, seen), (out / "truth", novel))
+            for photograph in photographs if not (folder / "images" / photograph.file).is_file()
+            or not (folder / "masks" / f"{photograph.name}.png").is_file()]  # fmt: skip
+    for photograph, folder in progress(todo, "photographing", unit="photograph", leave=True):
+        own, ambient = studio.radiance(scene, photograph, studio.spp)
         pictures = {"images": exposure * (own + ambient)}
-        coverage = stage.coverage(Shot(view.camera))
-        write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{view.name}.png")
-        if fitted:
+        coverage = scene.coverage(LensCamera(photograph.camera))
+        write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{photograph.name}.png")
+        if folder == out:  # novel views have neither noise nor errors
             if config.pairs:
-                pictures = {"ambient": exposure * ambient} | pictures  # by the last it is known what there is
+                pictures = {"ambient": exposure * ambient} | pictures  # images last: `todo` looks for them
             for purpose, place in ((5, "images"), (7, "ambient")):
                 if place in pictures:
-                    pictures[place] *= production.gains[int(view.name)]
+                    pictures[place] *= studio.gains[int(photograph.name)]
                     if config.electrons or config.read:
-                        random = production.random(purpose, int(view.name))
+                        random = studio.random(purpose, int(photograph.name))
                         pictures[place] = noisy(pictures[place], config.electrons, config.read, random)
         for place, linear in pictures.items():
-            write_image(encoded(linear, config.format), folder / place / photograph_name(config, view))
-    write_scenes(production, seen, novel, exposure)
+            write_image(encoded(linear, config.format), folder / place / photograph.file)
+    write_scenes(studio, seen, novel, exposure)
 
 
-def write_scenes(production: Production, seen: list[View], novel: list[View], exposure: float) -> None:
-    """Write scene.xml, the truth's own, and, where scene.xml is wrong, what it should say: truth/exact.xml."""
-    config = production.config
-    out = config.out
-    strength = exposure if production.environment is None else 0.0
-    extra: list[Element] = []
-    if production.environment is not None:
-        extra = [production.environment_element(exposure)]
+def write_scenes(
+    studio: Studio, seen: list[PlannedPhotograph], novel: list[PlannedPhotograph], exposure: float
+) -> None:
+    """Write scene.xml, truth/scene.xml of the novel views, and, if scene.xml has errors, truth/exact.xml without."""
+    config, out = studio.config, studio.config.out
+    strength = exposure if studio.environment is None else 0.0
+    emitters: list[Element] = []
+    if studio.environment is not None:
+        emitters = [studio.environment_element(exposure)]
     elif config.room:
-        extra = room_elements(exposure * production.room_level * production.room)
-    for lamp in production.lamps_beside((seen + novel)[0]):
-        extra.append(emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
-    up, ground = (config.axis, production.ground) if config.table != "none" else (None, None)
+        emitters = scenefile.room_elements(exposure * studio.room_level * studio.room)
+    for lamp in studio.further_lamps((seen + novel)[0].light):
+        emitters.append(scenefile.emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
+    up, ground = (config.up_axis, studio.ground) if config.table != "none" else (None, None)
     metres = 0.001 if config.table == "sheet" else None
 
-    def scene(folder: Path, views: list[View], images: str, masks: str, exact: bool) -> bytes:
-        paired = config.pairs and views is seen
-        gains = production.gains if exact and views is seen else np.ones((len(views), 3))
-        cameras, lights = [view.camera for view in views], [view.light for view in views]
-        if not exact:
-            cameras, lights = miscalibrated(
-                cameras, lights, np.zeros(3), production.random(4), config.wrong_cameras, config.wrong_light,
-                config.wrong_power,
-            )  # fmt: skip
-            if config.light == "lamp":  # which no camera takes along
-                lights = [light._replace(vector=view.light.vector) for light, view in zip(lights, views)]
-        elements = [
-            photograph_element(
-                view.name, f"{images}/{photograph_name(config, view)}", camera,
-                light._replace(rgb=strength * light.rgb), f"{masks}/{view.name}.png",
-                saturation=HIGHEST if config.format == "exr" else None, calibrated=exact, gain=gain,
-                ambient=f"ambient/{photograph_name(config, view)}" if paired else None,
+    def scene(folder: Path, photographs: list[PlannedPhotograph], place: str, exact: bool) -> bytes:
+        paired = config.pairs and photographs is seen
+        gains = studio.gains if exact and photographs is seen else np.ones((len(photographs), 3))
+        shots: Sequence[Shot] = [
+            Shot(
+                p.name, p.camera, p.light._replace(rgb=strength * p.light.rgb),
+                response=Response(gain=tuple(gain.tolist())),
+                files=Files(Path(place, "images", p.file), Path(place, "masks", f"{p.name}.png"),
+                            ambient=Path("ambient", p.file) if paired else None),
+                saturation=HALF_LIMIT if config.format == "exr" else 1.0, calibrated=exact,
             )
-            for view, camera, light, gain in zip(views, cameras, lights, gains)
+            for p, gain in zip(photographs, gains)
         ]  # fmt: skip
-        root = scene_element(elements, ground, up, metres)
-        root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(extra))
-        for table in production.tables:
-            root.append(deepcopy(table))
+        if not exact:
+            shots = miscalibrated(shots, np.zeros(3), studio.random(4), config.wrong_cameras, config.wrong_light,
+                                  config.wrong_power)  # fmt: skip
+            if config.light == "lamp":  # it does not move with a camera
+                shots = [replace(shot, light=shot.own_light._replace(vector=p.light.vector))
+                         for shot, p in zip(shots, photographs)]  # fmt: skip
+        root = scenefile.scene_element(map(scenefile.photograph_element, shots), ground=ground, up=up, metres=metres)
+        root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(emitters))
+        root.extend(deepcopy(studio.tables))
         move_names(root, out, folder)
-        return scene_bytes(root)
+        return scenefile.scene_bytes(root)
 
     if novel:
-        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/images", "truth/masks", True))
+        write_file(out / "truth/scene.xml", scene(out / "truth", novel, "truth/", exact=True))
     if not config.exact:
-        write_file(out / "truth/exact.xml", scene(out / "truth", seen, "images", "masks", True))
-    write_file(out / "scene.xml", scene(out, seen, "images", "masks", config.exact))
-
-
-def photograph_name(config: SynthesizeConfig, view: View) -> str:
-    """Of its file."""
-    return f"{view.name}.{'exr' if config.format == 'exr' else 'png'}"
+        write_file(out / "truth/exact.xml", scene(out / "truth", seen, "", exact=True))
+    write_file(out / "scene.xml", scene(out, seen, "", config.exact))
 
 
 def digest(file: Path) -> str:
-    """Of a file and of those that it names, which are beside it: pictures of a material or of a mesh."""
+    """Hash of a file and of the files that it names, such as the textures of a material or a mesh."""
     result, files = hashlib.blake2b(digest_size=16), [file]
-    for each in files:  # which grow meanwhile
-        content = each.read_bytes()
+    for each in files:  # the list grows in the loop
+        content, kind = each.read_bytes(), each.suffix.lower()
         result.update(content)
-        for name in named_in(content, each.suffix.lower()):
+        found = re.findall(REFERENCES.get(kind, b"(?!)"), content, re.M)
+        for name in quoted(content) if kind == ".xml" else [name.decode(errors="replace") for name in found]:
             named = each.parent / name
             if os.path.isfile(named) and named.resolve() not in files:
                 files.append(named.resolve())
     return result.hexdigest()
 
 
-def named_in(content: bytes, kind: str) -> list[str]:
-    """What a file of this kind, a suffix, says where names of other files stand."""
-    if kind == ".xml":
-        return quoted(content)
-    return [name.decode(errors="replace") for name in re.findall(NAMED.get(kind, b"(?!)"), content, re.M)]
-
-
 def settings_of(config: SynthesizeConfig) -> dict:
-    """The options that a capture depends on, and what their files hold, as JSON has them."""
+    """The options that a capture depends on, and hashes of their files, as values of JSON."""
     values = asdict(replace(config, out=Path())) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
-        text = str(getattr(config, name)).partition(".npz:")[0]  # which may be longer than names of files are
+        text = str(getattr(config, name)).partition(".npz:")[0]
+        # os.path.isfile, unlike Path.is_file, takes texts that are too long for a file name.
         file = next((file for file in (text, f"{text}.npz") if os.path.isfile(file)), None)
         if file:
             values["digests"][name] = digest(Path(file))
@@ -314,15 +275,15 @@ def settings_of(config: SynthesizeConfig) -> dict:
 
 
 def claim(out: Path, config: SynthesizeConfig) -> None:
-    """Raise InputError if a folder holds anything but the same capture, whole or in part."""
+    """Raise InputError if a folder holds anything but the same capture, complete or not."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     found = read_json(out / SETTINGS)
     if not isinstance(found, dict):
         raise InputError(f"{out}: OUT: is there already, and is no capture of mi-ring synthesize; give another name")
     wanted = settings_of(config)
-    named = {"mesh", "environment"} & wanted["digests"].keys()  # by what they hold, wherever they are
-    other = [name for name, value in wanted.items() if name not in named and found.get(name) != value]
+    hashed = {"mesh", "environment"} & wanted["digests"].keys()  # only their content matters, not their place
+    other = [name for name, value in wanted.items() if name not in hashed and found.get(name) != value]
     if other:
         raise InputError(f"{out}: OUT: holds a capture that was made with other options ({', '.join(other)}); "
                          "give another name, or remove it")  # fmt: skip

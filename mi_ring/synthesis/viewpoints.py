@@ -1,4 +1,4 @@
-"""Where photographs are taken from: evenly all around, freely by hand, or from one place beside a turntable."""
+"""Camera poses: evenly around the object, as if held by hand, or beside a turntable."""
 
 from typing import Literal
 
@@ -7,16 +7,16 @@ from scipy.spatial.transform import Rotation
 
 CameraKind = Literal["around", "free", "turntable"]
 
-LOWEST = 0.1  #: height of a camera above a table on which the object stands, by its distance
-NEARER, FARTHER = 0.98, 1.2  #: free cameras, by the distance of the others
-ASTRAY, ROLL = 0.06, 15.0  #: how far free ones aim beside the object, by its radius, and lean [degrees]
-GOLDEN = np.pi * (3 - np.sqrt(5))  #: turns along a spiral that is even everywhere
+LOWEST = 0.1  #: least height of a camera above the table, in units of its distance
+NEARER, FARTHER = 0.98, 1.2  #: range of distances of hand-held cameras, in units of `distance`
+AIM, ROLL = 0.06, 15.0  #: of hand-held cameras: error of the aim [object radii], standard deviation of the roll [deg]
+GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad]: points of a spiral with it are evenly spread over a sphere
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """A camera-to-world matrix (4, 4), x left, y up, z forward, leaning by `roll` [radians] about where it looks."""
+    """Camera-to-world matrix (4, 4), x left, y up, z forward. `roll`: about the viewing direction [rad]."""
     forward = (target - position) / np.linalg.norm(target - position)
-    if abs(forward @ up) > 0.99 * np.linalg.norm(up):  # straight up or down: any other direction is up
+    if abs(forward @ up) > 0.99 * np.linalg.norm(up):  # the camera looks along `up`: take another direction
         up = np.roll(up, 1)
     left = np.cross(up, forward)
     left /= np.linalg.norm(left)
@@ -30,27 +30,27 @@ def poses(
     kind: CameraKind, count: int, radius: float, distance: float, up: np.ndarray, random: np.random.Generator,
     elevations: tuple[float, ...] = (20.0, 55.0), standing: bool = False,
 ) -> list[np.ndarray]:  # fmt: skip
-    """Camera-to-world matrices (4, 4) around an object of this radius at the origin.
+    """Camera-to-world matrices (4, 4) around an object of this radius at the origin, at this distance from it.
 
-    `elevations` [degrees]: of the rings of a turntable, in whose frame the cameras are; `standing`: on a table, so that
-    none is below.
+    `elevations`: of the rings of cameras around a turntable [deg]. `standing`: no camera is below the table.
     """
     upright = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])[0].as_matrix()
     low = LOWEST if standing else -1.0
     result = []
     for k in range(count):
-        turn, height, away, aim, roll = k * GOLDEN, low + (1 - low) * (k + 0.5) / count, distance, np.zeros(3), 0.0
+        azimuth, height = k * GOLDEN, low + (1 - low) * (k + 0.5) / count
+        away, aim, roll = distance, np.zeros(3), 0.0
         if kind == "free":
-            turn, height = random.uniform(0, 2 * np.pi), random.uniform(low, 1)
+            azimuth, height = random.uniform(0, 2 * np.pi), random.uniform(low, 1)
             away = distance * random.uniform(NEARER, FARTHER)
-            aim = ASTRAY * radius * random.uniform(-1, 1, 3)
+            aim = AIM * radius * random.uniform(-1, 1, 3)
             roll = np.radians(random.normal(0, ROLL))
         elif kind == "turntable":
             ring = k * len(elevations) // count
             first, last = (-(-r * count // len(elevations)) for r in (ring, ring + 1))
-            turn = 2 * np.pi * (k - first + ring / len(elevations)) / (last - first)
+            azimuth = 2 * np.pi * (k - first + ring / len(elevations)) / (last - first)
             height = np.sin(np.radians(elevations[ring]))
-        flat = np.sqrt(max(0.0, 1 - height**2))
-        direction = upright @ np.array([np.cos(turn) * flat, np.sin(turn) * flat, height])
+        horizontal = np.sqrt(max(0.0, 1 - height**2))
+        direction = upright @ np.array([np.cos(azimuth) * horizontal, np.sin(azimuth) * horizontal, height])
         result.append(look_at(away * direction, aim, up, roll))
     return result

@@ -1,4 +1,4 @@
-"""The machine that all runs on: LLVM, threads, whole files, the command line.
+"""The machine and the operating system: LLVM, threads, GPUs, files, progress bars, the command line.
 
 May import: mitsuba, drjit, torch, tqdm, tyro, filelock.
 """

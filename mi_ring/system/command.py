@@ -1,9 +1,10 @@
-"""What all commands share: arguments from a dataclass, one line for a user's mistake."""
+"""What all commands share: arguments parsed into a dataclass, user errors in one line, signals, exit status."""
 
 import ast
 import contextlib
 import difflib
 import io
+import itertools
 import math
 import os
 import re
@@ -20,10 +21,10 @@ import tyro
 from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
-LONGEST = 800  #: message, in characters
-#: Signals that end a command: Ctrl-C, `kill` and schedulers, a terminal that is closed (not on Windows).
+MAX_MESSAGE = 800  #: characters of an error message
+#: Signals that end a command: from Ctrl-C, from `kill` and schedulers, from a terminal that is closed (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-REPEATS = 5.0  #: seconds within which a signal that comes again is the same one
+REPEATED = 5.0  #: seconds in which a second SIGTERM or SIGHUP is taken for a copy of the first
 
 
 def parse(
@@ -51,29 +52,27 @@ def parse(
 
 
 def require_utf8(name: str) -> None:
-    """Raise InputError for a file's name that is not UTF-8: it may be any bytes."""
-    shown = os.fsencode(name).decode(errors="replace")
-    if shown != name:
-        raise InputError(f"{shown}: this name is not UTF-8, which Mitsuba and XML need; rename it")
+    """Raise InputError if a file name is not UTF-8; the file system allows any bytes."""
+    printable = os.fsencode(name).decode(errors="replace")
+    if printable != name:
+        raise InputError(f"{printable}: this name is not UTF-8, which Mitsuba and XML need; rename it")
 
 
 def complaint_in(box: str) -> str:
-    """The complaint, in one line, of the box that tyro draws: a title, the complaint, rules and advice between them.
+    """The error message in the box that tyro prints, as one line.
 
-    Of the advice, which options are spelled alike is kept, and what an option takes. Where the output is not UTF-8 the
-    box has no sides.
+    The box holds a title, the message, and advice, separated by horizontal rules. Of the advice two parts are used:
+    options of similar spelling, and the help of the option. The box has no sides if the output is not UTF-8.
     """
     if "│" in box:
         lines = [line.strip("│") for line in box.splitlines() if line.startswith("│")]
     else:
         lines = [line for line in box.splitlines() if line.strip()][2:]  # after the title and its rule
-    parts: list[list[str]] = [[]]
-    for line in lines:
-        if set(line.strip()) in ({"─"}, {"-"}):
-            parts.append([])
-        else:
-            parts[-1].append(line)
-    if names := missing_in(parts[0]):
+    groups = itertools.groupby(lines, lambda line: set(line.strip()) in ({"─"}, {"-"}))
+    parts = [list(group) for is_rule, group in groups if not is_rule] or [[]]
+    if parts[0] and parts[0][0].strip().startswith("Missing from "):  # their names are indented, their help is more so
+        indents = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
+        names = [line.split()[0] for line, indent in zip(parts[0][1:], indents) if indent == min(indents)]
         return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     parts = [[line.strip() for line in part if line.strip()] for part in parts]
     advice = {part[0]: part[1:] for part in parts[1:] if part}
@@ -82,131 +81,121 @@ def complaint_in(box: str) -> str:
     return f"{complaint}; perhaps you meant {', '.join(alike)}" if alike else complaint
 
 
-def missing_in(lines: Sequence[str]) -> list[str]:
-    """The names of what is missing, where tyro says so: they are those lines that are indented, and their help more."""
-    if not (lines and lines[0].strip().startswith("Missing from ")):
-        return []
-    indents = [len(line) - len(line.lstrip()) for line in lines]
-    return [line.split()[0] for line, n in zip(lines[1:], indents[1:], strict=True) if n == min(indents[1:])]
-
-
 def plain(complaint: str, help_text: str) -> str:
-    """A complaint of tyro's as ours are: what, what was found, what must be. `help_text`: the option's."""
+    """An error message of tyro, reworded like ours: the option, what was found, what is needed.
+
+    `help_text` is the help of the option.
+    """
     if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
         choices = wrong[3].replace("'", "").split(", ")
         alike = difflib.get_close_matches(wrong[1], choices)
         meant = f"; perhaps you meant {', '.join(alike)}" if alike else ""
-        return f"{as_shown(wrong[2])}: is {wrong[1]}; must be one of {', '.join(choices)}{meant}"
+        return f"{name_in_help(wrong[2])}: is {wrong[1]}; must be one of {', '.join(choices)}{meant}"
     if wrong := re.match(r"Missing value for argument '(\S+)'\. Expected (\d+) values", complaint):
         has_none = "has no value" if wrong[1].startswith("--") else "is missing; --help tells more"
-        return f"{as_shown(wrong[1])}: {has_none if wrong[2] == '1' else f'must be {wrong[2]} values'}"
+        return f"{name_in_help(wrong[1])}: {has_none if wrong[2] == '1' else f'must be {wrong[2]} values'}"
     union = r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]"
-    if wrong := re.match(union, complaint):  # why each kind of value is not meant is of no interest
+    if wrong := re.match(union, complaint):  # without the reasons why each type does not fit
         kinds = re.sub("[{}]", "", wrong[2].replace("{None}|", "")).replace(",", "|")
         return "{}: is {}; must be {}".format(wrong[1], wrong[3].replace("'", ""), kinds)
     unread = r"Error parsing (--\S+): (?:Could not find valid parse|Failed to parse)[^\[]*(\[.*\])?"
     if wrong := re.match(unread, complaint):
         found = ""
-        with contextlib.suppress(SyntaxError, ValueError):  # of words that the box has broken
+        with contextlib.suppress(SyntaxError, ValueError):  # the box may have wrapped the words
             found = " ".join(ast.literal_eval(wrong[2] or "[]"))
         shown = re.match(r"--\S+ \[(.*?\.\.\.\])\]", help_text)
         return f"{wrong[1]}: {f'is {found}, ' * bool(found)}must be {shown[1] if shown else 'as --help says'}"
-    for kind, error in (
-        ("whole number", r"invalid literal for int\(\) .*"),
-        ("number", "could not convert string to float"),
-    ):
+    errors = {"whole number": r"invalid literal for int\(\) .*", "number": "could not convert string to float"}
+    for kind, error in errors.items():
         complaint = re.sub(rf"^Error parsing (\S+): {error}: '(.*)'", rf"\1: is \2; must be a {kind}", complaint)
-    return re.sub(r"^Error parsing \w+Config: ", "", complaint)  # by the dataclass itself
+    return re.sub(r"^Error parsing \w+Config: ", "", complaint)  # errors that the dataclass itself raises
 
 
-def as_shown(name: str) -> str:
-    """An argument's name as the help has it."""
+def name_in_help(name: str) -> str:
+    """The name of an argument as the help shows it."""
     return name if name.startswith("--") else name.upper()
 
 
 def scene_name(scene: Path) -> str:
-    """The name of a scene: that of the file, or of its folder where the file is just called scene.xml."""
+    """The name of a scene: the file's name, or the folder's if the file is called scene.xml."""
     return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
 def one_line(message: str) -> str:
-    """A message without the line breaks that a name in it may have, and without the middle of what it echoes."""
+    """A message without line breaks; if it is longer than `MAX_MESSAGE`, without its middle."""
     words = " ".join(message.split())
-    return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]} … {words[-LONGEST // 2 :]}"
+    return words if len(words) <= MAX_MESSAGE else f"{words[: MAX_MESSAGE // 2]} … {words[-MAX_MESSAGE // 2 :]}"
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal has come that ends a command, as Ctrl-C does."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
+    """A signal of `SIGNALS` has arrived; the argument is its number."""
 
 
-def status_of(stop: KeyboardInterrupt) -> int:
-    """The exit status of a command that was interrupted: 128 and the signal."""
-    return 128 + getattr(stop, "number", signal.SIGINT)
+def exit_status(stop: KeyboardInterrupt) -> int:
+    """The exit status of an interrupted command: 128 + the signal's number."""
+    return 128 + next(iter(stop.args), signal.SIGINT)
 
 
-COME: list[tuple[int, float]] = []  #: signals that have come within `going_on`, and when
+_received: list[tuple[int, float]] = []  #: signals within `resumable`: number, time of arrival [s]
 
 
 def interrupted() -> bool:
-    """Has a signal come that ends what is within `going_on`? Native code may have made an error of its own of it."""
-    return bool(COME)
+    """Has a signal arrived within `resumable`? Native code may have turned it into another error."""
+    return bool(_received)
 
 
 @contextlib.contextmanager
-def going_on() -> Iterator[None]:
-    """For work that goes on where it was interrupted: says so if it is, by Ctrl-C or another signal that ends it.
+def resumable() -> Iterator[None]:
+    """A context manager for work that the same command resumes; it prints that when a signal of `SIGNALS` arrives.
 
-    Raises Interrupted for all of them, whatever a library has made of it. Signals are heard in the main thread alone.
+    Raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
     """
 
-    def hear(number: int, frame: object) -> None:
-        before, now = COME[-1][1] if COME else -math.inf, time.monotonic()
-        COME.append((number, now))
-        if number == signal.SIGINT or now - before > REPEATS:  # shells, schedulers and the kernel send others again
+    def receive(number: int, frame: object) -> None:
+        before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
+        _received.append((number, now))
+        # Shells, schedulers and the kernel may send the same signal several times; only Ctrl-C means it each time.
+        if number == signal.SIGINT or now - before > REPEATED:
             raise Interrupted(number)
 
-    heard = []
+    handled = []
     if threading.current_thread() is threading.main_thread():
-        heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # not under nohup
-    before = {number: signal.signal(number, hear) for number in heard}
+        handled = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # as under nohup
+    before = {number: signal.signal(number, receive) for number in handled}
     try:
         yield
     except (KeyboardInterrupt, Exception) as stop:
-        if not (COME or isinstance(stop, KeyboardInterrupt)):
+        if not (_received or isinstance(stop, KeyboardInterrupt)):
             raise
-        with contextlib.suppress(OSError):  # a terminal that is closed
+        with contextlib.suppress(OSError):  # the terminal may be closed
             sys.stdout.flush()
             print("interrupted; the same command goes on", file=sys.stderr, flush=True)
-        raise Interrupted(COME[0][0] if COME else signal.SIGINT) from stop
+        raise Interrupted(_received[0][0] if _received else signal.SIGINT) from stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        COME.clear()  # of what is over nothing is left to whoever asks
+        _received.clear()
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit: status 2 and one line on standard error for anything the user can mend.
+    """Run a command and exit. A user error is one line on standard error and exit status 2.
 
-    With `--traceback` among the arguments the whole way to the error is shown instead.
+    With `--traceback` among the arguments the traceback is shown instead.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in arguments
     arguments = [argument for argument in arguments if argument != "--traceback"]
     try:
         status = main(arguments) or 0
-        sys.stdout.flush()  # here, where it may fail
+        sys.stdout.flush()  # so that a broken pipe is noticed here
         sys.exit(status)
     except KeyboardInterrupt as stop:
-        sys.exit(status_of(stop))
-    except BrokenPipeError:  # `mi-ring … | head`: nobody reads on
+        sys.exit(exit_status(stop))
+    except BrokenPipeError:  # `mi-ring … | head` has stopped reading
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except (InputError, OSError) as error:
-        # A file that may not be read, a folder that is gone; other errors of the system are nobody's mistake but ours.
+        # An OSError with a file name is a user error: no permission, a folder that was removed. Others are bugs.
         if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
             raise
         message = str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Writing files so that they are complete or absent; checksums; locks of folders."""
 
 import contextlib
 import errno
@@ -8,6 +8,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,14 +19,14 @@ import torch
 
 from mi_ring.errors import InputError
 
-SEAL = b"blake2b "  #: begins the comment at the end of an archive that says what its bytes are
-DIGEST = 32  #: hexadecimal digits of it
-END, COMMENT = b"PK\x05\x06", 20  #: of a zip file: its last record begins so, and there has the length of a comment
+SEAL = b"blake2b "  #: begins the comment of a zip file that holds its checksum
+DIGEST = 32  #: hexadecimal digits of the checksum
+END, COMMENT = b"PK\x05\x06", 20  #: how the last record of a zip file begins; where in it the comment's length is
 
 
 @contextlib.contextmanager
 def writing(what: Path | str) -> Iterator[None]:
-    """Turns what the system has against writing a file, a full disk for instance, into an InputError."""
+    """Turns an OSError, for instance of a full disk, into an InputError that begins with `what`."""
     try:
         yield
     except OSError as error:
@@ -34,28 +35,28 @@ def writing(what: Path | str) -> Iterator[None]:
 
 
 def require_place(path: Path, field: str = "") -> None:
-    """Make the folder of a file that is to come after long work. Raises InputError if nothing can be written there."""
+    """Make the folder of a file before the long work for it. Raises InputError if nothing can be written there."""
     with writing(f"{path}: {field}" if field else path):
         path.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path.parent).close()
 
 
 def relative_to(folder: Path, path: Path) -> str:
-    """A path as files in a folder name it, with forward slashes; absolute where it is on another drive (Windows)."""
+    """A path relative to a folder, with forward slashes; absolute if it is on another drive (Windows)."""
     with contextlib.suppress(ValueError):
         path = Path(os.path.relpath(path, folder))
     return path.as_posix()
 
 
 def partial_path(path: Path) -> Path:
-    """Where a file grows until it is whole: beside it, under a name that no other process has."""
+    """The temporary file, beside `path`, to write until it is complete. No other process has this name."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
 def write_file(path: Path, content: bytes | memoryview | str, durable: bool = False, keep: Path | None = None) -> None:
-    """Write a file so that it is there whole or not at all. Raises InputError if it cannot be written.
+    """Write a file so that it is complete or absent. Raises InputError if it cannot be written.
 
-    `durable`: even after a power cut, which takes a while. `keep`: what was there before goes there.
+    `durable`: also after a power cut; this is slower. `keep`: where to move the old file of this name.
     """
     partial = partial_path(path)
     with writing(path):
@@ -70,26 +71,16 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
                     os.replace(path, keep)
             os.replace(partial, path)
             if durable:
-                sync_folder(path.parent)
+                with contextlib.suppress(OSError):  # on Windows, and on some file systems
+                    folder = os.open(path.parent, os.O_RDONLY)
+                    os.fsync(folder)
+                    os.close(folder)
         finally:
             partial.unlink(missing_ok=True)
 
 
-def sync_folder(folder: Path) -> None:
-    """Have its names outlive a power cut, where the system can: not on Windows, nor on all that is mounted."""
-    with contextlib.suppress(OSError):
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
-
-
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """`torch.save`, whole or not at all, and sealed: `read_state` notices each bit that is not as it was.
-
-    `keep`: what was there before goes there.
-    """
+    """`torch.save` by `write_file`, with a checksum by which `read_state` notices any changed bit."""
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
     seal(buffer)
@@ -97,27 +88,27 @@ def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
 
 
 def seal(archive: io.BytesIO) -> None:
-    """Give a zip file the digest of all that comes before as its comment."""
+    """Add a comment to a zip file that holds the checksum of everything before it."""
     end = archive.seek(-COMMENT - 2, os.SEEK_END)
-    assert archive.read(len(END)) == END, "has a comment already"
+    assert archive.read(len(END)) == END, "it has a comment already"
     archive.seek(end + COMMENT)
     archive.write((len(SEAL) + DIGEST).to_bytes(2, "little"))
     archive.write(SEAL + fingerprint(archive.getbuffer()))
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Is it a zip file as `seal` left it, every bit of it?"""
+    """Does a zip file end in the checksum that `seal` wrote, and does it hold?"""
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 
 
 def fingerprint(content: bytes | memoryview) -> bytes:
-    """Of some bytes, in hexadecimal digits."""
+    """The BLAKE2b checksum in `DIGEST` hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file of ours holds; None if there is no such file, or if it is damaged."""
+    """The content of a JSON file that we wrote; None if it does not exist or is damaged."""
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -125,53 +116,57 @@ def read_json(path: Path) -> Any:
 
 
 def quoted(content: bytes) -> list[str]:
-    """The words in quotes of an XML file, some of which are names of files."""
-    words = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
-    return [(double or single).decode(errors="replace") for double, single in words]
+    """The quoted strings of an XML file, among them the names of all files that it refers to."""
+    strings = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
+    return [(double or single).decode(errors="replace") for double, single in strings]
 
 
 @contextlib.contextmanager
-def in_turn(folder: Path) -> Iterator[None]:
-    """Make a folder after another process that does so has done it; says so if there is one.
+def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
+    """A context manager that locks a folder. If another process has the lock, raise InputError or `wait` for it.
 
-    The lock is beside the folder and stays there: of one that is removed, who waits for it would hold another.
-    """
-    with writing(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder.with_name(f".{folder.name}.lock"))
-        try:
-            lock.acquire(timeout=0)
-        except filelock.Timeout:
-            print(f"waiting for {folder}, which another process makes", flush=True)
-            lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-@contextlib.contextmanager
-def locked(folder: Path, field: str = "--out") -> Iterator[None]:
-    """Keep other processes from writing into a folder. Raises InputError if one does already.
-
-    The lock is beside the folder, which may be moved meanwhile, and goes with the process.
+    The lock file is beside the folder, so that the folder may be moved. The lock ends with the process.
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
     if place.is_file():
         raise InputError(f"{folder}: {field}: is a file; give a folder, which is made if it is not there")
-    require_place(place, field)  # else filelock tells of another process
+    require_place(place, field)  # otherwise filelock would report that another process holds the lock
     with writing(f"{folder}: {field}"):
-        lock = filelock.FileLock(file, timeout=0)
+        lock = filelock.FileLock(file)
         try:
-            lock.acquire()
+            acquired = lock.acquire(timeout=0)
         except filelock.Timeout:
-            raise InputError(
-                f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
-            ) from None
-    try:
-        yield
-    finally:
-        if os.name == "posix":  # elsewhere a file that is open cannot be removed, and filelock removes it itself
-            file.unlink(missing_ok=True)
-        lock.release()
+            if not wait:
+                raise InputError(
+                    f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
+                ) from None
+            print(f"waiting for {folder}, which another process makes", flush=True)
+            acquired = lock.acquire()
+    with acquired:
+        try:
+            yield
+        finally:
+            # A process that waits has opened this file; it must not lock a file that is removed. Windows cannot remove
+            # an open file; there filelock removes it.
+            if os.name == "posix" and not wait:
+                file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder`. At the end it is renamed to `folder`, which must then be missing or empty.
+
+    After an error nothing is left of it. Raises InputError if something in it cannot be written.
+    """
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        growing = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            yield growing
+            growing.chmod(0o755)
+            with contextlib.suppress(FileNotFoundError):
+                folder.rmdir()
+            os.replace(growing, folder)
+        finally:
+            shutil.rmtree(growing, ignore_errors=True)

@@ -1,12 +1,12 @@
-"""Finds the LLVM library that Dr.Jit compiles with; as a script, downloads one.
+"""Finds the LLVM library that Dr.Jit compiles with. Run as a script, it downloads one.
 
-Dr.Jit chooses its library once, while it is imported, and takes what it meets first. LLVM 15 and 16 look fine and then
-abort the whole process at the first kernel; Debian 12 installs 14. So `mi_ring` chooses before Dr.Jit does (`prepare`)
-and says what is wrong with the result (`missing`).
+Dr.Jit chooses its LLVM once, at import, and takes the first that it finds. LLVM 15 and 16 load without complaint, but
+abort the process at the first kernel; Debian 12 installs LLVM 14. So `mi_ring` chooses before Dr.Jit does (`prepare`)
+and reports what is wrong with the result (`missing`).
 
-`python mi_ring/system/llvm.py` (part of `make setup`) makes sure that there is something to choose: where the machine
-has no usable LLVM, it unpacks Debian or Ubuntu packages beside the Python environment, without root and without
-installing them. It needs nothing but Python.
+`python mi_ring/system/llvm.py` (part of `make setup`) makes an LLVM available: if the machine has no usable one, it
+unpacks Debian or Ubuntu packages beside the Python environment. This needs no root, changes nothing in the system, and
+imports only the standard library.
 """
 
 import ctypes
@@ -24,23 +24,21 @@ from pathlib import Path
 OLDEST = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 PRIVATE = Path(sys.prefix) / "llvm"  # the copy that belongs to this environment
+DEBIAN_VERSIONS = (19, 18, 17, *range(20, 30))  # that Debian and Ubuntu have packages of, the best tested first
 
-# The versions that Debian and Ubuntu carry, the best tested first.
-DEBIAN_VERSIONS = (19, 18, 17, *range(20, 30))
-
-# Full names only: libLLVMSPIRVLib.so.19.1 and the libLLVM-18-rust-*.so of a compiler are other libraries.
+# Full names only: libLLVMSPIRVLib.so.19.1 and a compiler's libLLVM-18-rust-*.so are other libraries. Last: Homebrew.
 _NAME = re.compile(
     r".*/(?:libLLVM-(\d+)[\d.]*\.so[\d.]*|libLLVM\.so\.(\d+)[\d.]*"
     r"|llvm[@\d]*/(\d+)[^/]*/lib/libLLVM\.dylib)"
-)  # Homebrew
+)
 
-_too_late = False  # Dr.Jit was there before us
+_too_late = False  # Dr.Jit was imported before `prepare`
 
 
 def prepare() -> None:
-    """Choose Dr.Jit's LLVM through the environment variable `DRJIT_LIBLLVM_PATH`; call it before Dr.Jit is imported.
+    """Choose Dr.Jit's LLVM by the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
 
-    A value that the user has set stays. Without a usable library nothing is set, and `missing` says what came of it.
+    It keeps a value that the user has set, and sets nothing if no library is usable; see `missing`.
     """
     global _too_late
     _too_late = "drjit" in sys.modules
@@ -52,9 +50,9 @@ def prepare() -> None:
 
 
 def missing() -> str | None:
-    """What the variants `llvm_*` of Mitsuba lack here and what to do about it; None if they lack nothing.
+    """What Mitsuba's `llvm_*` variants lack on this machine and how to get it; None if they can run.
 
-    Call it after `prepare`. Where libatomic is missing Dr.Jit cannot even be imported.
+    Call it after `prepare`. Without libatomic, Dr.Jit cannot even be imported.
     """
     if not has_atomic():
         return f"Dr.Jit needs libatomic.so.1, which this machine lacks. {cure('libatomic1')}"
@@ -67,17 +65,14 @@ def missing() -> str | None:
     chosen, known = os.environ.get(VARIABLE), libraries()
     found = f"loaded LLVM {'.'.join(map(str, version))}" if version[0] > 0 else "found none that it can use"
     if chosen:
-        missing = os.sep in chosen and not os.path.exists(chosen)
-        found += f" ({VARIABLE}={chosen}{', which does not exist' if missing else ''})"
+        found += f" ({VARIABLE}={chosen}{', which does not exist' * (os.sep in chosen and not os.path.exists(chosen))})"
     elif known:
         found += f" (on this machine: {', '.join(path for _, path in known)})"
 
     usable = [path for major, path in known if major >= OLDEST]
     if usable and _too_late:
-        remedy = (
-            f"Dr.Jit was imported before mi_ring could choose {usable[0]}: "
-            "restart Python and import mi_ring before mitsuba."
-        )
+        remedy = (f"Dr.Jit was imported before mi_ring could choose {usable[0]}: "
+                  "restart Python and import mi_ring before mitsuba.")  # fmt: skip
     elif usable and chosen and os.path.realpath(chosen) not in usable:
         remedy = f"Unset {VARIABLE}: mi_ring then takes {usable[0]}."
     else:
@@ -89,22 +84,18 @@ def missing() -> str | None:
 
 
 def cure(package: str, more: str = "") -> str:
-    """How to get a Debian package's library on this machine."""
-    advice = {
-        "darwin": "Run `brew install llvm`",
-        "win32": "Run `winget install LLVM.LLVM`",
-    }
-    if sys.platform in advice:
-        return f"{advice[sys.platform]}{more}."
+    """How to install the library of a Debian package on this machine, in one sentence that ends in `more`."""
+    installers = {"darwin": "brew install llvm", "win32": "winget install LLVM.LLVM"}
+    if sys.platform in installers:
+        return f"Run `{installers[sys.platform]}`{more}."
     script = f"{sys.executable} {os.path.abspath(__file__)}"
     return f"Run `{script}` (part of `make setup`; needs no root), or `apt install {package}` as root{more}."
 
 
 def libraries(folders: list[str] | None = None) -> list[tuple[int, str]]:
-    """List the LLVM libraries in `folders` as (major version, path), in order of preference.
+    """The LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first.
 
-    Without `folders`: the system's, newest first, then the private copy. The version is read from the file name, since
-    loading two LLVMs into one process is asking for trouble.
+    Default: those of the system, then the private copy. Versions are read from file names, without loading the files.
     """
     if folders is None:
         return libraries(_system_folders()) + libraries([f"{glob.escape(str(PRIVATE))}/**"])
@@ -120,16 +111,9 @@ def _system_folders() -> list[str]:
     """Folders (glob patterns) in which systems keep libLLVM."""
     arch = sysconfig.get_config_var("MULTIARCH") or f"{platform.machine()}-linux-gnu"
     folders = [
-        f"/usr/lib/{arch}",
-        "/usr/lib/llvm-*/lib",
-        "/usr/lib64",
-        "/usr/lib64/llvm*/lib",
-        "/usr/lib",
-        "/usr/local/lib",
-        "/opt/homebrew/Cellar/llvm*/*/lib",
-        "/usr/local/Cellar/llvm*/*/lib",
-        f"{glob.escape(sys.prefix)}/lib",
-    ]
+        f"/usr/lib/{arch}", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib64/llvm*/lib", "/usr/lib", "/usr/local/lib",
+        "/opt/homebrew/Cellar/llvm*/*/lib", "/usr/local/Cellar/llvm*/*/lib", f"{glob.escape(sys.prefix)}/lib",
+    ]  # fmt: skip
     if ldconfig := shutil.which("ldconfig", path="/sbin:/usr/sbin"):  # not in every user's PATH
         cache = subprocess.run([ldconfig, "-p"], check=False, capture_output=True, text=True).stdout
         folders += {os.path.dirname(path) for path in re.findall(r"=> (/.*/libLLVM[^/]*)$", cache, re.MULTILINE)}
@@ -137,15 +121,15 @@ def _system_folders() -> list[str]:
 
 
 def find(folders: list[str] | None = None) -> str | None:
-    """Return the path of the first library in `libraries(folders)` that is new enough and loads, or None."""
-    if sys.platform == "win32" and folders is None:  # whose libraries do not have their version in their names
+    """The first library of `libraries(folders)` that is new enough and can be loaded; None if there is none."""
+    if sys.platform == "win32" and folders is None:  # file names there do not contain the version
         places = shutil.which("LLVM-C.dll"), r"C:\Program Files\LLVM\bin\LLVM-C.dll"
         return next((path for path in places if path and os.path.exists(path)), None)
     return next((path for major, path in libraries(folders) if major >= OLDEST and loads(path)), None)
 
 
 def loads(path: str | Path) -> bool:
-    """Load a shared library and keep it; False if that fails (wrong architecture, a missing dependency)."""
+    """Load a shared library for the rest of the process. False if that fails, e.g. for another architecture."""
     try:
         ctypes.CDLL(str(path))
         return True
@@ -154,14 +138,14 @@ def loads(path: str | Path) -> bool:
 
 
 def has_atomic() -> bool:
-    """Whether libatomic, which Dr.Jit is linked with and slim containers lack, can be loaded (only Linux needs it)."""
+    """Can libatomic be loaded? Dr.Jit is linked with it on Linux, but slim containers do not have it."""
     return sys.platform != "linux" or loads("libatomic.so.1")
 
 
 def preload(folder: Path) -> None:
-    """Load what is unpacked in `folder`, LLVM itself apart, in whatever order resolves.
+    """Load the shared libraries unpacked in `folder`, except LLVM, in an order that satisfies their dependencies.
 
-    The loader does not search there, but takes a library that is already loaded wherever its name is asked for.
+    The dynamic loader does not search this folder, but it resolves a dependency by a library that is already loaded.
     """
     waiting = [path for path in folder.rglob("*.so*") if path.is_file() and not path.name.startswith("libLLVM")]
     while waiting != (left := [path for path in waiting if not loads(path)]):
@@ -169,42 +153,30 @@ def preload(folder: Path) -> None:
 
 
 def install(target: Path = PRIVATE) -> str:
-    """Make a usable LLVM, and libatomic, available and say in one line how.
+    """Make a usable LLVM and libatomic available. Returns one line that says where they are.
 
-    Does nothing where the machine has both. Otherwise fills the folder `target` by `unpack`.
-
-    Raises:
-        RuntimeError: There is no usable LLVM and no way to get one here.
+    If the machine lacks one of them, the folder `target` is filled by `unpack`. Raises RuntimeError if that fails.
     """
     preload(target)
-    path = os.environ.get(VARIABLE) or find()
-    if path and has_atomic():
-        return f"LLVM: {path}"
-
-    wanted = [["libatomic1"]]  # asked for in any case: apt leaves out what the machine has
-    if not (os.environ.get(VARIABLE) or find(_system_folders())):
-        wanted = [["libatomic1", f"libllvm{major}"] for major in DEBIAN_VERSIONS]
-    packages = unpack(wanted, target)
-
-    preload(target)
-    path = os.environ.get(VARIABLE) or find()
+    path, packages = os.environ.get(VARIABLE) or find(), []
     if not (path and has_atomic()):
-        raise RuntimeError(f"{' '.join(packages)} in {target} cannot be loaded")
-    return f"LLVM: {path} (unpacked in {target}: {' '.join(packages)})"
+        wanted = [["libatomic1"]]  # always asked for: apt leaves out what the machine has
+        if not (os.environ.get(VARIABLE) or find(_system_folders())):
+            wanted = [["libatomic1", f"libllvm{major}"] for major in DEBIAN_VERSIONS]
+        packages = unpack(wanted, target)
+        preload(target)
+        path = os.environ.get(VARIABLE) or find()
+        if not (path and has_atomic()):
+            raise RuntimeError(f"{' '.join(packages)} in {target} cannot be loaded")
+    return f"LLVM: {path}" + (f" (unpacked in {target}: {' '.join(packages)})" if packages else "")
 
 
 def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
-    """Unpack Debian or Ubuntu packages into the folder `target`, replacing it, and return the packages' names.
+    """Unpack Debian or Ubuntu packages into the folder `target`, replacing it. Returns the packages' names.
 
-    Works without root and leaves the system as it is: apt keeps its lists and its cache in a temporary folder.
-
-    Args:
-        alternatives: Lists of packages. The first list that the archive can serve is taken, together with the
-            dependencies that this machine lacks; packages that the machine has are left out.
-        target: The folder. It appears complete or not at all.
-
-    Raises:
-        RuntimeError: The system has no apt, or apt failed.
+    `alternatives` are lists of packages. The first list that the archive has is taken, with the dependencies that this
+    machine lacks; packages that the machine has are left out. It needs no root: apt keeps its lists and its cache in a
+    temporary folder. `target` appears complete or not at all. Raises RuntimeError if there is no apt or if it fails.
     """
     if not shutil.which("apt-get"):
         raise RuntimeError(
@@ -216,28 +188,18 @@ def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
         folder = Path(name).resolve()
         for part in ("state/lists/partial", "cache/archives/partial", "debs", "tree"):
             (folder / part).mkdir(parents=True)
-        # Without the sandbox user: it could not write here, and apt would say so at length.
+        # As root: apt's own sandbox user could not write here, and apt would warn about it at length.
         apt = [
-            "apt-get",
-            "-qq",
-            "-o",
-            f"Dir::State={folder}/state",
-            "-o",
-            "Dir::State::status=/var/lib/dpkg/status",
-            "-o",
-            f"Dir::Cache={folder}/cache",
-            "-o",
-            "APT::Sandbox::User=root",
-            "-o",
-            "Acquire::Languages=none",
-        ]
-        # An unreachable third-party source fails here and does not matter; an unreachable archive fails below.
+            "apt-get", "-qq", f"-oDir::State={folder}/state", "-oDir::State::status=/var/lib/dpkg/status",
+            f"-oDir::Cache={folder}/cache", "-oAPT::Sandbox::User=root", "-oAcquire::Languages=none",
+        ]  # fmt: skip
+        # An unreachable third-party source fails here and does no harm. Without the archive, the next step fails.
         subprocess.run([*apt, "update"], check=False)
         for wanted in alternatives:
             plan = subprocess.run(
                 [*apt, "install", "-s", "--no-install-recommends", *wanted], check=False, capture_output=True, text=True
             )
-            # "Inst name (version ...)" is new; "Inst name [old] (version ...)" would shadow what runs here: never that.
+            # "Inst name (version ...)" is a new package. "Inst name [old] (version ...)" would shadow an installed one.
             if packages := re.findall(r"^Inst (\S+) \(", plan.stdout, re.MULTILINE):
                 break
         else:
@@ -256,7 +218,7 @@ def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
 
 
 def main(arguments: list[str]) -> None:
-    """`llvm.py` makes LLVM available; `llvm.py FOLDER PACKAGE...` unpacks other packages the same way."""
+    """`llvm.py` makes LLVM available; `llvm.py FOLDER PACKAGE...` unpacks other packages into a folder."""
     try:
         if arguments:
             unpack([arguments[1:]], Path(arguments[0]))

@@ -1,4 +1,4 @@
-"""The machine that a fit runs on: variant, cores, threads, precision, memory."""
+"""The computing resources of a fit: Mitsuba's variant, cores, threads, precision, memory."""
 
 import contextlib
 import ctypes
@@ -21,45 +21,46 @@ from mi_ring.system import llvm
 Thing = TypeVar("Thing")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-ENOUGH, ONE_AT_A_TIME = 2, threading.Lock()  #: threads for an EXR; who changes their number
+EXR_THREADS = 2  #: with fewer, Mitsuba waits forever when it reads or writes an EXR
+_exr_lock = threading.Lock()  # held by who changes the number of threads for an EXR
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
 
 
 def device() -> torch.device:
-    """Where torch must keep its tensors: where the current variant of Mitsuba computes. Nothing is copied then."""
+    """The device on which the current variant of Mitsuba computes. Tensors there need not be copied."""
     return torch.device("cuda" if str(mi.variant()).startswith("cuda") else "cpu")
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Are matrix products faster in bfloat16 than in float32? Most processors emulate it.
+    """Are matrix products faster in bfloat16 than in float32? Most processors emulate bfloat16.
 
-    Asked of what the processor can do, not measured: a fit that is repeated must not depend on a measurement.
+    It is decided by the processor's features, not by a measurement, so that fits can be repeated exactly.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    # PyTorch and oneDNN can be told to do without what there is.
-    told = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
+    # The user can switch features off in PyTorch and in oneDNN.
+    limit = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
     if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):
         return False
-    if torch.cpu._is_amx_tile_supported() and torch.cpu._init_amx():  # which asks the system for its registers
-        return told == "DEFAULT" or "AMX" in told
-    # By AVX512-BF16 alone products are twice as fast as in float32 on AMD's (Zen 4), half as fast on Intel's.
-    told_of: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # from PyTorch 2.10 on
-    amd = "AMD" in told_of.get("cpu_name", "")
-    return amd and torch.cpu._is_avx512_bf16_supported() and (told == "DEFAULT" or "BF16" in told or "AMX" in told)
+    if torch.cpu._is_amx_tile_supported() and torch.cpu._init_amx():  # the system must grant the AMX registers
+        return limit == "DEFAULT" or "AMX" in limit
+    # With AVX512-BF16 alone, products are twice as fast as in float32 on AMD's Zen 4, but half as fast on Intel's.
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # since PyTorch 2.10
+    amd = "AMD" in capabilities.get("cpu_name", "")
+    return amd and torch.cpu._is_avx512_bf16_supported() and any(s in limit for s in ("DEFAULT", "BF16", "AMX"))
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
-    """A context in which the networks' matrix products have this precision, `auto` the faster one."""
+    """A context manager in which matrix products have this precision; `auto` is the faster one."""
     if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
         return lambda: torch.autocast(device.type, torch.bfloat16)
     return contextlib.nullcontext
 
 
 def set_variant(variant: str) -> str:
-    """Switch Mitsuba to a variant and return its name: that of the processor, where there is no GPU to use.
+    """Switch Mitsuba to a variant and return its name. Without a usable GPU, `llvm_ad_rgb` replaces CUDA variants.
 
-    Raises InputError if that needs an LLVM which is not there.
+    Raises InputError if the variant needs LLVM and there is none.
     """
     reason = None
     if variant.startswith("cuda"):
@@ -83,87 +84,76 @@ def set_variant(variant: str) -> str:
 
 
 def cores() -> int:
-    """Of the processor, those that this process may use: by its affinity, and by the quota of its container."""
+    """The number of processor cores that this process may use, by its affinity and its container's quota."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return max(1, math.ceil(min(count, quota(Path("/sys/fs/cgroup")))))
+    return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
 
 
 def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[Result]:
-    """`map`, each in a thread, as many at once as there are cores; for what leaves Python's lock alone."""
+    """`map` in threads, one per core; for functions that release Python's global lock."""
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(function, *things)
 
 
-def in_turn(
+def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """`second(thing, first(thing))` of each; in a thread of its own, while this one has the `first` of the next.
+    """`second(thing, first(thing))` of each thing. Another thread runs `second` during the next thing's `first`.
 
-    But for one thread, in turn indeed: `threads_for_exr` must not change their number while another renders.
+    If Dr.Jit has one thread, all runs in this thread: `exr_threads` must not change their number during rendering.
     """
-    if dr.thread_count() < ENOUGH:
+    if dr.thread_count() < EXR_THREADS:
         for thing in things:
             yield second(thing, first(thing))
         return
     with ThreadPoolExecutor(1) as pool:
-        before = None
+        pending = None
         for thing in things:
             part = first(thing)
-            if before:
-                yield before.result()
-            before = pool.submit(second, thing, part)
-        if before:
-            yield before.result()
+            if pending:
+                yield pending.result()
+            pending = pool.submit(second, thing, part)
+        if pending:
+            yield pending.result()
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """What a long native call returns. Ctrl-C is heard meanwhile, not only at its end: it runs in another thread."""
+    """The result of a long native call, which runs in another thread so that Ctrl-C has an effect at once."""
     future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
     while not wait([future], 0.1).done:
         pass
     return future.result()
 
 
-def quota(root: Path) -> float:
-    """The processor time per time that control groups allow this process; infinite without a limit.
+def cpu_quota(root: Path) -> float:
+    """The number of cores that the control groups below `root` allow this process; infinite without a limit.
 
-    Of groups above its own, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
+    The groups that contain its group limit it, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
     """
-    limit = math.inf
+    groups = [root]
     with contextlib.suppress(OSError):
-        groups = Path("/proc/self/cgroup").read_text().splitlines()
-        own = next((line.split(":", 2)[2] for line in groups if line.startswith("0::")), "/")  # version 2
-        folder = root / own.lstrip("/")
-        for group in (folder, *folder.parents):
-            limit = min(limit, share_of(group / "cpu.max"))
-            if group == root:
-                break
-    for name in ("cpu", "cpu,cpuacct"):  # version 1
-        with contextlib.suppress(OSError, ValueError):
-            time = int((root / name / "cpu.cfs_quota_us").read_text())
-            if time > 0:
-                limit = min(limit, time / int((root / name / "cpu.cfs_period_us").read_text()))
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+        group = root / next((line.split(":", 2)[2] for line in lines if line.startswith("0::")), "/").lstrip("/")
+        groups = [folder for folder in (group, *group.parents) if folder.is_relative_to(root)]
+    sources = [[group / "cpu.max"] for group in groups]  # version 2, then version 1
+    sources += [[root / name / f"cpu.cfs_{x}_us" for x in ("quota", "period")] for name in ("cpu", "cpu,cpuacct")]
+    limit = math.inf
+    for files in sources:
+        with contextlib.suppress(OSError, ValueError):  # there is no such file, or it says "max"
+            time, period = map(int, " ".join(file.read_text() for file in files).split())
+            limit = min(limit, time / period if time > 0 else math.inf)
     return limit
 
 
-def share_of(file: Path) -> float:
-    """What a `cpu.max` allows; infinite if it says so or is not there."""
-    try:
-        time, period = file.read_text().split()
-        return math.inf if time == "max" else int(time) / int(period)
-    except (OSError, ValueError):
-        return math.inf
-
-
 def set_threads(count: int = 0) -> None:
-    """Have torch and Dr.Jit use so many threads, by default all `cores`."""
+    """Set the number of threads of torch and Dr.Jit. 0: all `cores`."""
     torch.set_num_threads(count or cores())
     dr.set_thread_count(count or cores())
 
 
 def processor() -> str:
-    """What runs this: model of the processor and number of cores."""
+    """The model of the processor and the number of `cores`."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -173,16 +163,16 @@ def processor() -> str:
 
 
 def computer() -> str:
-    """What the current variant computes on: the GPU, and the processor."""
+    """The GPU, if the current variant computes on one, and the processor."""
     gpu = f"{torch.cuda.get_device_name()}, " if device().type == "cuda" else ""
     return gpu + processor()
 
 
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
-    """So many threads of torch and Dr.Jit, by default all `cores`, and those of before at the end.
+    """A context manager in which torch and Dr.Jit use this number of threads. 0: all `cores`.
 
-    Parallel sums depend on the order in which threads finish: one thread is what determinism costs.
+    Only one thread is deterministic: the order of parallel sums depends on which thread finishes first.
     """
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(count)
@@ -194,21 +184,23 @@ def threads_of(count: int = 0) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def threads_for_exr() -> Iterator[None]:
-    """Threads enough for Mitsuba to read or write an EXR: on a single one it waits forever."""
-    with contextlib.ExitStack() as held:
-        held.enter_context(ONE_AT_A_TIME)
-        before = dr.thread_count()  # of which no other thread has made more for a moment
-        if before < ENOUGH:
-            dr.set_thread_count(ENOUGH)
-            held.callback(dr.set_thread_count, before)
-        else:
-            held.close()
+def exr_threads() -> Iterator[None]:
+    """A context manager in which Dr.Jit has the `EXR_THREADS` threads that Mitsuba needs for an EXR, or more."""
+    with _exr_lock:  # another thread may have raised the number for a moment
+        before = dr.thread_count()
+    if before >= EXR_THREADS:
         yield
+        return
+    with _exr_lock:
+        dr.set_thread_count(EXR_THREADS)
+        try:
+            yield
+        finally:
+            dr.set_thread_count(before)
 
 
 def glibc(name: str) -> Callable[..., int]:
-    """A function of glibc's; one that does nothing where there is none: macOS, musl, Windows."""
+    """A function of glibc; on other systems (macOS, musl, Windows) a function that does nothing."""
     try:
         return getattr(ctypes.CDLL(None), name)
     except (AttributeError, TypeError, OSError):
@@ -216,16 +208,13 @@ def glibc(name: str) -> Callable[..., int]:
 
 
 def keep_memory() -> None:
-    """Have glibc keep freed memory, for the rest of the process.
-
-    The system takes longer to hand out and clear pages than most operations take to use them.
-    """
+    """Let glibc keep freed memory for the rest of the process: new pages from the system are slow."""
     mallopt = glibc("mallopt")
     mallopt(M_MMAP_MAX, 0)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def release_memory() -> None:
-    """Give the system back what has been freed so far, between what stays, too: up to half of what a fit holds."""
+    """Return freed memory to the system, which may be half of the memory of a fit."""
     dr.flush_malloc_cache()
     glibc("malloc_trim")(0)

@@ -1,4 +1,4 @@
-"""Packages that not every machine can install: asked for when they are needed."""
+"""Packages that cannot be installed on every machine: they are imported when they are needed."""
 
 import contextlib
 import importlib.util
@@ -12,30 +12,29 @@ from mi_ring.errors import InputError
 
 
 def installed(package: str) -> bool:
-    """Is it there?"""
+    """Can this package be imported?"""
     return importlib.util.find_spec(package) is not None
 
 
 def need(package: str, what: str, distribution: str | None = None) -> ModuleType:
-    """Import a package. Raises InputError, which says `what` it is for, if it is not installed.
+    """Import a package. Raises InputError, which begins with `what`, its use, if it is not installed.
 
-    `distribution`: what to install, if that has another name.
+    `distribution`: the name to install it by, if that differs.
     """
     try:
-        with keeping_handlers():  # pycolmap puts some of its own
-            module = importlib.import_module(package)
+        with keeping_handlers():  # pycolmap installs its own
+            return importlib.import_module(package)
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
         raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install "
                          f"{distribution or package}` (for some systems, Linux on ARM for one, there is none "
                          "ready-made)") from error  # fmt: skip
-    return module
 
 
 @contextlib.contextmanager
 def keeping_handlers() -> Iterator[None]:
-    """Within it a library may put a handler of its own for SIGTERM, and does; ours is back then."""
+    """Restore the handler of SIGTERM afterwards: some libraries replace it."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield

@@ -1,8 +1,7 @@
-"""How far something is."""
+"""Progress bars, and output that survives readers which stop reading."""
 
 import contextlib
 import errno
-import io
 import math
 import os
 import shutil
@@ -13,29 +12,29 @@ from typing import Any
 
 from tqdm import tqdm
 
-Progress = Callable[..., Iterable]  #: what `progress` is; another shows nothing
-PATIENCE, QUIET = 2.0, 30.0  #: seconds before something is shown, and between two lines where there is no terminal
+Progress = Callable[..., Iterable]  #: the type of `progress`, and of substitutes that show nothing
+DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and between two lines
 
 
 @contextlib.contextmanager
-def outliving_readers() -> Iterator[None]:
-    """Within it nobody need read on what is printed: `| head`, a terminal that is closed. It is dropped then."""
+def tolerating_closed_output() -> Iterator[None]:
+    """A context manager that drops output that cannot be written: after `| head`, or if the terminal is closed."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (stream and Dispensable(stream) for stream in before)  # None: there is no console
+    sys.stdout, sys.stderr = (stream and TolerantStream(stream) for stream in before)  # None: there is no console
     try:
         yield
     finally:
         for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, Dispensable):
+            if isinstance(stream, TolerantStream):
                 try:
                     stream.stream.flush()
                 except OSError:
-                    stream.drop()
+                    stream.discard()
         sys.stdout, sys.stderr = before
 
 
-class Dispensable:
-    """A stream of text, of which what cannot be written is dropped; all from then on, if nobody is there any more."""
+class TolerantStream:
+    """A text stream that drops what cannot be written, and everything after its reader is gone."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -44,76 +43,66 @@ class Dispensable:
         return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
-        """Write it, if that is possible."""
-        self.attempt(lambda: self.stream.write(text))
+        """Write text if that is possible."""
+        self.attempt(self.stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush it, if that is possible."""
+        """Flush if that is possible."""
         self.attempt(self.stream.flush)
 
-    def attempt(self, output: Callable[[], object]) -> None:
-        """Try it."""
+    def attempt(self, operation: Callable[..., object], *arguments: Any) -> None:
+        """Call an operation of the stream; ignore its OSError."""
         try:
-            output()
+            operation(*arguments)
         except OSError as error:
             if error.errno in (errno.EPIPE, errno.EIO):
-                self.drop()
+                self.discard()
 
-    def drop(self) -> None:
-        """Drop what is left to be written, which would fail again at the very end, and all that comes."""
-        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), self.stream.fileno())
-
-
-class Lines(io.TextIOBase):
-    """Standard error where it is a file: a bar's state now and then, each a line of its own."""
-
-    def __init__(self) -> None:
-        self.last, self.shown = -math.inf, ""  #: when the last was written [s], and what it was
-
-    def write(self, text: str) -> int:
-        """Write it, if there is anything to be seen in it and the last was a while ago."""
-        if text.strip() and time.monotonic() - self.last >= QUIET:
-            self.put(text.strip())
-        return len(text)
-
-    def put(self, line: str) -> None:
-        """Write a line, unless it is there already."""
-        if sys.stderr and line != self.shown:
-            sys.stderr.write(f"{line}\n")
-            self.last, self.shown = time.monotonic(), line
-
-    def flush(self) -> None:
-        """Flush standard error."""
-        if sys.stderr:
-            sys.stderr.flush()
+    def discard(self) -> None:
+        """Send the buffered text, and all that follows, to the null device: it would fail again at exit."""
+        with contextlib.suppress(OSError), open(os.devnull, "w") as null:
+            os.dup2(null.fileno(), self.stream.fileno())
 
 
-class LastLine(tqdm):
-    """A bar that is lines, of which the last says how far it came; tqdm leaves that out, or wipes it off."""
+class LogBar(tqdm):
+    """A progress bar for a log: a line every `LOG_INTERVAL` seconds, and one at the end."""
 
-    def __init__(self, *arguments: Any, file: Lines, **options: Any) -> None:
-        self.lines = file
-        super().__init__(*arguments, file=file, **options)
+    written, line = -math.inf, ""  #: when the last line was written [s], and its text
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Write a line if it is time; called by tqdm."""
+        if msg is None and time.monotonic() - self.written >= LOG_INTERVAL:
+            self.write_line()
+
+    def write_line(self) -> None:
+        """Write the state as a line, unless that is the last line already."""
+        if (line := str(self).strip()) != self.line:
+            self.fp.write(f"{line}\n")
+            self.fp.flush()
+            self.written, self.line = time.monotonic(), line
+
+    def clear(self, *arguments: Any, **options: Any) -> None:
+        """Nothing: a log is not erased."""
 
     def close(self) -> None:
-        """Say it, if anything was said before."""
-        if not self.disable and self.lines.shown:
-            self.lines.put(str(self).strip())
+        """Write the last line, if there were others."""
+        if not self.disable and self.line:
+            self.write_line()
         super().close()
 
 
 def progress(
     things: Iterable | None, what: str = "", total: float | None = None, leave: bool = False, **options: Any
 ) -> tqdm:
-    """Iterates over things and shows how far it is, while it is at work; `options` are those of tqdm.
+    """Iterate over `things` and show the progress; `options` are those of tqdm.
 
-    In a terminal it is a bar; else a line is written twice a minute, and none of what takes less than two seconds.
+    A terminal shows a bar. A log gets two lines a minute, and none for what takes less than two seconds.
     """
     kind = tqdm
     if not getattr(sys.stderr, "isatty", bool)():
-        kind = LastLine
-        options |= {"file": Lines(), "delay": PATIENCE, "ascii": " #", "position": 0}
-    columns, rows = shutil.get_terminal_size()  # 80 x 24 where a terminal says 0 x 0: tqdm would show nothing
+        kind = LogBar
+        # At position 0, tqdm would end with a carriage return.
+        options |= {"delay": DELAY, "ascii": " #", "position": 1} | ({} if sys.stderr else {"disable": True})
+    columns, rows = shutil.get_terminal_size()  # 80 x 24 if a terminal says 0 x 0, at which tqdm shows nothing
     return kind(things, what, total, leave=leave, ncols=columns, nrows=rows, **options)

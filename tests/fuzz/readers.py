@@ -1,5 +1,6 @@
 """All that reads files of others, and small whole files for each; what a reader may raise is InputError alone."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,14 +40,14 @@ from mi_ring.importers.reading import has_alpha, image_size, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
-from mi_ring.metrics.capture_findings import told_before
+from mi_ring.metrics.capture_findings import findings_of_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit, ring_state
 from mi_ring.output.results import read_log
 from mi_ring.photogrammetry.folder import Picture
-from mi_ring.rendering.measured_brdf import CELLS, Network, Table
+from mi_ring.rendering.measured_brdf import CELLS, MerlNetwork, MerlTable
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.path_traced_capture import Production
+from mi_ring.synthesis.path_traced_capture import Studio
 from mi_ring.system.files import write_state
 
 SIZE = W, H = 7, 5  #: of pictures [px]
@@ -306,6 +307,12 @@ def checkpoint(folder: Path) -> Reader:
     return Reader([path], lambda: read_checkpoint(folder, config))
 
 
+def settings(folder: Path) -> Reader:
+    path = folder / "config.json"
+    path.write_text(json.dumps({"scene": "scene.xml", **Config(domain=("mesh", Path("a.ply"))).settings()}))
+    return Reader([path], lambda: Config.load(folder))
+
+
 def results(folder: Path) -> Reader:
     """What a fit and `check` look for in folders of results."""
     names = ("config.json", "log.jsonl", "calibration.json")
@@ -319,7 +326,7 @@ def results(folder: Path) -> Reader:
 
     def read() -> None:
         read_log(folder)
-        told_before(folder / "scene.xml", ["000", "001"])
+        findings_of_fit(folder / "scene.xml", ["000", "001"])
         planned_before(config, [config], folder)
 
     return Reader([folder / name for name in names], read)
@@ -328,13 +335,13 @@ def results(folder: Path) -> Reader:
 def merl(folder: Path) -> Reader:
     path = folder / "table.binary"
     path.write_bytes(np.array(CELLS, "<i4").tobytes() + b"\0" * 99)
-    return Reader([path], lambda: plugin_error(lambda: Table(path)))
+    return Reader([path], lambda: plugin_error(lambda: MerlTable(path)))
 
 
 def networks(folder: Path) -> Reader:
     path = folder / "networks.npz"
     test_merl.networks(path)
-    return Reader([path], lambda: plugin_error(lambda: Network(path, "one")))
+    return Reader([path], lambda: plugin_error(lambda: MerlNetwork(path, "one")))
 
 
 def synthesized(folder: Path) -> Reader:
@@ -352,7 +359,7 @@ def synthesized(folder: Path) -> Reader:
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
     config = SynthesizeConfig(mesh_file, folder / "out", material=str(material), second=f"{measured}:one",
                               pattern=str(pattern), environment=sky)  # fmt: skip
-    return Reader(files, lambda: Production(config))
+    return Reader(files, lambda: Studio(config))
 
 
 def plugin_error(call: Callable[[], object]) -> None:
@@ -379,7 +386,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "middlebury": middlebury, "sfmdata-alicevision": alicevision, "sfmdata-openmvg": openmvg, "transforms": transforms,
     "neus": neus, "wildlight": wildlight, "iron": iron, "diligent-mv": diligent, "colmap-text": colmap_text,
     "colmap-binary": colmap_binary, "detect": detected, "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
-    "results": results, "merl-networks": networks, "synthesize": synthesized,
+    "results": results, "config.json": settings, "merl-networks": networks, "synthesize": synthesized,
     "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
     "stl": mesh(".stl"), "glb": mesh(".glb"),
     "png": picture("a.png", lambda path: photographs(path.parent, ["a.png"])),

@@ -229,7 +229,7 @@ def child_of(name: str, options: argparse.Namespace, keep: Path, count: mmap.mma
         os.dup2(output.fileno(), 2)
         faulthandler.enable()
         dr.set_thread_count(2)
-        foreign.subprocess, foreign.PATIENCE = Trials(), PATIENCE
+        foreign.subprocess, foreign.READ_SECONDS = Trials(), PATIENCE
         try:
             bench = Bench(name, keep, count)
             work(bench, options, left)

@@ -1,0 +1,210 @@
+"""Calibration as a fit refines it: the unknowns of cameras and lights with their values, and the light of the room.
+
+The paper refines calibration together with the shape (its Table 3). Room light that is the same from all sides has no
+axes of its own: it counts as fixed in the world. Room light fixed in the camera looks like a flash elsewhere, or like
+another reflectance. It is refined only if the scene has some.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mi_ring.calibration.camera_response import CameraResponse
+from mi_ring.calibration.light_tensors import LightTensors
+from mi_ring.calibration.rig import Estimate, Rig, Views
+from mi_ring.calibration.room_light import RoomLight
+from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
+from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera, undistortion_factor
+from mi_ring.rendering import bridge, prediction
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.assembly import with_lamps
+from mi_ring.scene.lights import shared_emitters
+from mi_ring.system.machine import device
+
+#: All options of `--refine` with values in a calibration, in order.
+OPTIONS = [*dict.fromkeys(unknown.option for unknown in UNKNOWNS.values())]
+OPTIONS.insert(OPTIONS.index("lamps"), "ambient")
+ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light begins
+
+
+class Calibration(nn.Module):
+    """The values of the unknowns, each in units of its prior's standard deviation: 0 where the capture is right."""
+
+    def __init__(
+        self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
+    ) -> None:
+        """`refined`: options of `--refine`. `frames`: axes in which the room's light is fixed.
+
+        Raises InputError if `falloff` is refined without a flash that moves with the camera.
+        """
+        super().__init__()
+        self.refined, self.rig = tuple(refined), rig
+        self.unknowns: dict[str, Unknown] = {n: u for n, u in UNKNOWNS.items() if u.option in refined}
+        if "falloff" in refined and rig.flash is None:
+            raise InputError(f"{rig.path}: emitter: the lights do not move with the cameras, but --refine falloff "
+                             "is for a flash that does; leave it out")  # fmt: skip
+        self.bent = bool(rig.views.distortion.any()) or "distortion" in refined  #: Is there any lens distortion?
+        self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
+        for name, unknown in self.unknowns.items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
+        given = capture.room
+        room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
+        alone = capture.photographs.dark and not shared_emitters(capture.scene)
+        self.room = RoomLight(room, rig.exposure, frames, alone)
+
+    def value(self, name: str) -> Tensor:
+        """An unknown in its own unit; 0 if it is not refined."""
+        return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
+
+    def estimate(self) -> Estimate:
+        """Cameras, lights and response with the current values."""
+        now = self.rig.estimate()
+        for name, unknown in self.unknowns.items():
+            now = unknown.apply(now, self.value(name), self.rig)
+        return now
+
+    def forward(self, scale: int = 1) -> Views:
+        """Cameras and lights with the current values, for photographs `scale` times smaller."""
+        views = self.rig.views_of(self.estimate(), self.bent)
+        return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
+
+    def lamps(self) -> LightTensors:
+        """The scene's own lamps with the current values."""
+        return self.rig.lamps_of(self.estimate())
+
+    def lamp_tensors(self) -> list[Tensor]:
+        """Places and strengths of the lamps for the renderer; empty if they are not refined."""
+        if "lamps" not in self.refined:
+            return []
+        now = self.lamps()
+        return [now.places.to(device()), now.strengths.to(device())]
+
+    def solves_room(self, progress: float) -> bool:
+        """Is the room's light solved for at this progress? From the start if there is no other light."""
+        return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
+
+    @torch.no_grad()
+    def relight(self, surface: Surface) -> None:
+        """Light a surface by the scene's lamps with their current values."""
+        if lamps := self.lamp_tensors():
+            surface.relight(*map(bridge.to_drjit, lamps))
+
+    @property
+    def albedo_factor(self) -> float:
+        """Factor of the albedo that keeps directly lit surfaces as bright as they are, whatever `scale` is."""
+        return math.exp(-float(self.value("scale").detach()))
+
+    @property
+    def power_factor(self) -> float:
+        """Factor of all lights' strengths that was found."""
+        return self.rig.power / self.albedo_factor
+
+    def indirect(self, light: Tensor) -> Tensor:
+        """Interreflection (n, H, W, 3), attached to `scale`.
+
+        Stronger lights mean a darker surface. Each further bounce loses one factor of the albedo.
+        """
+        scale = self.value("scale").to(light)
+        return light * (scale.detach() - scale).exp()
+
+    def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """(N, H, W, 1) cosines between the optical axis and the rays of photographs, `scale` times smaller."""
+        width, height = (size // scale for size in self.rig.sizes[index[0]])
+        views = self(scale)
+        fx, fy, cx, cy = (views.intrinsics[index].detach().T)[..., None, None]
+        x = (torch.arange(width) + 0.5 - cx) / fx
+        y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
+        distance2 = x**2 + y**2
+        if self.bent:
+            distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
+        return (1 + distance2)[..., None] ** -0.5
+
+    def response(self) -> CameraResponse:
+        """The camera response with the current values."""
+        return self.estimate().response
+
+    def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """`CameraResponse.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
+        response = self.response()
+        return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
+
+    @torch.no_grad()
+    def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """The inverse of `recorded`, without gradients."""
+        response = self.response()
+        return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
+
+    def refined_photographs(self, photographs: Photographs, views: Sequence[Tensor]) -> Photographs:
+        """Photographs with these cameras and lights, and the current room light; without gradients."""
+        room = self.room_harmonics().double().numpy(force=True)
+        return replace(prediction.calibrated(photographs, views), room=room if room.any() else None)
+
+    def room_harmonics(self) -> Tensor:
+        """(BASIS, 3) current harmonics of the room light; if only the scene says them, `scale` applies to them."""
+        harmonics = self.room.harmonics
+        return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
+
+    @torch.no_grad()
+    def room_share(self, harmonics: Tensor) -> Tensor:
+        """(3,) the room's mean irradiance relative to the flash's on a surface that faces it.
+
+        Without a flash: the room's mean radiance.
+        """
+        now = self()
+        distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
+        mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
+        own = (now.strengths / distance2).median(0).values
+        return mean / own if bool((own > 0).all()) else mean / math.pi
+
+    def prior(self) -> Tensor:
+        """Half the sum of squares of all unknowns, in standard deviations, divided by the number of photographs."""
+        return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
+
+    def shared_parameters(self) -> list[list[Tensor]]:
+        """Parameters of unknowns that several photographs share, grouped by option."""
+        groups: dict[str, list[Tensor]] = {}
+        for name, unknown in self.unknowns.items():
+            if unknown.per != "photograph":
+                groups.setdefault(unknown.option, []).append(getattr(self, name))
+        return list(groups.values())
+
+    def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
+        """Of each unknown of an option: its tensor, to be changed in place, and its value as the capture says."""
+        if option == "ambient":
+            return [(self.room.harmonics, self.room.given)]
+        own = [getattr(self, name) for name, unknown in self.unknowns.items() if unknown.option == option]
+        return [(tensor, torch.zeros_like(tensor)) for tensor in own]
+
+    @torch.no_grad()
+    def applied(self, capture: Capture) -> Capture:
+        """The capture with the current cameras, lights and response."""
+        estimate = self.estimate()
+        views, lamps = self.rig.views_of(estimate, self.bent), self.rig.lamps_of(estimate)
+        gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
+        gains = np.ones((len(self.rig), 3))
+        if "gain" in self.refined:
+            gains = centred(self.value("gain"), self.rig).double().exp().numpy()
+        # The curve keeps the exposure here, and full scale in a scene file.
+        level = self.rig.exposure ** ((1 - gamma) / gamma)
+        lights = LightTensors(views.places, self.rig.finite, level * views.strengths.double()).lights()
+        poses, intrinsics, _, _, falloff, distortion = (part.double().numpy() for part in views)
+        shots = []
+        for k, shot in enumerate(capture.shots):
+            pose, lens = np.vstack([poses[k], [0, 0, 0, 1]]), intrinsics[k]
+            camera = Camera(pose, lens[:2], lens[2:], shot.size, float(distortion[k]))
+            response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
+            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]), response=response))
+        scene, room = capture.scene, None
+        if "lamps" in self.refined:
+            scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())
+        if "ambient" in self.refined or capture.room is not None:
+            room = self.room_harmonics().double().numpy(force=True) * level
+        return replace(capture, scene=scene, shots=tuple(shots), room=room)

@@ -1,0 +1,89 @@
+"""The camera response as a fit refines it: what lens, gain and tone curve make of radiance."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.images import contrasted
+
+BLACK = 1e-6  #: radiance, in units of the file's full scale, below which an S curve is a straight line
+DARKEST = 1e-4  #: radiance, in units of the exposure, below which the power curve is a straight line
+
+
+class CameraResponse(NamedTuple):
+    """The response of all photographs: vignetting, gains, and one tone curve. None: as the capture says."""
+
+    exponent: Tensor | None  #: logarithm of the curve's exponent: the decoded value is radiance to this power
+    contrast: Tensor | None  #: logarithm of the steepness of the curve's S
+    vignetting: Tensor | None  #: exponent of the cosine about the optical axis, added to the known one
+    gammas: Tensor  #: (P,) exponents that the capture knows
+    known_vignetting: Tensor  #: (P,) exponents of vignetting that the capture knows
+    exposure: float  #: radiance that the exponent keeps as it is: the object's mean
+    gains: Tensor  #: (P, 3) gains that the capture knows
+    gain: Tensor | None = None  #: (P, 3) factors of these gains
+
+    @property
+    def has_vignetting(self) -> bool:
+        """Is any vignetting known or unknown? Then `recorded` and `linear` need the cosines of the pixels."""
+        return self.vignetting is not None or bool(self.known_vignetting.any())
+
+    def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
+        """The decoded photographs of this radiance (N, ..., 3): decoded by what the capture knows of the response.
+
+        `index` (N,): which photographs. `cosines` (N, ..., 1): of the pixels' rays, needed with vignetting.
+        """
+        known, unknown = self.factors(radiance, index, cosines)
+        return self.with_curve(radiance * known * unknown, self.gammas[index]) / known
+
+    @torch.no_grad()
+    def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
+        """Radiance of decoded photographs (N, ..., 3), the inverse of `recorded`; without gradients."""
+        known, unknown = self.factors(recorded, index, cosines)
+        return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
+
+    def factors(
+        self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
+    ) -> tuple[Tensor | float, Tensor | float]:
+        """Factors (N, ..., 3) of lens and gain: known from the capture, and found by the fit."""
+        ones = [1] * (like.ndim - 2)
+
+        def by_photograph(values: Tensor) -> Tensor:
+            return values[index].to(like).view(-1, *ones, values.shape[1])
+
+        known: Tensor | float = by_photograph(self.gains) if (self.gains != 1).any() else 1.0
+        unknown: Tensor | float = 1.0 if self.gain is None else by_photograph(self.gain)
+        if cosines is not None:
+            cosines = cosines.to(like)
+            known = known * cosines ** by_photograph(self.known_vignetting[:, None])
+            unknown = unknown if self.vignetting is None else unknown * cosines ** self.vignetting.to(like)
+        return known, unknown
+
+    def with_curve(self, radiance: Tensor, gammas: Tensor) -> Tensor:
+        """Radiance (N, ...) after the tone curve; `gammas` (N,): the exponents that the capture knows."""
+        if self.exponent is not None:
+            relative = radiance / self.exposure
+            radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
+        return radiance if self.contrast is None else with_contrast(radiance, self.contrast.exp(), gammas)
+
+    @torch.no_grad()
+    def without_curve(self, recorded: Tensor, gammas: Tensor) -> Tensor:
+        """The inverse of `with_curve`."""
+        if self.contrast is not None:
+            recorded = with_contrast(recorded, (-self.contrast).exp(), gammas)
+        if self.exponent is None:
+            return recorded
+        relative, gamma = recorded / self.exposure, float(self.exponent.exp())
+        return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
+
+
+def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
+    """Values (N, ...), decoded by the capture with `gammas` (N,), after an S curve of this steepness.
+
+    Two S curves in a row are one, whose steepness is the product. So the capture's own contrast is not needed.
+    """
+    gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
+    lit = values.clamp(min=BLACK)  # below it the curve is a straight line
+    return contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas) * (values / lit)

@@ -1,0 +1,102 @@
+"""The light of the room as an unknown: spherical harmonics, solved by linear least squares during a fit."""
+
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mi_ring.rendering.global_illumination import GlobalIllumination
+from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER, harmonics_up_to
+
+MEMORY = 0.95  #: factor per iteration of earlier normal equations, which belong to an earlier surface
+RIDGE = 0.01  #: ridge toward the values of the capture, relative to the mean diagonal of the normal equations
+DIM = 0.3  #: radiance, in units of the exposure, that is added to the scale of errors: dark pixels count less
+ROBUST = 0.2  #: relative error above which an error counts linearly
+OBJECT = 0.99  #: coverage of pixels that are compared, at least
+COMPARED_WIDTH = 64  #: largest width of the pictures that are compared [px]
+BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photographs tell hardly more
+FINE = 0.3  #: progress from which the only light has its full order
+
+
+class RoomLight(nn.Module):
+    """The harmonics of `mi_ring.rendering.spherical_harmonics`, and the normal equations that determine them."""
+
+    which: list[int]  #: numbers of the harmonics that may be non-zero
+    given: Tensor  #: (BASIS, 3) from the capture
+    harmonics: Tensor  #: (BASIS, 3) as found
+    matrix: Tensor  #: (3, BASIS, BASIS) of the normal equations, one for each colour
+    vector: Tensor  #: (3, BASIS) right sides of the normal equations
+
+    def __init__(self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",), alone: bool = False) -> None:
+        """`exposure`: mean radiance of the object. `frames`: axes whose harmonics are unknown; others stay as given.
+
+        Harmonics of world and camera together could replace a flash elsewhere and another reflectance. `alone`: there
+        is no other light. Then its order is higher, once the shape is no longer coarse.
+        """
+        super().__init__()
+        self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
+        free = harmonics_up_to(MAX_ORDER if alone else BESIDE_FLASH, frames)
+        self.which = sorted({*free, *given.abs().sum(1).nonzero()[:, 0].tolist()})
+        self.register_buffer("given", given, persistent=False)
+        self.register_buffer("harmonics", given.clone())
+        self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
+        self.register_buffer("vector", torch.zeros(3, BASIS))
+
+    def forget(self) -> None:
+        """Reset the normal equations and keep the harmonics."""
+        self.matrix.zero_()
+        self.vector.zero_()
+
+    @torch.no_grad()
+    def solve(
+        self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
+        total: Callable[[Tensor], Tensor] = lambda equations: equations,
+    ) -> None:  # fmt: skip
+        """Add photographs to the normal equations and solve them.
+
+        `observed`, `predicted` (N, H, W, 3): linear radiance, predicted with the current room light as if nothing
+        occluded it. `counted` (N, H, W) bool: pixels that show the object. `progress`: of the fit, in [0, 1]. `total`:
+        sums tensors over all processes.
+        """
+
+        def pooled(pictures: Tensor, factor: int) -> Tensor:
+            means = F.avg_pool2d(pictures.movedim(-1, 1), factor, ceil_mode=True, count_include_pad=False)
+            return means.movedim(1, -1)
+
+        # Few paths per pixel are noisy, and noise would make the room darker.
+        coarser = max(1, max(around.alpha.shape[1:]) // COMPARED_WIDTH)
+        alpha = pooled(around.alpha[..., None], coarser)[..., 0]
+        height, width = alpha.shape[1:]
+
+        def small(pictures: Tensor) -> Tensor:
+            return pooled(pictures, around.factor * coarser)[:, :height, :width]
+
+        inside = torch.minimum(small(counted.float()[..., None])[..., 0], alpha) > OBJECT
+        missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
+        which, now = around.harmonics, self.harmonics[around.harmonics]
+        basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.transfer])  # (which, n, 3)
+        lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
+        missing = missing + pooled(lit, coarser)[inside]
+        scale = light + DIM * self.exposure
+        left = missing - torch.einsum("jnc,jc->nc", basis, now)
+        weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
+        matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
+        vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
+        equations = total(torch.cat([matrix, vector[..., None]], -1))
+        if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
+            return
+        self.matrix *= MEMORY
+        self.vector *= MEMORY
+        self.matrix[:, torch.tensor(which)[:, None], which] += equations[..., :-1]
+        self.vector[:, which] += equations[..., -1]
+        told = self.matrix.diagonal(dim1=1, dim2=2)[:, which].mean(1)
+        ridge = RIDGE * told[:, None, None] * torch.eye(BASIS).to(self.matrix)
+        if bool((ridge.amax((1, 2)) > 0).all()):
+            free = harmonics_up_to(MAX_ORDER if self.alone and progress >= FINE else BESIDE_FLASH, self.frames)
+            right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
+            more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
+            self.harmonics = self.given.clone()
+            self.harmonics[free] += more.T
+            # A room with negative mean radiance is impossible: another part of the model is too bright then.
+            self.harmonics[:, self.harmonics[0] < 0] = 0.0

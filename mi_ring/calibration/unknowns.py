@@ -1,0 +1,322 @@
+"""The unknowns of calibration: cameras, lenses, lights and the camera's response. One class for each unknown.
+
+A new unknown is a class here with an entry in `UNKNOWNS`. Its parameters count in standard deviations of its prior, so
+that 0 is what the capture says.
+
+Some unknowns cannot be told apart from photographs; only the priors decide between them. Brightness of lights and
+albedo: the logarithms of `power` and `gain` have mean zero in each colour, and `scale` changes the albedo, too. The
+place, rotation and scale of the whole scene. Focal length and distance. The cone of a flash and vignetting, almost, if
+the flash is beside the lens.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.calibration.rig import Estimate, LightTensors, Rig
+from mi_ring.capture.capture import Capture
+from mi_ring.geometry.rotations import rotations
+
+VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
+
+
+class Found(NamedTuple):
+    """What a fit has found, to be described."""
+
+    rig: Rig
+    before: Capture  #: as the capture says
+    after: Capture  #: as found
+    power: float  #: factor of all lights' strengths that was found
+    lamps: LightTensors  #: the scene's own lamps as found
+    several: bool  #: Are the photographs' lights the first of several unknown lamps?
+
+
+@dataclass(frozen=True)
+class Unknown(ABC):
+    """An unknown of calibration, `components` numbers for each photograph, lens, light or lamp."""
+
+    name: str
+    option: str  #: of `--refine`
+    width: float  #: standard deviation of the prior, in the unknown's own unit
+    per: Literal["capture", "photograph", "lens", "light", "lamp"]
+    components: int = 1
+    own_lights: bool = False  #: Is it a property of the photographs' own lights?
+
+    #: What it changes in a picture. view: how things are seen and lit; recording: only how that is recorded; light: the
+    #: photograph's own light by a factor of each colour; gain: the same of all that is recorded; indirect: only that.
+    changes: ClassVar[Literal["view", "recording", "light", "gain", "indirect"]] = "view"
+
+    def shape(self, rig: Rig) -> tuple[int, ...]:
+        """Shape of its parameter."""
+        several = () if self.per == "capture" else (rig.count(self.per),)
+        return several + (self.components,) * (self.components > 1)
+
+    def width_for(self, rig: Rig) -> float:
+        """Standard deviation of its prior for the photographs of this rig."""
+        return self.width
+
+    def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
+        """Rows of the parameter on which photographs `index` depend, each (n,)."""
+        if self.per == "lamp":  # all lamps light all photographs
+            return [np.full_like(index, k) for k in range(rig.count("lamp"))]
+        numbers = {"lens": rig.lens, "light": rig.place}
+        if self.per in numbers:
+            return [numbers[self.per][index].numpy()]
+        return [index if self.per == "photograph" else np.zeros_like(index)]
+
+    @abstractmethod
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        """The estimate with this unknown at `value`, in its own unit."""
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
+        """For people: what it is, its value before and after the fit, and the standard deviation. None: nothing."""
+        return None
+
+    def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
+        """For people, of one photograph: a key of calibration.json, its value and the standard deviation."""
+        return None
+
+
+class Turn(Unknown):
+    """Rotation of each camera about its own axes [rad]."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        turned = rig.views.cameras[:, :, :3] @ rotations(value)
+        return replace(now, cameras=torch.cat([turned, now.cameras[:, :, 3:]], 2))
+
+    def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
+        angle, spread = (float(np.degrees(1.0) * np.linalg.norm(part)) for part in (value, std))
+        return "turned_degrees", angle, spread
+
+
+class Move(Unknown):
+    """Motion of each camera along its own axes [rig's distance]."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        along = rig.views.cameras[:, :, :3] @ (value * rig.distance)[..., None]
+        moved = rig.views.cameras[:, :, 3:] + along
+        return replace(now, cameras=torch.cat([now.cameras[:, :, :3], moved], 2))
+
+    def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
+        way, spread = (float(rig.distance * np.linalg.norm(part)) for part in (value, std))
+        return "moved", way, spread
+
+
+class Focal(Unknown):
+    """Logarithm of a factor of each lens's focal length."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        focal = now.intrinsics[:, :2] * value.exp()[rig.lens, None]
+        return replace(now, intrinsics=torch.cat([focal, now.intrinsics[:, 2:]], 1))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = (np.array([camera.focal.mean() for camera in cameras]) for cameras in lens_cameras(found))
+        return "focal length [px]", before, after, after * std
+
+
+class Principal(Unknown):
+    """Shift of each lens's principal point [focal lengths]."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        shift = value[rig.lens] * now.intrinsics[:, :2]
+        return replace(now, intrinsics=torch.cat([now.intrinsics[:, :2], now.intrinsics[:, 2:] + shift], 1))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = lens_cameras(found)
+        focal = np.stack([camera.focal for camera in after])
+        return "principal point [px]", *([camera.centre for camera in side] for side in (before, after)), focal * std
+
+
+class Distortion(Unknown):
+    """First radial distortion of each lens, added to the known one."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, distortion=now.distortion + value[rig.lens])
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = ([camera.distortion for camera in cameras] for cameras in lens_cameras(found))
+        return "first radial distortion of the lens", before, after, std
+
+
+class LightPlace(Unknown):
+    """Offset of each light's place [rig's distance], of a distant light [rad]."""
+
+    def width_for(self, rig: Rig) -> float:
+        return self.width * (VAGUE if rig.guessed else 1.0)
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, offset=value)
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        rig = found.rig
+        if rig.flash is not None:
+            before, unit = rig.upright.numpy(), rig.distance * rig.free.numpy()
+            what = "place of the flash in the cameras' axes: to the left, up, ahead [scene units]"
+            return what, before, before + unit * value[0], unit * std[0]
+        first = np.unique(rig.place.numpy(), return_index=True)[1]
+        places = (side.photographs.lights.positions()[first] for side in (found.before, found.after))
+        units = np.where(rig.finite.numpy()[first], rig.distance, 1.0)
+        which = "place of the first lamp" if found.several else "places of the lights"
+        return f"{which} [scene units], directions to distant ones", *places, units * std
+
+
+class Exposure(Unknown):
+    """Logarithm of a factor of each photograph, by colour. Their mean over all photographs is 0."""
+
+    def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
+        factor = np.exp(value)
+        return self.name, factor.tolist(), (factor * std).tolist()
+
+
+class Power(Exposure):
+    """Logarithm of a factor of each photograph's light, by colour."""
+
+    changes = "light"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, log_power=now.log_power + centred(value, rig))
+
+
+class Falloff(Unknown):
+    """Exponent of the cosine about the flash's axis, added to the known one."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, falloff=now.falloff + value)
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = (np.mean([shot.falloff for shot in side.shots]) for side in (found.before, found.after))
+        return "exponent of the flash's cone", before, after, std
+
+
+class Vignetting(Unknown):
+    """Exponent of the cosine about the optical axis, added to the known one."""
+
+    changes = "recording"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, response=now.response._replace(vignetting=value))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = (
+            np.mean([shot.response.vignetting for shot in side.shots]) for side in (found.before, found.after)
+        )
+        return "exponent of the lens' vignetting", before, after, std
+
+
+class CurveExponent(Unknown):
+    """Logarithm of the exponent of the camera's tone curve."""
+
+    changes = "recording"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, response=now.response._replace(exponent=value))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = (np.mean([shot.response.gamma for shot in side.shots]) for side in (found.before, found.after))
+        return "exponent of the camera's curve", before, after, after * std
+
+
+class Contrast(Unknown):
+    """Logarithm of the steepness of the S in the camera's tone curve."""
+
+    changes = "recording"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, response=now.response._replace(contrast=value))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        before, after = (
+            np.mean([shot.response.contrast for shot in side.shots]) for side in (found.before, found.after)
+        )
+        return "contrast of the camera's curve", before, after, after * std
+
+
+class Gain(Exposure):
+    """Logarithm of a factor of what each photograph records, by colour. Its solver does without gradients."""
+
+    changes = "gain"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, response=now.response._replace(gain=centred(value, rig).detach().exp()))
+
+
+class Scale(Unknown):
+    """Logarithm of the power of all lights. The albedo changes with it, so only indirect light has its gradient."""
+
+    changes = "indirect"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        value = value.detach()
+        return replace(now, log_power=value + now.log_power, log_lamp_power=now.log_lamp_power + value)
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        return "power of all lights together", 1, found.power, found.power * std
+
+
+class LampPlace(LightPlace):
+    """Offset of each lamp of the scene, as `LightPlace`."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, lamp_offset=value)
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        lamps, which = found.rig.lamps, "the other lamps" if found.several else "the scene's lamps"
+        unit = np.where(lamps.finite, found.rig.distance, 1.0)
+        what = f"places of {which} [scene units], directions to distant ones"
+        return what, lamps.places, found.lamps.places, unit * std
+
+
+class LampPower(Unknown):
+    """Logarithm of a factor of the strength of each lamp of the scene, by colour."""
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, log_lamp_power=value + now.log_lamp_power)
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        what = "strengths of the scene's lamps: red, green, blue"
+        if found.several:
+            first = found.after.photographs.lights[0].rgb[0]
+            what = f"strengths of the other lamps: red, green, blue (of the first, by which all are, {first:.4g})"
+        after = found.lamps.strengths
+        return what, found.rig.lamps.strengths, after, after.numpy() * std
+
+
+#: All unknowns but the room's light, by name, in the order in which they are applied.
+UNKNOWNS: dict[str, Unknown] = {unknown.name: unknown for unknown in (
+    Turn("turn", "cameras", 0.01, "photograph", 3),
+    Move("move", "cameras", 0.005, "photograph", 3),
+    Focal("focal", "focal", 0.01, "lens"),
+    Principal("principal", "principal", 0.01, "lens", 2),
+    Distortion("distortion", "distortion", 0.05, "lens"),
+    LightPlace("light", "light", 0.1, "light", 3, own_lights=True),
+    Power("power", "power", 0.1, "photograph", 3, own_lights=True),
+    Falloff("falloff", "falloff", 1.0, "capture", own_lights=True),
+    Vignetting("vignetting", "vignetting", 1.0, "capture"),
+    CurveExponent("curve", "curve", 0.2, "capture"),
+    Contrast("contrast", "contrast", 0.2, "capture"),
+    Gain("gain", "gain", 0.1, "photograph", 3),
+    Scale("scale", "scale", 0.7, "capture", own_lights=True),
+    LampPlace("lamp", "lamps", 0.1, "lamp", 3),
+    LampPower("strength", "lamps", 0.5, "lamp", 3),
+)}  # fmt: skip
+
+#: Options about the photographs' own lights, which an unknown light replaces.
+OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lights}
+
+
+def centred(value: Tensor, rig: Rig) -> Tensor:
+    """(P, 3) logarithms of factors with mean 0 over the fitted photographs; 0 for photographs that are held out."""
+    result = torch.zeros_like(value)
+    result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
+    return result
+
+
+def lens_cameras(found: Found) -> Iterable[list]:
+    """Before and after the fit: of each lens the camera of its first photograph."""
+    first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
+    return ([side.shots[k].camera for k in first] for side in (found.before, found.after))

@@ -1,0 +1,198 @@
+"""Photographs in arrays: what is checked of them, and the files that they become."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mi_ring.capture.decoding import is_linear
+from mi_ring.capture.pixels import Pixels
+from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
+from mi_ring.errors import InputError
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import write_image
+from mi_ring.plugins.properties import LARGEST
+from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER
+from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Encoding, Files, Shot
+from mi_ring.system.files import writing
+
+FLATTEST = 8  #: longer side of a photograph by its shorter one
+NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]*")  #: of a photograph: its files are called so
+
+Item = TypeVar("Item")
+
+
+def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
+    """Photographs (H, W, 3). Raises InputError if there are none, or if one is no photograph."""
+    if encoding not in ("auto", "srgb", "linear"):
+        raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
+    found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
+    if not found:
+        raise InputError("images: is empty; give one array for each photograph")
+    return found
+
+
+def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
+    """Masks of these images, 255 inside. Raises InputError, which begins with `what`, if one is no mask."""
+    several = zip(one_each(masks, len(images), what), images)
+    return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
+
+
+def shots_of(
+    images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
+    names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
+) -> tuple[Shot, ...]:  # fmt: skip
+    """What `Capture.from_arrays` says of these photographs. Raises InputError, which names the argument."""
+    count = len(images)
+    full = float(numbers(saturation, (), "saturation"))
+    if not full > 0:
+        raise InputError(f"saturation: is {saturation}, must be above 0")
+    columns = names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
+    return tuple(
+        Shot(name, camera_of(camera, image, f"cameras[{k}]"), light_of(light, f"lights[{k}]"), encoding=encoding,
+             saturation=full, calibrated=calibrated)
+        for k, (name, image, camera, light) in enumerate(zip(*columns))
+    )  # fmt: skip
+
+
+def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
+    """One item for each photograph; None for all if there are no items. Raises InputError for another number."""
+    found: list[Item | None] = [None] * count if items is None else list(items)
+    if len(found) != count:
+        raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
+    return found
+
+
+def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
+    """A photograph (H, W, 3). Raises InputError, which begins with `what`, if it is none."""
+    array = np.asarray(image)
+    if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
+        raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
+                         "float32")  # fmt: skip
+    if FLATTEST * min(array.shape[:2]) < max(array.shape[:2]):
+        raise InputError(f"{what}: is {sides(array)} pixels; sides of more than {FLATTEST} : 1 cannot be made smaller")
+    if array.dtype == np.float32 and not (np.abs(array) <= LARGEST).all():
+        raise InputError(f"{what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
+    if array.dtype == np.uint8 and is_linear(encoding, array):
+        raise InputError(f"{what}: is uint8, which is sRGB, but encoding is linear; give uint16 or float32")
+    return array
+
+
+def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
+    """A mask (H, W) uint8 of an image, 255 inside. Raises InputError, which begins with `what`, if it is none."""
+    if mask is None:
+        return None
+    array = np.asarray(mask)
+    if array.dtype not in (np.uint8, bool) or array.shape != image.shape[:2]:
+        raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be {image.shape[:2]} of bool, or of "
+                         "uint8 from 0 to 255")  # fmt: skip
+    if array.dtype == np.uint8 and array.max() == 1:
+        raise InputError(f"{what}: has 1 inside; must be bool, or uint8 with 255 inside")
+    return array if array.dtype == np.uint8 else np.where(array, 255, 0).astype(np.uint8)
+
+
+def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
+    """The camera of an image, in float32. Raises InputError, which begins with `what`, if it is none."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
+    to_world, focal, centre, distortion = (
+        numbers(getattr(camera, name), shape, f"{what}: {name}")
+        for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()))
+    )
+    own = Camera(to_world, focal, centre, (image.shape[1], image.shape[0]), float(distortion))
+    if tuple(camera.size) != own.size:
+        raise InputError(f"{what}: size is {tuple(camera.size)}, (width, height); its image is {sides(image)}")
+    if not (own.focal > 0).all():
+        raise InputError(f"{what}: focal is {own.focal}; must be above 0 [px]")
+    if not np.allclose(own.to_world[3], [0, 0, 0, 1]):
+        raise InputError(f"{what}: to_world: its last row is {own.to_world[3]}, must be 0 0 0 1; is it transposed?")
+    if fault := own.fault():
+        raise InputError(f"{what}: {fault}")
+    return own
+
+
+def light_of(light: object, what: str) -> Light | None:
+    """A light, in float32. Raises InputError, which begins with `what`, if it is none."""
+    if light is None:
+        return None
+    if not isinstance(light, Light) or light.kind not in ("point", "directional"):
+        kind = f'of kind "{light.kind}"' if isinstance(light, Light) else type(light).__name__
+        raise InputError(f"{what}: is {kind}; must be a mi_ring.Light, point or directional, or None")
+    vector, rgb = (numbers(getattr(light, name), (3,), f"{what}: {name}").astype(float) for name in ("vector", "rgb"))
+    if light.kind == "directional" and not vector.any():
+        raise InputError(f"{what}: vector is 0; must be the direction in which the light travels")
+    return Light(light.kind, vector, rgb)
+
+
+def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Finite numbers of this shape, in float32. Raises InputError, which begins with `what`, for anything else."""
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: is {type(value).__name__}; must be numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{what}: is of shape {array.shape}; must be {shape}")
+    if not (np.abs(array) <= LARGEST).all():
+        raise InputError(f"{what}: must be finite, {LARGEST:g} at most")
+    return array.astype(np.float32)
+
+
+def names_of(names: Sequence[str] | None, count: int) -> list[str]:
+    """Names of photographs, by default 000, 001, …. Raises InputError for names that no files can have."""
+    if names is None:
+        return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
+    for k, name in enumerate(one_each(names, count, "names")):
+        if not isinstance(name, str) or not NAME.fullmatch(name) or name == "object":
+            raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix, not "object"')
+        if name in names[:k]:
+            raise InputError(f"names[{k}]: {name!r} occurs twice")
+    return list(names)
+
+
+def room_of(room: ArrayLike) -> np.ndarray:
+    """Harmonics (n, 3) of a room's light, in the world, as (BASIS, 3). Raises InputError for another number."""
+    array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
+    if array.ndim != 2 or array.shape[0] not in counts:
+        raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
+    found = numbers(array, (len(array), 3), "room").astype(float)
+    return np.concatenate([found, np.zeros((BASIS - len(found), 3))])
+
+
+def sides(image: np.ndarray) -> str:
+    """Width and height of an image (H, W, …)."""
+    return "{} x {}".format(*image.shape[1::-1])
+
+
+def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
+    """The files that a photograph gets beside its scene file, relative to that: float32 as EXR, all else as PNG."""
+    suffix = "exr" if image.dtype == np.float32 else "png"
+    mask, shown = (Path(folder, f"{shot.name}.png") if there else None
+                   for folder, there in (("masks", masked), ("valid", valid)))  # fmt: skip
+    return Files(Path("images", f"{shot.name}.{suffix}"), mask, shown)
+
+
+def scene_xml(
+    shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
+    room: ArrayLike | None,
+) -> bytes:  # fmt: skip
+    """The scene file of `Capture.from_arrays`, by these files. Raises InputError, which names the argument."""
+    middle = None if center is None else numbers(center, (3,), "center")
+    reach = None if radius is None else float(numbers(radius, (), "radius"))
+    if reach is not None and not reach > 0:
+        raise InputError(f"radius: is {radius}, must be above 0")
+    elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]
+    root = scene_element(elements, middle, reach)
+    root.extend([] if room is None else room_elements(room_of(room)))
+    return scene_bytes(root)
+
+
+def write_array(array: np.ndarray, file: Path) -> None:
+    """Write a photograph (H, W, 3) or a mask (H, W), and the folder of the file. Raises InputError if it cannot."""
+    with writing(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_image(array if array.ndim == 3 else array[..., None], file)

@@ -1,0 +1,91 @@
+"""Photographs as a fit sees them: linear radiance, clipped pixels, masks."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.capture.decoding import decode, is_linear, shade
+from mi_ring.images import box_filter
+from mi_ring.scene.shot import Shot
+
+#: Pixels of all photographs in an `ObservationCache`. A pixel takes up to 200 bytes: what is kept fragments the memory.
+REMEMBERED_PIXELS = 2**23
+
+
+class Observation(NamedTuple):
+    """Photographs as a fit sees them, n of one size."""
+
+    rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
+    clipped: Tensor  #: (n, H, W, 3) bool: the scene is at least this bright
+    mask: Tensor  #: (n, H, W) the object's coverage in [0, 1]; 0 where there is no mask
+    masked: Tensor  #: (n,) bool: which photographs have a mask
+    valid: Tensor | None  #: (n, H, W) bool: which pixels say something; the others are black and clipped. None: all do
+
+    def surely(self, coverage: Tensor) -> Tensor:
+        """(n, H, W) bool: pixels that are wholly object by their mask, if they have one, and by a `coverage`."""
+        mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
+        return torch.minimum(mask, coverage) > 0.99
+
+    def to(self, device: torch.device) -> "Observation":
+        """The same on a device."""
+        return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
+
+    @classmethod
+    def joined(cls, several: Sequence["Observation"]) -> "Observation":
+        """Several of photographs of one size as one."""
+        rgb, clipped, mask, masked, valid = zip(*several)
+        if all(v is None for v in valid):
+            return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), None)
+        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
+        return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), torch.cat(shown))
+
+
+def observed(
+    shot: Shot, image: np.ndarray, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
+) -> Observation:
+    """One photograph by its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
+
+    `mask`, `valid`: (H, W) uint8 as in its files, None where it has none.
+    """
+    curve = shot.response.gamma, shot.response.contrast
+    linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
+    linear = linear / shade(shot)
+    coverage = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
+    shown = None
+    if valid is not None:
+        here = valid > 127
+        linear = np.where(here[..., None], linear, 0)
+        clipped = clipped | ~here[..., None]  # nothing is known: the scene is at least this black
+        shown = box_filter(torch.from_numpy(here).float()[..., None], scale)[None, ..., 0] == 1
+    return Observation(
+        box_filter(torch.from_numpy(linear), scale)[None],
+        box_filter(torch.from_numpy(clipped).float(), scale)[None] > 0,
+        box_filter(torch.from_numpy(coverage).float()[..., None] / 255, scale)[None, ..., 0],
+        torch.tensor([mask is not None]),
+        shown,
+    )
+
+
+class ObservationCache:
+    """Observations of single photographs, each at its last scale, as many as there is room for; none at scale 1."""
+
+    def __init__(self) -> None:
+        self.kept: dict[int, tuple[int, Observation]] = {}  # (scale, photograph) by index
+        self.pixels = 0  # of all that are kept
+
+    def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
+        """Photograph `k` at a scale; `observe` is called if it is not kept."""
+        if k in self.kept:
+            before, result = self.kept[k]
+            if before == scale:
+                return result
+            self.pixels -= self.kept.pop(k)[1].mask.numel()
+        result = observe()
+        pixels = result.mask.numel()
+        if scale > 1 and self.pixels + pixels <= REMEMBERED_PIXELS:
+            self.kept[k] = scale, result
+            self.pixels += pixels
+        return result

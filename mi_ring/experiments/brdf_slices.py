@@ -1,0 +1,41 @@
+"""Slices of BRDFs for light and camera in the same direction, as Mitsuba evaluates them."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_ring.synthesis.materials import pattern_of
+from mi_ring.synthesis.options import SynthesizeConfig
+
+ANGLES = np.radians(np.arange(0, 76, 5))  #: between the normal and the common direction of light and camera
+
+
+def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
+    """A `cooktorrance` of V materials, as a texture of V pixels in a row. `material`: arrays (V, 3) or (V,) by name."""
+    texture = {"type": "bitmap", "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    return mi.load_dict({"type": "cooktorrance", **{
+        name: texture | {"bitmap": mi.Bitmap(np.ascontiguousarray(value.reshape(1, len(value), -1), np.float32))}
+        for name, value in material.items()
+    }})  # fmt: skip
+
+
+def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
+    """BRDFs (count, angles, 3) [1/sr] at the `ANGLES`, of the `count` materials of `bsdf_of`, or of one material."""
+    angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
+    si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.wi = mi.Vector3f(mi.Float(np.sin(angle)), 0, mi.Float(np.cos(angle)))
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, si.wi)).reshape(3, count, len(ANGLES))
+    return np.moveaxis(value, 0, -1) / np.cos(ANGLES)[:, None]
+
+
+def is_second_material(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(P,) bool: where the true object with these bounds (2, 3) has the second material at points (P, 3) near it."""
+    edge = 1e-4 * (bounds[1] - bounds[0])  # outside the bounds the pattern would repeat
+    inside = np.clip(points, bounds[0] + edge, bounds[1] - edge)
+    pattern = pattern_of(config.pattern, np.concatenate([bounds, inside]), config.bands, "xyz".index(config.up), "")
+    black, white = (mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": v}}) for v in (0.0, 1.0))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(points))
+    si.uv, si.wi = mi.Point2f(*map(mi.Float, pattern.uv[2:].T)), mi.Vector3f(0, 0, 1)
+    return np.array(pattern.blend(black, white).eval(mi.BSDFContext(), si, si.wi))[0] > 0.5 / np.pi

@@ -1,0 +1,222 @@
+"""Datasets of experiments: captures with ground truth, given by the user, path traced, converted or derived."""
+
+import json
+import shutil
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import move_names, recalibrated_xml, scene_bytes
+from mi_ring.collection.jobs import modified
+from mi_ring.errors import InputError, require_file
+from mi_ring.foreign import reading
+from mi_ring.importers.conversion import write_scene
+from mi_ring.importers.diligent_mv import DiligentMV
+from mi_ring.synthesis.degradation import miscalibrated
+from mi_ring.synthesis.example_pot import VIEWS, pot, write_example
+from mi_ring.synthesis.options import SynthesizeConfig, require_options
+from mi_ring.synthesis.path_traced_capture import SETTINGS, claim, write_capture
+from mi_ring.system.command import scene_name
+from mi_ring.system.files import locked, read_json, whole_folder, write_file
+
+POT2 = Path(__file__).parents[2] / "scenes" / "pot2.xml"  #: in a checkout of the repository
+ORIGIN = "made_of.json"  #: in the folder of a capture: what it was made from
+WANTED = "the folder of a capture with scene.xml and truth/mesh.ply, or its scene file"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A capture with ground truth. Subclasses are written when they are first needed."""
+
+    name: str
+    scene: Path  #: scene file
+    truth: Path  #: folder with mesh.ply and, perhaps, scene.xml of novel views
+
+    def prepare(self) -> None:
+        """Write what is missing or outdated, one process at a time. Raises InputError if that is impossible."""
+        require_file(self.scene, WANTED)
+
+    @property
+    def truth_files(self) -> list[Path]:
+        """The files that a fit is compared with. Some may be missing."""
+        return [self.truth / "mesh.ply", self.truth / "scene.xml"]
+
+    @property
+    def photographs(self) -> int:
+        """Number of photographs. Raises InputError if the scene file is no XML."""
+        with reading(self.scene, "XML"):
+            return len(ElementTree.parse(self.scene).getroot().findall("sensor"))
+
+
+def given(path: Path) -> Dataset:
+    """The user's capture, by its folder or scene file. Raises InputError if scene file or truth are missing."""
+    scene = path / "scene.xml" if path.is_dir() else path
+    require_file(scene, WANTED)
+    folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
+    for folder in folders:
+        if (folder / "mesh.ply").is_file():
+            return Dataset(scene_name(scene), scene, folder)
+    raise InputError(f"{scene}: has no truth, neither {folders[0]}/mesh.ply nor {folders[1]}/mesh.ply; an experiment "
+                     "compares with it, and mi-ring synthesize writes it")  # fmt: skip
+
+
+def default_dataset(captures: Path) -> Dataset:
+    """The dataset that needs no other data: pot2 in a checkout of the repository, else the example's pot."""
+    return given(POT2) if POT2.is_file() else ExamplePot.of(captures / "example")
+
+
+Cached = TypeVar("Cached", bound="CachedDataset")
+
+
+@dataclass(frozen=True)
+class CachedDataset(Dataset):
+    """A dataset in a folder of its own. It is written again when what it is made from has changed."""
+
+    @classmethod
+    def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
+        """The dataset in a folder. `fields`: those of the subclass."""
+        return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
+
+    def prepare(self) -> None:
+        folder = self.scene.parent
+        with locked(folder, wait=True):
+            origin = self.origin()
+            if not self.scene.is_file() or read_json(folder / ORIGIN) != origin:
+                with whole_folder(folder) as growing:
+                    self.write(growing)
+                    write_file(growing / ORIGIN, json.dumps(origin))
+                    shutil.rmtree(folder, ignore_errors=True)  # outdated, or its scene file is missing
+
+    def origin(self) -> dict[str, Any]:
+        """What it is made from, as values of JSON."""
+        raise NotImplementedError
+
+    def write(self, folder: Path) -> None:
+        """Write it into an empty folder, which is then renamed to `self.scene.parent`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class ExamplePot(CachedDataset):
+    """The small capture of `mi-ring example`."""
+
+    photographs = VIEWS
+
+    def origin(self) -> dict[str, Any]:
+        return {"views": VIEWS}
+
+    def write(self, folder: Path) -> None:
+        write_example(folder)
+
+
+@dataclass(frozen=True)
+class Synthetic(Dataset):
+    """A capture of `mi-ring synthesize`."""
+
+    config: SynthesizeConfig
+    of_pot: bool  #: of the example's pot, whose mesh is written, too
+
+    @property
+    def photographs(self) -> int:
+        return self.config.views
+
+    def prepare(self) -> None:
+        config = self.config
+        with locked(config.out, wait=True):
+            require_options(config)
+            if self.of_pot and not config.mesh.is_file():
+                config.mesh.parent.mkdir(parents=True, exist_ok=True)
+                write_file(config.mesh, pot().ply())
+            try:
+                claim(config.out, config)
+            except InputError:  # the folder is named after the settings, so the content of a file has changed
+                if not (config.out / SETTINGS).is_file():
+                    raise
+                shutil.rmtree(config.out)
+            if not self.scene.is_file():  # it is written last
+                write_capture(config)
+
+
+@dataclass(frozen=True)
+class Derived(CachedDataset):
+    """The photographs and the truth of another dataset, with a scene file of its own."""
+
+    source: Dataset
+
+    @classmethod
+    def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
+        return cls(folder.name, folder / "scene.xml", fields[0].truth, *fields)
+
+    def prepare(self) -> None:
+        self.source.prepare()
+        super().prepare()
+
+    def origin(self) -> dict[str, Any]:
+        own = {key: value for key, value in vars(self).items() if key not in ("name", "scene", "truth", "source")}
+        scene = self.source.scene
+        return {"scene": str(scene.resolve()), "written": modified(scene), **own}
+
+    def write(self, folder: Path) -> None:
+        root = ElementTree.parse(self.source.scene).getroot()
+        move_names(root, self.source.scene.parent, self.scene.parent)
+        write_file(folder / "scene.xml", self.changed(root))
+
+    def changed(self, root: ElementTree.Element) -> bytes:
+        """Its scene file, from the source's XML with adjusted file names."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Subset(Derived):
+    """Some of the photographs, evenly from the first to the last."""
+
+    count: int
+
+    def changed(self, root: ElementTree.Element) -> bytes:
+        sensors = root.findall("sensor")
+        kept = {round(k) for k in np.linspace(0, len(sensors) - 1, min(self.count, len(sensors)))}
+        for k, sensor in enumerate(sensors):
+            if k not in kept:
+                root.remove(sensor)
+        return scene_bytes(root)
+
+
+@dataclass(frozen=True)
+class PerturbedCameras(Derived):
+    """A capture with wrong cameras, by `mi_ring.synthesis.degradation.miscalibrated`, not marked as calibrated."""
+
+    degrees: float  #: standard deviation of the rotations, and per cent of the distance
+    seed: int
+
+    def changed(self, root: ElementTree.Element) -> bytes:
+        capture = load_capture(self.source.scene, images=False)
+        center, _ = capture.sphere()
+        wrong = miscalibrated(capture.shots, center, np.random.default_rng(self.seed), turned=self.degrees)
+        for shot in root.findall("sensor"):
+            for flag in shot.findall("boolean[@name='calibrated']"):
+                shot.remove(flag)
+        return recalibrated_xml(ElementTree.tostring(root), wrong, capture.room)
+
+
+@dataclass(frozen=True)
+class DiligentObject(CachedDataset):
+    """An object of DiLiGenT-MV, converted."""
+
+    source: Path  #: its folder in DiLiGenT-MV
+    fill_holes: bool = False  #: in its masks
+
+    def origin(self) -> dict[str, Any]:
+        truth = DiligentMV(self.source, self.scene).truth
+        if truth is None:
+            raise InputError(f"{self.source}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
+        files = [truth, self.source / "Calib_Results.mat"]
+        files += [file for kind in ("*.png", "light_*.txt") for file in self.source.glob(f"view_*/{kind}")]
+        return {"folder": str(self.source.resolve()), "fill_holes": self.fill_holes,
+                "written": {file.relative_to(self.source).as_posix(): modified(file) for file in files}}  # fmt: skip
+
+    def write(self, folder: Path) -> None:
+        write_scene(DiligentMV(self.source, folder / "scene.xml", fill_holes=self.fill_holes))

@@ -1,0 +1,82 @@
+"""The datasets that the arguments DATA and --materials of `mi-ring paper` select."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mi_ring.errors import InputError
+from mi_ring.experiments.datasets import Dataset, Synthetic, default_dataset, given
+from mi_ring.experiments.experiment import ExperimentOptions
+from mi_ring.synthesis.materials import COLOURS, load_material
+from mi_ring.synthesis.options import SynthesizeConfig
+
+MESHES = ".ply", ".obj", ".glb", ".stl", ".off"
+#: Options of path-traced captures. Full: 50 photographs of 512² px, as in the paper. Fast fits use no more than 256².
+SIZES: dict[str, dict[str, Any]] = {
+    "full": {},
+    "quick": {"views": 16, "novel": 4, "size": (128, 128), "spp": 16},
+    "fast": {"views": 32, "novel": 8, "size": (256, 256), "spp": 16},
+}
+
+
+def datasets(options: ExperimentOptions) -> list[Dataset]:
+    """The captures and meshes of DATA, by default one that is at hand. Meshes are path traced, materials in turn."""
+    meshes = [path for path in options.data if path.suffix.lower() in MESHES]
+    if options.materials and not meshes:
+        raise InputError("--materials: are what meshes are made of; give meshes as DATA")
+    if len(options.materials) > max(1, len(meshes)):
+        raise InputError(f"--materials: are {len(options.materials)} for {len(meshes)} meshes; give one each, or "
+                         "fewer, which are taken in turn")  # fmt: skip
+    found: list[Dataset] = []
+    for path in options.data:
+        if path.is_file() and path.suffix.lower() not in (".xml", *MESHES):
+            raise InputError(f"{path}: DATA: is neither a scene file, .xml, nor a mesh, {', '.join(MESHES)}; give one "
+                             "of these")  # fmt: skip
+        if path in meshes:
+            material = options.materials[meshes.index(path) % len(options.materials)] if options.materials else None
+            found.append(path_traced(options, path, material))
+        else:
+            found.append(given(path))
+    return found or [default_dataset(options.captures)]
+
+
+def path_traced(
+    options: ExperimentOptions, mesh: Path | None, material: str | None, name: str = "", **more: Any
+) -> Synthetic:
+    """A mesh, or the example's pot, photographed as in the paper. `more`: other options of `mi-ring synthesize`."""
+    settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
+    config = SynthesizeConfig(Path(), Path(), material, **settings)
+    name = name or (mesh.stem if mesh else "pot")
+    key = repr((config, mesh and mesh.resolve())).encode()  # two meshes or materials may have the same name
+    folder = options.captures / f"{name}-{hashlib.blake2b(key, digest_size=3).hexdigest()}"
+    config = replace(config, mesh=(mesh or options.captures / "pot.ply").resolve(), out=folder)
+    return Synthetic(name, folder / "scene.xml", folder / "truth", config, mesh is None)
+
+
+def require_no_materials(options: ExperimentOptions) -> None:
+    """Raise InputError if --materials is given to an experiment that has no use for it."""
+    if options.materials:
+        raise InputError("--materials: are what meshes are made of, and this experiment takes none; leave them out")
+
+
+def one_mesh(options: ExperimentOptions) -> Path | None:
+    """The only mesh of DATA, or None. Raises InputError for other DATA and for textured materials."""
+    for material in options.materials:
+        load_material(material, "--materials", coloured=True)
+        text = Path(material).read_text(errors="replace") if material.lower().endswith(".xml") else material
+        if "<texture" in text or f"={COLOURS}" in text:
+            raise InputError(f"--materials: {material}: varies over the surface, and slices are of one BRDF; give one "
+                             "that is the same everywhere")  # fmt: skip
+    if len(options.data) > 1 or any(path.suffix.lower() not in MESHES for path in options.data):
+        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
+    return options.data[0] if options.data else None
+
+
+def short_name(material: str) -> str:
+    """A name of a material that can be part of a file name."""
+    if ".npz:" in material:
+        return material.rpartition(":")[2]
+    words = material.split()
+    values = [word.replace("roughness=", "r") for word in words[1:] if word.startswith("roughness=")]
+    return "-".join([Path(words[0]).stem, *values])

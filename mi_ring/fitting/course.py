@@ -1,0 +1,32 @@
+"""The course of a fit: what has happened so far."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.mask_refinement import Masks
+from mi_ring.fitting.regulariser_strength import RegulariserStrength
+
+LOG_EVERY = 5  #: iterations between entries of the log
+
+
+@dataclass
+class Course:
+    """How far a fit is, and what it has found on the way besides its model."""
+
+    iteration: int = 0  #: number of iterations that are done
+    seconds: float = 0.0  #: time of these iterations, and of coarse fits before them
+    log: list[dict[str, Any]] = field(default_factory=list)  #: entries of every fifth iteration and of the last
+    masks: Masks = field(default_factory=dict)  #: masks that were found anew
+    validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
+
+    def record(self, it: Iteration, learning_rate: float, regulariser: RegulariserStrength, last: bool) -> None:
+        """Add an entry to the log if it is due. Terms of the loss are unweighted."""
+        if it.number % LOG_EVERY and not last:
+            return
+        self.log.append({
+            "iteration": it.number, "seconds": round(self.seconds, 3), "loss": it.loss, **it.terms,
+            "weights": it.weights, "learning_rate": learning_rate,
+            "stage": it.context.schedule.stages.index(it.stage) + 1, "vertices": len(it.batch.points),
+            "crossing": regulariser.crossing, "unexplained": regulariser.unexplained,
+        })  # fmt: skip

@@ -1,0 +1,50 @@
+"""The model of a fit: the fitted object and the calibration, all that is learned."""
+
+import math
+
+from torch import nn
+
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.rig import Rig
+from mi_ring.capture.capture import Capture
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import initial_power, refined_of
+from mi_ring.geometry.domain import Sphere
+from mi_ring.objects.fitted_object import FittedObject
+
+
+class Model(nn.Module):
+    """A fitted object, `ring`, and the `calibration` of the photographs, None if nothing of it is refined."""
+
+    calibration: Calibration | None
+
+    def __init__(self, problem: Problem, ring: FittedObject) -> None:
+        super().__init__()
+        self.ring = ring
+        center = ring.center.cpu().numpy()
+        self.albedo = problem.albedo(center)  #: of the object, according to the lights' intensities
+        self.calibration = None
+        lighting, config = problem.lighting, problem.config
+        if refined := refined_of(problem.seen, config, lighting.kind, self.albedo):
+            power, ahead = initial_power(refined, self.albedo), "light" in config.refine
+            rig = Rig(problem.capture, center, problem.exposure, problem.fitted, power, bool(lighting.lamps), ahead,
+                      lamps="lamps" in refined)  # fmt: skip
+            self.calibration = Calibration(problem.capture, refined, rig, problem.room_frames)
+            self.calibration.room.to(problem.device)
+        self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
+        self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
+
+    def fix_surface(self, fixed: bool) -> None:
+        """Whether the surface stays as it is. Parameters that were frozen from the start stay frozen."""
+        for parameter in self.to_freeze:
+            parameter.requires_grad_(not fixed)
+
+    def update_albedo(self) -> None:
+        """Scale the material's brightness by what the fit has found of the power of all lights."""
+        if self.calibration and "scale" in self.calibration.refined:
+            net, initial = self.ring.brdf_net, self.albedo / self.calibration.rig.power / math.pi
+            net.set_parameters(net.bsdf_parameters, initial * self.calibration.albedo_factor)
+
+    def calibrated(self, capture: Capture) -> Capture:
+        """The capture with the current cameras, lights and response."""
+        return self.calibration.applied(capture) if self.calibration else capture

@@ -1,0 +1,141 @@
+"""The optimisation: Muon for hidden weights, Adam for the rest, and one guarded step of all."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.muon import Muon
+from mi_ring.fitting.nan_guard import NanGuard
+from mi_ring.fitting.pose_solver import PoseSolver
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import START
+from mi_ring.fitting.room_solver import RoomSolver
+from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
+from mi_ring.fitting.terms import Term
+from mi_ring.system.machine import has_fast_bfloat16
+
+CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
+CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped, lest it diverges
+
+
+def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
+    """Muon for the hidden weight matrices and Adam for everything else, or Adam for all.
+
+    Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear layers.
+    """
+    lists = [getattr(part, "hidden", None) for part in networks.modules()]
+    hidden: list[Any] = [
+        layer.weight
+        for layers in lists
+        if isinstance(layers, nn.ModuleList)
+        for layer in layers
+        if isinstance(layer, nn.Linear)
+    ]
+    hidden = hidden if config.optimizer == "muon" else []
+    rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
+    adam = torch.optim.Adam(rest, lr=config.learning_rate)
+    result = [Stepper(adam, [Rate(config.learning_rate, config.decay)])]
+    if hidden:
+        fast = config.precision != "float32" and has_fast_bfloat16(device)
+        muon = Muon(hidden, lr=config.muon_rate, dtype=torch.bfloat16 if fast else torch.float32)
+        result.append(Stepper(muon, [Rate(config.muon_rate, config.decay)]))
+    return result
+
+
+def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
+    """Adam for the unknowns that several photographs share; those of single photographs have solvers."""
+    groups = calibration.shared_parameters()
+    if not groups:
+        return []
+    adam = torch.optim.Adam([{"params": group} for group in groups], lr=CALIBRATION_RATE)
+    return [Stepper(adam, [Rate(CALIBRATION_RATE, config.decay, START)] * len(groups))]
+
+
+class Optimisation:
+    """All optimisers of a model with their learning rates, solvers of calibration, and the guard against NaN."""
+
+    def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
+        """`terms`: of the loss."""
+        self.problem, self.model = problem, model
+        self.steppers = network_steppers(model.ring, problem.config, problem.device)
+        self.solvers: list[RoomSolver | ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
+        if calibration := model.calibration:
+            self.solvers.append(RoomSolver(calibration))
+            self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
+            if "cameras" in calibration.refined:
+                self.solvers.append(PoseSolver(calibration, model.starts_near, terms))
+            self.steppers += calibration_steppers(calibration, problem.config)
+            self.steppers += [s.stepper() for s in self.solvers if isinstance(s, torch.optim.Optimizer)]
+        self.optimizers = [stepper.optimizer for stepper in self.steppers]
+        self.guard = NanGuard(model, self.optimizers)
+
+    def step(self, loss: Tensor, it: Iteration) -> None:
+        """Backpropagate the loss of an iteration and step all optimisers; no step if anything is not finite.
+
+        Nothing happens if no term applies, for instance masks alone and photographs without masks. Raises InputError
+        if the fit diverges.
+        """
+        for solver in self.solvers:
+            solver.look(it)
+        if not it.terms:
+            return
+        self.backward(loss, it)
+        clip = torch.nn.utils.clip_grad_norm_
+        ring, calibration = self.model.ring, self.model.calibration
+        norm = clip(ring.shape_net.parameters(), CLIPPED) + clip(ring.brdf_net.parameters(), torch.inf)
+        others = [p.grad for p in calibration.parameters() if p.grad is not None] if calibration else []
+        # The renderer may lose a NaN on the way back, so the loss is checked, too.
+        healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
+        for optimizer, rates in self.steppers:
+            for group, rate in zip(optimizer.param_groups, rates):
+                group["lr"] = learning_rate(rate, it.progress) * self.guard.factor
+            if healthy:
+                optimizer.step()
+        if not self.guard.note(healthy):
+            option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
+            path = self.problem.capture.path
+            raise InputError(f"{path}: diverged at iteration {it.number - 1}; try a lower {option}")
+        self.model.update_albedo()
+
+    def settle(self, schedule: Schedule, iteration: int) -> None:
+        """Fix the surface during the settling stage, and forget the room's light at its beginning."""
+        fixed = schedule.surface_fixed(iteration)
+        self.model.fix_surface(fixed)
+        if fixed and iteration == schedule.shaping and self.model.calibration:
+            self.model.calibration.room.forget()
+            self.guard.keep()  # so that a retreat does not bring it back
+
+    def backward(self, loss: Tensor, it: Iteration) -> None:
+        """Gradients of the loss, summed over all processes."""
+        processes = self.problem.processes
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
+        if processes.count > 1:
+            loss = loss + 0 * it.prediction.vertices.sum()  # so that each process takes part in the backward pass
+        if loss.requires_grad:
+            with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit has one state per thread
+                loss.backward()
+        processes.sum_gradients([p for o in self.optimizers for group in o.param_groups for p in group["params"]])
+
+    @property
+    def learning_rate(self) -> float:
+        """The current learning rate of the first optimiser, Adam's for the networks."""
+        return self.optimizers[0].param_groups[0]["lr"]
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"optimizers": [o.state_dict() for o in self.optimizers], "guard": self.guard.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`. The model must have been restored before."""
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
+        self.guard = NanGuard(self.model, self.optimizers, state["guard"])

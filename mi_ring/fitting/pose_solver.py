@@ -1,0 +1,149 @@
+"""Solves for the poses of cameras by Gauss-Newton, from how a picture moves with its camera.
+
+An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps, which do not depend on
+the size of an error, move right cameras away or arrive too late. The gradient is that of the loss; this module computes
+the curvature to divide it by. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews,
+IJCV 2004), with the surface in place of a template.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.errors import InputError
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.losses import colour_error, perceived
+from mi_ring.fitting.schedule import Rate, Stepper
+from mi_ring.fitting.terms import Term, default_terms
+from mi_ring.images import blur
+
+#: Damping: shares of the diagonal, and of its largest entry, that are added to the diagonal. The latter slows down
+#: directions that pictures hardly determine, for instance rotation about the axis of a round object.
+DAMPING, FLOOR = 0.1, 0.01
+LONGEST = 3.0  #: longest step [standard deviations]
+INITIAL, DECAY = 1.0, 0.5  #: factor of the steps: it decreases to average over iterations
+LEAST = 1e-9  #: least curvature: what no photograph determines stays
+NEAR, FAR = 0.2, 0.4  #: progress at which they begin, for a start near the object and far from it
+
+
+def slopes(picture: Tensor) -> Tensor:
+    """Central differences of a picture (H, W, C) to the right and down: (H, W, C, 2)."""
+    padded = F.pad(picture.movedim(-1, 0), (1, 1, 1, 1), mode="replicate")
+    right = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
+    down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
+    return torch.stack([right, down], -1).movedim(0, 2) / 2
+
+
+def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
+    """How far the pixels of a sphere move with the camera: (H, W, 2, 6) [px], right and down.
+
+    For a turn [rad] about each axis of the camera and a step [scene units] along each, Mitsuba's axes. `intrinsics`
+    (4,) fx, fy, cx, cy [px], of a pinhole: distortion changes little of it; `size` (width, height); `center` (3,) of
+    the sphere, in the camera's axes, of which a camera inside it sees a smaller one. Where a ray misses it, the depth
+    is that of the point next to it.
+    """
+    width, height = size
+    fx, fy, cx, cy = intrinsics
+    radius = min(radius, 0.9 * float(center.norm()))
+    x = (cx - torch.arange(width) - 0.5) / fx
+    y = (cy - torch.arange(height) - 0.5)[:, None] / fy
+    x, y = torch.broadcast_tensors(x, y)
+    rays = torch.stack([x, y, torch.ones_like(x)], -1)
+    along, length2 = rays @ center, rays.square().sum(-1)
+    inside = (along**2 - length2 * (center.square().sum() - radius**2)).clamp(min=0)
+    nearness = length2 / (along - inside.sqrt())
+    no, one = torch.zeros_like(x), torch.ones_like(x)
+    # A point z (x, y, 1) of the camera's axes moves by −ω × z (x, y, 1) − t; here divided by z.
+    right, up, forward = (
+        torch.stack([no, -one, y, -nearness, no, no], -1),
+        torch.stack([one, no, -x, no, -nearness, no], -1),
+        torch.stack([-y, x, no, no, no, -nearness], -1),
+    )
+    return torch.stack([-fx * (right - x[..., None] * forward), -fy * (up - y[..., None] * forward)], -2)
+
+
+class PoseSolver(torch.optim.Optimizer):
+    """Gauss-Newton steps of `turn` and `move` of a calibration: `look` at an iteration, then `step`."""
+
+    def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
+        """`near`: the fit starts near the object. `terms`: of the loss.
+
+        Raises InputError if `rgb` or `mask` is not the default term: the curvature is that of the default ones.
+        """
+        for name in "rgb", "mask":
+            if terms.get(name, default_terms[name]) is not default_terms[name]:
+                raise InputError(f"terms: {name}: must be the default one for --refine cameras, which has to know how "
+                                 "it changes with them; give yours another name")  # fmt: skip
+        super().__init__([{"params": [calibration.turn, calibration.move]}], {"lr": INITIAL})
+        self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
+        self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
+
+    def stepper(self) -> Stepper:
+        """With its rate."""
+        return Stepper(self, [self.rate])
+
+    def look(self, it: Iteration) -> None:
+        """Remember the photographs of an iteration and the curvature of its loss."""
+        begun = it.progress >= self.rate.start
+        self.seen = (torch.from_numpy(it.batch.all_photographs), it.batch.gathered(curvature(it))) if begun else None
+
+    @torch.no_grad()
+    def step(self) -> None:  # type: ignore[override]
+        """One step along the gradients that the parameters have; none before refinement begins."""
+        (group,) = self.param_groups
+        turn, move = group["params"]
+        if self.seen is None or turn.grad is None:
+            return
+        index, matrix = self.seen
+        gradient = torch.cat([turn.grad[index], move.grad[index]], 1)
+        own = matrix.diagonal(dim1=1, dim2=2)
+        damped = matrix + torch.diag_embed(DAMPING * own + FLOOR * own.amax(1, keepdim=True))
+        step = torch.linalg.solve(damped, gradient)
+        step *= group["lr"] * (LONGEST / step.norm(dim=1, keepdim=True)).clamp(max=1)
+        turn[index] -= step[:, :3]
+        move[index] -= step[:, 3:]
+
+
+@torch.no_grad()
+def curvature(it: Iteration) -> Tensor:
+    """Second derivatives (n, 6, 6) of the loss of an iteration by `turn` and `move` of its photographs.
+
+    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. Absolute differences count as
+    squares of the same slope (iteratively reweighted least squares); those below the mean count as the mean.
+    """
+    context, seen, prediction = it.context, it.observation, it.prediction
+    calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape
+    assert calibration is not None
+    rig, kind, counted = calibration.rig, context.config.loss, it.counted()
+    error = colour_error(prediction.rgb, seen.rgb, seen.clipped, context.exposure, kind, counted).abs()
+    if kind == "l2":
+        weight = 2 * torch.ones_like(error)
+    else:
+        covered = error[prediction.coverage > 0.5]
+        total, count = it.batch.total(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
+        mean = (total / count).nan_to_num(1.0).clamp(min=1e-6)
+        weight = 1 / error.maximum(mean)
+    weight *= ~seen.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
+    if counted is not None:
+        weight *= counted[..., None]
+    weight *= it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * weight[0].numel())
+    colours = perceived(prediction.rgb, context.exposure, kind)
+    silhouettes = blur(prediction.coverage, it.outline_blur())
+    masked = max(1.0, float(it.batch.total(seen.masked.sum())))
+    mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * height * width)
+
+    at, radius = calibration(it.batch.scale), float(context.model.ring.radius)
+    unit = torch.tensor([calibration.widths["turn"]] * 3 + [rig.distance * calibration.widths["move"]] * 3)
+    prior = it.weights.get("calibration", 0.0) / len(rig)
+    result = torch.eye(6).repeat(n, 1, 1) * max(prior, LEAST)
+    for i, k in enumerate(it.batch.photographs):
+        center = at.cameras[k, :, :3].T @ (rig.center - at.cameras[k, :, 3])
+        moving = motion(at.intrinsics[k], (width, height), center, radius) * unit
+        colour, outline = slopes(colours[i]), slopes(silhouettes[i, ..., None])
+        structure = torch.einsum("hwc,hwca,hwcb->hwab", weight[i], colour, colour)
+        structure = structure + mask_weight * seen.masked[i] * torch.einsum("hwca,hwcb->hwab", outline, outline)
+        result[i] += torch.einsum("hwaj,hwab,hwbk->jk", moving, structure.cpu(), moving)
+    return result

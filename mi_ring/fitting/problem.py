@@ -1,0 +1,68 @@
+"""The problem that a fit solves: photographs as they are lit, and settings. Fixed from the first iteration on."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+import torch
+
+from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.lighting import Lighting, frames, lit, smoothed
+from mi_ring.fitting.processes import Processes, current
+from mi_ring.system.machine import device
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A capture with the lights that a fit assumes, and the settings of the fit."""
+
+    given: Capture  #: the capture as it was handed in
+    capture: Capture  #: lit by `lighting`
+    seen: Capture  #: of it the photographs that are fitted
+    scene: mi.Scene  #: to render, without an environment that is among the room's harmonics
+    config: Config
+    lighting: Lighting
+    environment: np.ndarray | None  #: (BASIS, 3) harmonics of the scene's own environment, if it was made one
+    fitted: np.ndarray  #: indices of the photographs that are fitted
+    held_out: np.ndarray  #: indices of the others
+    exposure: float  #: mean radiance of the object in the fitted photographs
+    processes: Processes
+    device: torch.device
+
+    @classmethod
+    def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
+        """Raises InputError if no photographs are left to fit, or if the object is black in them."""
+        held_out = held_out_photographs(capture, config.holdout)
+        fitted = np.setdiff1d(np.arange(len(capture)), held_out)
+        as_lit, scene, environment = smoothed(lit(capture, lighting))
+        seen = as_lit.part(fitted) if len(held_out) else as_lit
+        return cls(capture, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
+                   current(), device())  # fmt: skip
+
+    @property
+    def room_frames(self) -> Collection[str]:
+        """Axes in which unknown room light is fixed: "world", "camera"."""
+        return frames(self.capture, self.lighting)
+
+    def albedo(self, center: np.ndarray) -> float:
+        """Albedo of an object at `center` (3,) according to the lights' intensities; above 1 they cannot be true."""
+        return math.pi * self.seen.reflectance(center, self.exposure)
+
+
+def held_out_photographs(capture: Capture, every: int) -> np.ndarray:
+    """Indices of one photograph in `every`, starting in the middle of the first `every`; none if that is 0.
+
+    Raises InputError if no photograph or all photographs would be held out.
+    """
+    several = len(capture)
+    found = np.arange(several)[every // 2 :: every] if every else np.arange(0)
+    if every and several < 2:
+        raise InputError(f"{capture.path}: --holdout: there is one photograph alone; leave it out")
+    if every and not 0 < len(found) < several:
+        raise InputError(f"{capture.path}: --holdout: is {every}, which keeps {len(found)} of {several} photographs "
+                         f"out; give 2 to {2 * several - 1}")  # fmt: skip
+    return found

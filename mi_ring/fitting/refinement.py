@@ -1,0 +1,41 @@
+"""Which unknowns of calibration a fit refines, and when."""
+
+from collections.abc import Sequence
+
+from mi_ring.calibration.calibration import OPTIONS
+from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.fitting.config import Config
+from mi_ring.scene.assembly import has_table, lamps_of
+from mi_ring.scene.lights import shared_emitters
+
+#: What `--refine auto` stands for; `scale` is added where the lights' intensities cannot be true. Of a flash it refines
+#: the place beside the lens: a flash farther ahead looks like a darker surface. Not `curve`: it looks like another
+#: reflectance, too (docs: phone captures).
+AUTO = "light", "power", "ambient"
+#: What is refined under each kind of unknown light.
+UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
+START = 0.2  #: progress of the fit at which refinement begins
+
+
+def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
+    """The options of `--refine` that a fit refines; `auto` depends on what the capture says about itself.
+
+    `light`: kind of the `Lighting`. `albedo`: the object's, according to the lights' intensities.
+    """
+    names: set[str] = set(config.refine)
+    auto = "auto" in names and not capture.known
+    unknown = UNDER_UNKNOWN_LIGHT.get(light)
+    if unknown or capture.photographs.dark:
+        names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
+        names |= {"gain"} if auto and "power" not in names else set()
+    elif auto:
+        subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
+        names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
+        if config.indirect and albedo >= 1 and not has_table(capture.scene):
+            names.add("scale")
+    return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
+
+
+def initial_power(refined: Sequence[str], albedo: float) -> float:
+    """Initial factor of all lights' strengths: 1, or what turns an impossible albedo into a usual one for `scale`."""
+    return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0

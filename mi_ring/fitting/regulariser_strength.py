@@ -1,0 +1,60 @@
+"""Strength of the regulariser: it weakens during a fit, but not while something is wrong with the surface."""
+
+import math
+from typing import Any
+
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.scene.self_intersections import crossing_triangles
+
+CROSSING = 1e-3  #: share of self-intersecting triangles above which the regulariser gets stronger
+CROSSING_EVERY = 20  #: iterations between counts of them
+STRONGEST = -0.3  #: smallest value of `weakened`
+RETREAT, CATCH_UP = 2.0, 3.0  #: how fast `weakened` falls then and rises later; progress rises with 1
+RECENT = 0.1  #: weight of an iteration in the running mean of `unexplained`
+LATE = 0.6  #: progress after which self-intersections mean that the regulariser is too weak
+UNEXPLAINED = 0.2  #: share of unexplained light at which the regulariser has full strength; exact captures end at 0.07
+
+
+class RegulariserStrength:
+    """Decides from the last iterations how far the regulariser may weaken."""
+
+    def __init__(self) -> None:
+        self.crossing: float = 0.0  #: share of self-intersecting triangles at the last count
+        self.weakened: float = 0.0  #: how far the regulariser has weakened: progress, unless held back
+        self.held: bool = False  #: Did the surface intersect itself late?
+        self.unexplained: float = 1.0  #: running mean of `Iteration.unexplained`
+
+    def note(self, it: Iteration) -> None:
+        """Update after an iteration.
+
+        Where photographs disagree with the model, a weak regulariser lets the surface fold. So it gets stronger while
+        the surface intersects itself. Early intersections of growing limbs are normal, and the regulariser catches up
+        afterwards. After late ones it does not.
+        """
+        step = 1 / it.context.schedule.shaping
+        if it.number % CROSSING_EVERY == 0:
+            vertices = it.prediction.vertices.detach().cpu().numpy()
+            self.crossing = float(crossing_triangles(vertices, it.batch.faces).mean())
+            self.held |= self.crossing > CROSSING and it.progress > LATE
+        if self.crossing > CROSSING:
+            self.weakened = max(STRONGEST, self.weakened - RETREAT * step)
+        else:
+            self.weakened = min(it.number * step, self.weakened + (1.0 if self.held else CATCH_UP) * step)
+        unexplained = it.unexplained()
+        if math.isfinite(unexplained):
+            self.unexplained += RECENT * (unexplained - self.unexplained)
+
+    def strength(self, decay: float) -> float:
+        """A factor of the regulariser's weight, which falls to `decay`. It is 1 while much light is unexplained.
+
+        What no surface explains (wrong lights, a room that is not dark), a weak regulariser would explain by folds.
+        """
+        return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return dict(vars(self))
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`."""
+        vars(self).update(state)

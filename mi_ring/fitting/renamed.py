@@ -1,0 +1,34 @@
+"""Attributes that were renamed. The old names raise and tell the new ones; the next version drops this module."""
+
+from typing import Any, ClassVar
+
+FIT = {
+    "given": "problem.given", "config": "problem.config", "processes": "problem.processes",
+    "held_out": "problem.held_out", "fitted": "problem.fitted", "exposure": "problem.exposure",
+    "lighting": "problem.lighting", "environment": "problem.environment", "device": "problem.device",
+    "calibration": "model.calibration", "albedo": "model.albedo", "surface": "renderer.surface",
+    "averages": "renderer.average", "stages": "schedule.stages", "terms": "loss.terms", "log": "course.log",
+    "seconds": "course.seconds", "outlines": "course.masks", "confirmed": "course.validation",
+    "restraint": "regulariser", "caution": "optimisation.guard", "optimizers": "optimisation.optimizers",
+    "rounds": "sampler", "random": "sampler.random", "summary": "result().calibration",
+}  # fmt: skip
+ITERATION = {
+    "fit": "context", "s": "batch.points", "faces": "batch.faces", "index": "batch.photographs",
+    "everything": "batch.all_photographs", "scale": "batch.scale", "share": "batch", "photographs": "prediction.views",
+    "vertices": "prediction.vertices", "material": "prediction.material", "predicted": "prediction.rgb",
+    "coverage": "prediction.coverage", "observed": "observation.rgb", "clipped": "observation.clipped",
+    "mask": "observation.mask", "masked": "observation.masked", "valid": "observation.valid",
+    "surely": "object_pixels",
+}  # fmt: skip
+
+
+class Renamed:
+    """A class whose old attributes raise AttributeError with the new names."""
+
+    RENAMED: ClassVar[dict[str, str]]
+
+    def __getattr__(self, name: str) -> Any:
+        kind = type(self)
+        if name in kind.RENAMED:
+            raise AttributeError(f"{kind.__name__}.{name} is now {kind.__name__}.{kind.RENAMED[name]}")
+        raise AttributeError(f"{kind.__name__} has no attribute {name}")

@@ -1,0 +1,120 @@
+"""The renderer of a fit: from a model and a batch to predicted photographs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.capture.capture import Capture
+from mi_ring.fitting.indirect_average import IndirectAverage
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.sampler import Batch
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.rendering import prediction
+from mi_ring.rendering.global_illumination import GlobalIllumination
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
+from mi_ring.system.machine import autocast
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model predicts for a batch: V vertices, n photographs of H × W pixels. Attached until `detached`."""
+
+    vertices: Tensor  #: (V, 3) [scene units]
+    material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
+    rgb: Tensor  #: (n, H, W, 3) radiance as the camera records it, decoded like the photographs
+    coverage: Tensor  #: (n, H, W) of the object, in [0, 1]
+    views: Photographs  #: cameras and lights of these photographs, as refined so far
+    other_light: (
+        GlobalIllumination | None
+    )  #: interreflection and room light in small pictures, where they were rendered
+    without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
+
+    def detached(self) -> "Prediction":
+        """The same without the graph, which uses memory."""
+        return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
+                       material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
+
+
+class Renderer:
+    """Renders a scene with the fitted object in it."""
+
+    def __init__(self, problem: Problem, ring: FittedObject) -> None:
+        self.surface = Surface(problem.scene, problem.capture.shape, ring)
+        self.autocast: Callable[[], Any] = autocast(problem.config.precision, problem.device)
+        self.average = IndirectAverage()
+
+    def showing(self, model: Model, level: int) -> Surface:
+        """The surface of a model at this level of the icosphere, under its lamps, to be drawn without gradients."""
+        self.surface.show(model.ring, *model.ring.domain.sample(level))
+        if model.calibration:
+            model.calibration.relight(self.surface)
+        return self.surface
+
+    def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
+        """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
+        photograph = capture.photograph(k, -(-capture.shots[k].size[0] // width))
+        rgb, _ = prediction.draw(self.showing(model, level), photograph, spp, shadows=capture.shadows,
+                                 indirect=model.ring.indirect)  # fmt: skip
+        return rgb[0].numpy()
+
+    def predict(self, problem: Problem, model: Model, batch: Batch) -> Prediction:
+        """Evaluate the networks at the batch's points and render its photographs (paper, section 3)."""
+        config, calibration = problem.config, model.calibration
+        vertices, material = self.deform(problem, model.ring, batch)
+        self.surface.set_faces(batch.faces)
+        views = problem.capture.photographs.select(batch.photographs, batch.size, batch.scale)
+        views = replace(views, before=batch.share.part.start)
+        refined = [t.to(problem.device) for t in calibration(batch.scale)] if calibration else []
+        if calibration:
+            views = calibration.refined_photographs(views, refined)
+        linear, coverage = prediction.render(
+            self.surface, views, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
+            shadows=config.shadows and problem.capture.shadows, calibration=refined,
+            lamps=calibration.lamp_tensors() if calibration else [],
+        )  # fmt: skip
+        other = self.other_light(problem, model, batch, views, coverage)
+        if other and model.ring.indirect:
+            bounced = other.interreflection
+            linear = linear + (calibration.indirect(bounced) if calibration else bounced)
+        without_room = linear.detach()
+        if other and views.harmonics:
+            linear = linear + other.occlusion(torch.from_numpy(views.room).to(linear))
+        rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
+        return Prediction(vertices, material, rgb, coverage, views, other, without_room)
+
+    def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Vertices (V, 3) and material (V, …) at the batch's points. Several processes share the evaluation."""
+        points = problem.processes.share(len(batch.points))
+        with self.autocast():
+            vertices, material = ring(batch.points[points.part])
+        vertices, *parameters = points.concatenated([vertices, *material.values()])
+        return vertices, problem.lighting.material_at(batch.progress, dict(zip(material, parameters)))
+
+    def other_light(
+        self, problem: Problem, model: Model, batch: Batch, views: Photographs, coverage: Tensor
+    ) -> GlobalIllumination | None:
+        """Interreflection and room light in the photographs; None if neither is part of the prediction."""
+        calibration = model.calibration
+        solving = calibration is not None and calibration.solves_room(batch.progress)
+        harmonics = calibration.room.which if calibration and solving else views.harmonics
+        if not (model.ring.indirect or harmonics):
+            return None
+        other = GlobalIllumination.of(self.surface, views, coverage, batch.seeds["indirect"], harmonics=harmonics,
+                                    indirect=model.ring.indirect)  # fmt: skip
+        if model.ring.indirect and self.surface.table is not None:
+            other = self.average.add(other, batch.all_photographs, batch.gathered, batch.share.part)
+        return other
+
+    def state(self) -> dict[int, tuple[int, Tensor]]:
+        """For a checkpoint."""
+        return self.average.pictures
+
+    def restore(self, state: dict[int, tuple[int, Tensor]]) -> None:
+        """Continue from `state()`."""
+        self.average.pictures = state

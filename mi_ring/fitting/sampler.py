@@ -1,0 +1,106 @@
+"""The sampler: what an iteration draws at random, as one `Batch`."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.capture.capture import Capture, Observation
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.processes import Share
+from mi_ring.fitting.schedule import Schedule, Stage
+from mi_ring.geometry.domain import Domain
+
+SEEDED = "renderer", "indirect", "regulariser"  #: get a seed in each batch
+PURPOSES = "photographs", "rotations", *SEEDED  #: of random generators
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What an iteration has drawn: domain points, photographs and random seeds.
+
+    V points; n photographs of this process, of N that all processes together render.
+    """
+
+    number: int  #: of the iteration, from 1
+    progress: float  #: share of the shaping iterations before it, in [0, 1]; 1: the surface is fixed
+    stage: Stage
+    points: Tensor  #: (V, 3) domain points
+    faces: np.ndarray  #: (F, 3)
+    photographs: np.ndarray  #: (n,) indices
+    all_photographs: np.ndarray  #: (N,) indices
+    size: tuple[int, int]  #: of these photographs' files (width, height) [px]
+    scale: int  #: photographs are compared this many times smaller
+    seeds: dict[str, int]  #: of the renderer, of its indirect light, and of the regulariser
+    share: Share  #: of this process
+
+    @property
+    def weight(self) -> float:
+        """Weight of this process's mean over photographs in the mean over all."""
+        return self.share.weight
+
+    def total(self, tensor: Tensor) -> Tensor:
+        """The sum over all photographs, from the sum over those of this process. Without gradients."""
+        return self.share.sum(tensor)
+
+    def gathered(self, tensor: Tensor) -> Tensor:
+        """(N, …) for all photographs, from (n, …) for those of this process. Without gradients."""
+        return self.share.gathered(tensor)
+
+
+class Sampler:
+    """Draws batches. Photographs come in random order, all of one size before one of them comes again.
+
+    Each purpose has a random generator of its own: what is switched off changes nothing else that is drawn.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        first = torch.Generator().manual_seed(problem.config.seed)
+        seeds = torch.randint(2**62, (len(PURPOSES),), generator=first).tolist()
+        self.random = {name: torch.Generator().manual_seed(seed) for name, seed in zip(PURPOSES, seeds)}
+        capture = problem.capture
+        self.sizes = [capture.shots[k].size for k in problem.fitted]
+        self.alike = {size: np.intersect1d(index, problem.fitted) for size, index in capture.sizes.items()}
+        #: by size (width, height): photographs that have not come yet in this round
+        self.waiting: dict[tuple[int, int], list[int]] = {}
+
+    def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
+        """The batch of an iteration, counted from 0."""
+        stage = schedule.stage(iteration)
+        points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
+        everyone, size = self.draw_photographs(problem.config.batch)
+        seeds = {name: int(torch.randint(2**31, (), generator=self.random[name])) for name in SEEDED}
+        share = problem.processes.share(len(everyone))
+        return Batch(iteration + 1, schedule.progress(iteration), stage, points.to(problem.device), faces,
+                     everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
+
+    def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
+        """Indices of the next `count` photographs, or of all of one size if there are fewer, and that size."""
+        random = self.random["photographs"]
+        size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
+        alike, waiting = self.alike[size], self.waiting.get(size, [])
+        count = min(count, len(alike))
+        if len(waiting) < count:  # those that are left come last in the next round
+            order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
+            waiting = waiting + [k for k in order if k not in waiting] + waiting
+        self.waiting[size] = waiting[count:]
+        return np.array(waiting[:count]), size
+
+    def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
+        """The photographs of a batch. Raises InputError in all processes if one cannot read its files."""
+        seen = problem.processes.agreed(lambda: capture.observe(batch.photographs, batch.scale))
+        return seen.to(problem.device)
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`. Raises ValueError if it has photographs that are not fitted here."""
+        if not {k for some in state["waiting"].values() for k in some} <= {k for a in self.alike.values() for k in a}:
+            raise ValueError("photographs that are not fitted")
+        for name, random in self.random.items():
+            random.set_state(state["random"][name])
+        self.waiting = state["waiting"]

@@ -1,0 +1,89 @@
+"""Interreflection and the light of the room in pictures of a surface: rendered small, then added to the large ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mi_ring.images import blur
+from mi_ring.rendering.bridge import evaluated
+from mi_ring.rendering.indirect_light import BOUNCES, render_indirect
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
+
+SMALL_WIDTH, PATHS = 32, 16  #: of the small pictures: width [px], and paths per pixel
+TABLE_WIDTH, TABLE_PATHS = 128, 3  #: the same with a table, whose pattern glossy surfaces mirror
+
+
+@dataclass(frozen=True)
+class GlobalIllumination:
+    """Interreflection and room light of N pictures, in small pictures of h × w pixels.
+
+    The small pictures are scaled up to H × W pixels, those of the picture of the direct light. `transfer` is the
+    radiance transfer of "Precomputed Radiance Transfer" (Sloan, Kautz and Snyder 2002).
+    """
+
+    radiance: Tensor  #: (N, h, w, 3) of interreflection
+    harmonics: list[int]  #: of `mi_ring.rendering.spherical_harmonics`, n of them
+    transfer: Tensor  #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics
+    unoccluded: Tensor  #: (n, N, h, w, 3) `transfer` as if nothing hid the room from the surface: once reflected light
+    alpha: Tensor  #: (N, h, w) coverage
+    coverage: Tensor  #: (N, H, W) coverage in the large pictures
+    factor: int  #: how many times larger these are
+
+    @classmethod
+    def of(
+        cls, surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
+        paths: int | None = None, indirect: bool = True, harmonics: Sequence[int] = (),
+    ) -> "GlobalIllumination":  # fmt: skip
+        """Render interreflection and `transfer` of some harmonics for the surface as last written, without gradients.
+
+        `photographs`: as they were rendered; `coverage` (N, H, W): of these pictures. The small pictures are at most
+        `width` pixels wide, and have `paths` paths per pixel: this light varies slowly, and a few good pixels are
+        better than many noisy ones. Both are larger by default where there is a table.
+
+        Without `indirect`, `transfer` has only room light that the surface reflects once, and `interreflection` must
+        not be used.
+        """
+        bounces = BOUNCES if indirect else 1
+        table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's
+        usual = (SMALL_WIDTH, PATHS) if table is None else (TABLE_WIDTH, TABLE_PATHS)
+        width, paths = width or usual[0], paths or usual[1]
+        factor = -(-max(photographs.size) // width)
+        small = photographs.select(np.array(photographs.index), photographs.size, factor).in_units(surface.unit)
+        channels = evaluated(render_indirect(surface.scene, small, paths, seed, bounces, harmonics, table))
+        *rgb, alpha = (channel.reshape(small.shape) for channel in channels[:4])
+        basis = channels[4:] or [alpha.new_zeros(0)]
+        transfer, unoccluded = torch.cat(basis).reshape(2, len(harmonics), 3, *small.shape).movedim(2, -1)
+        return cls(torch.stack(rgb, -1), list(harmonics), transfer, unoccluded, alpha, coverage, factor)
+
+    @property
+    def interreflection(self) -> Tensor:
+        """(N, H, W, 3) linear radiance that interreflection adds to the large pictures."""
+        return self.upsampled(self.radiance)
+
+    def room_light(self, room: Tensor) -> Tensor:
+        """(N, H, W, 3) linear radiance that a room, harmonics (BASIS, 3), adds to pictures without one."""
+        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
+
+    def occlusion(self, room: Tensor) -> Tensor:
+        """(N, H, W, 3) what to add to pictures with an unoccluded room (BASIS, 3): shadow, which is negative, and
+        interreflection of its light."""
+        difference = self.transfer - self.unoccluded
+        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
+
+    def upsampled(self, rgb: Tensor) -> Tensor:
+        """Small pictures (N, h, w, 3) as large ones (N, H, W, 3), with the outlines of the large ones.
+
+        Gradients flow through `coverage` alone: the outline feels this light, shape and material do not. The fit
+        corrects them for it as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
+        """
+        images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
+        images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)
+        images = F.interpolate(images, scale_factor=self.factor, mode="bilinear", align_corners=False)
+        below, right = self.coverage.shape[1] - images.shape[2], self.coverage.shape[2] - images.shape[3]
+        images = F.pad(images, (0, right, 0, below), mode="replicate")
+        return (images[:, :3] / images[:, 3:].clamp(min=1e-2)).movedim(1, -1) * self.coverage[..., None]

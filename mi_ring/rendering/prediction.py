@@ -1,0 +1,125 @@
+"""Predicted photographs of a surface as tensors: with gradients for a fit, without them for pictures and maps."""
+
+from collections.abc import Sequence
+
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
+from mi_ring.rendering.bridge import differentiable, evaluated, to_drjit
+from mi_ring.rendering.edge_selection import Edges
+from mi_ring.rendering.global_illumination import GlobalIllumination
+from mi_ring.rendering.image_formation import render_maps, render_photographs
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.plain_mesh import POSITIONS
+
+NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
+
+
+def render(
+    surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
+    seed: int = 0, shadows: bool = True, calibration: Sequence[Tensor] = (), lamps: Sequence[Tensor] = (),
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Predicted photographs of the surface, each under its own light, differentiable.
+
+    `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
+    `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
+    samples. `calibration`: other cameras and lights of all P photographs, as `Photographs.with_calibration` takes them:
+    (P, 3, 4), (P, 4) [px of these sizes], (P, 3), (P, 3), and optionally falloff and distortion (P,) each. `lamps`:
+    other places and strengths (L, 3) of the scene's L lamps, as `Surface.relight` takes them.
+
+    Returns linear radiance (N, H, W, 3) and coverage (N, H, W) in [0, 1]. Gradients with respect to all tensors are
+    those of shading, of outlines and of edges of cast shadows, for radiance and for coverage. There can be one backward
+    pass, before the surface is written again; else it raises RuntimeError. Raises ValueError like `Surface.parameters`.
+    """
+    parameters = surface.parameters(vertices, attributes)
+    moving = any(tensor.requires_grad for tensor in (vertices, *calibration, *lamps))
+
+    def program(arrays: list[mi.Float]) -> list[mi.Float]:
+        surface.write_arrays(dict(zip(parameters, arrays)))
+        others = arrays[len(parameters) :]
+        if lamps:
+            surface.relight(*others[len(calibration) :])
+        moved = photographs.with_calibration(*others[: len(calibration)]) if calibration else photographs
+        if moving:  # gradients with respect to the material alone need no edges
+            surface.edges = Edges.of(surface.scene, surface.edges)
+        edges = surface.edges if moving else None
+        return render_photographs(surface.scene, moved.in_units(surface.unit), spp, seed, shadows, edges)
+
+    if parameters[POSITIONS].requires_grad:
+        points, faces = parameters[POSITIONS].detach(), surface.faces
+        parameters[POSITIONS].register_hook(lambda gradient: finite_gradient(gradient, points, faces))
+    channels = differentiable(program, [*parameters.values(), *calibration, *lamps], surface)
+    *rgb, coverage = (channel.reshape(photographs.shape) for channel in channels)
+    return torch.stack(rgb, dim=-1), coverage.clone()
+
+
+def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Tensor:
+    """The gradient (V, 3) of vertices (V, 3), 0 where it is not finite because a triangle (F, 3) has no area.
+
+    Mitsuba's vertex normals have gradients there that are not finite. Other entries that are not finite stay.
+    """
+    if gradient.isfinite().all():
+        return gradient
+    corners = torch.from_numpy(np.asarray(faces, np.int64)).to(vertices.device)
+    a, b, c = vertices[corners.T]
+    areas = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    longest = torch.maximum((b - a).norm(dim=-1), (c - a).norm(dim=-1))
+    flat = ~(areas > NO_AREA * longest**2) | ((b - c).norm(dim=-1) == 0)
+    degenerate = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
+    degenerate[corners[flat].ravel()] = True
+    return torch.where(degenerate[:, None], gradient.nan_to_num(0, 0, 0), gradient)
+
+
+def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photographs:
+    """Photographs with other cameras and lights, as `render` takes them, without gradients."""
+    return photographs.with_calibration(*map(to_drjit, calibration))
+
+
+def draw(
+    surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
+    indirect: bool = False, paths: int = 32, occlusion: bool = True,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Like `render`, of the surface as last written, without gradients, in the processor's memory.
+
+    `indirect` adds interreflection by `paths` per pixel of a picture that is at most 128 pixels wide. The light of the
+    photographs' room is always part of the pictures; without `occlusion` as if nothing hid it from the surface.
+
+    This takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and the memory of the pictures
+    themselves, however many pixels and samples there are. `indirect` or a room add about 100 MB for each photograph.
+    """
+    own, parts = photographs.in_units(surface.unit), []
+    for pixels in photographs.chunks(spp):
+        parts.append(evaluated(render_photographs(surface.scene, own, spp, seed, shadows, pixels=pixels)))
+    *colours, coverage = (torch.cat(channel).reshape(photographs.shape) for channel in zip(*parts))
+    rgb = torch.stack(colours, dim=-1)
+    if indirect or (occlusion and photographs.room is not None):
+        harmonics = photographs.harmonics
+        added = GlobalIllumination.of(surface, photographs, coverage, seed + 1, 128, paths, indirect, harmonics)
+        if indirect:
+            rgb = rgb + added.interreflection
+        if harmonics and occlusion:
+            rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
+    return rgb.cpu(), coverage.cpu()
+
+
+def maps(
+    surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
+) -> dict[str, np.ndarray]:
+    """Normals and BSDF parameters of the surface as last written at the centres of pixels, 0 where there is none.
+
+    Returns `normal` (N, H, W, 3) in world space and each of the parameters by its name, (N, H, W, 3) or (N, H, W).
+    """
+    own, parts = photographs.in_units(surface.unit), []
+    attributes = {f"vertex_{p.name}": p.channels for p in parameters}
+    for pixels in photographs.chunks(1):
+        parts.append(torch.stack(evaluated(render_maps(surface.scene, own, attributes, pixels)), -1))
+    channels = torch.cat(parts).reshape(*photographs.shape, -1).cpu().numpy()
+    result, first = {"normal": channels[..., :3]}, 3
+    for p in parameters:
+        result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
+        first += p.channels
+    return result

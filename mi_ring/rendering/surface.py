@@ -1,0 +1,116 @@
+"""The surface that is rendered: the `shapenet` shape of a scene, to which torch tensors are written."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.rendering.bridge import to_drjit
+from mi_ring.rendering.edge_selection import Edges
+from mi_ring.scene.assembly import lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
+from mi_ring.scene.lights import shared_emitters
+from mi_ring.scene.plain_mesh import FACES, POSITIONS
+
+RADII_IN_SCENE_UNITS = 1e-3, 1e4  #: the least and the largest radius that float32 renders well in scene units
+
+
+class Surface:
+    """The `shapenet` shape of a loaded scene, to which torch tensors are written.
+
+    With a `FittedObject` the surface is a new shape with the BSDF of that object. It is in a new scene, which shares
+    all other objects with the given scene and leaves that as it is. Without a `FittedObject` the surface is the given
+    shape itself. Other shapes and top-level emitters of the scene are part of every picture, but are not changed. A
+    `table` is not visible: it only reflects light onto the other shapes.
+
+    `unit` is the number of scene units that are one unit of `scene`. Areas and their squares must be representable in
+    float32: an object that is alone in its scene, and tiny or enormous, is rendered in units of about its radius. With
+    `in_scene_units` it is not.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, shape: mi.Mesh, ring: FittedObject | None = None, in_scene_units: bool = False
+    ) -> None:
+        scene, self.table = split_tables(scene)
+        self.unit = 1.0
+        if ring is not None:
+            alone = self.table is None and len(scene.shapes()) == 1
+            if alone and not in_scene_units and all(lamp.is_environment() for lamp in shared_emitters(scene)):
+                self.unit = unit_for(float(ring.radius))
+            scene, shape = with_fitted_shape(scene, shape, ring, self.unit)
+        self.scene, self.shape = scene, shape
+        self.params = mi.traverse(scene)
+        self.owns_lamps = False  #: False while the lamps are those of the given scene, which must not be changed
+        self.prefix = f"{shape.id()}."
+        self.faces = np.array(shape.faces_buffer()).reshape(-1, 3)  #: (F, 3) triangles, from the next `write` on
+        self.faces_changed = False
+        self.edges: Edges | None = None  #: those of the last picture with gradients of moving edges
+        self.written = 0  #: number of times that vertices were written
+
+    def set_faces(self, faces: np.ndarray) -> None:
+        """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
+        if faces is not self.faces:
+            self.faces, self.faces_changed = faces, True
+
+    def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
+        """(V, 3) vertices [scene units] and (V, 3) or (V,) attributes by the names of the mesh's parameters.
+
+        The vertices, which come first, are in units of `unit`.
+
+        Raises ValueError if the number of vertices is not that of the triangles, or an attribute has another size.
+        """
+        needed = int(self.faces.max()) + 1
+        if vertices.shape != (needed, 3):
+            raise ValueError(f"vertices: of shape {tuple(vertices.shape)}, but the triangles need ({needed}, 3)")
+        for name, value in attributes.items():
+            channels = 1 if value.ndim == 1 else value.shape[-1]
+            if value.numel() != needed * channels or channels not in (1, 3):
+                raise ValueError(
+                    f"attribute {name}: of shape {tuple(value.shape)}, must be ({needed},) or ({needed}, 3)"
+                )
+        return {POSITIONS: vertices / self.unit} | {f"vertex_{name}": value for name, value in attributes.items()}
+
+    def write(self, vertices: Tensor, attributes: dict[str, Tensor]) -> None:
+        """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes, without gradients.
+
+        Raises ValueError like `parameters`.
+        """
+        self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
+
+    def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
+        """Write `parameters` of the mesh as Dr.Jit Floats, which may be attached.
+
+        Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
+        """
+        if self.faces_changed:
+            self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
+            self.faces_changed = False
+        for name, array in arrays.items():
+            self.params[self.prefix + name] = array
+        self.params.update()
+        self.written += 1
+
+    def relight(self, places: mi.Float, strengths: mi.Float) -> None:
+        """Change the scene's L lamps: three numbers for each, which may be attached. The given scene stays as it was.
+
+        `places`: positions [scene units], or unit directions toward distant lamps. `strengths`: intensities [W/sr], or
+        irradiances [W/m²] of distant lamps.
+        """
+        if not self.owns_lamps:
+            self.scene, self.owns_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
+            self.params = mi.traverse(self.scene)
+        move_lamps(self.scene, places, strengths)
+
+    def show(self, ring: FittedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
+        """Write a `FittedObject` at domain points (V, 3) with triangles (F, 3), at a `time` of the flow in [0, 1]."""
+        with torch.no_grad():
+            self.set_faces(faces)
+            self.write(*ring(s.to(ring.center.device), time))
+
+
+def unit_for(radius: float) -> float:
+    """The unit of length [scene units] that an object of this radius is rendered in: 1, or a power of 2."""
+    least, largest = RADII_IN_SCENE_UNITS
+    return 1.0 if least <= radius <= largest else 2.0 ** round(math.log2(radius))

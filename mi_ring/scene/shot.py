@@ -1,0 +1,86 @@
+"""A photograph as plain values: its camera, its light, the camera's response and its files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mi_ring.geometry.camera import Camera, moved_pose
+from mi_ring.scene.lights import Light
+
+#: How a file encodes linear values; `auto`: files of 8 bits are sRGB, all others are linear.
+Encoding: TypeAlias = Literal["auto", "srgb", "linear"]
+
+
+class Files(NamedTuple):
+    """The files of a photograph; None where it has none."""
+
+    filename: Path | None = None  #: the photograph
+    mask: Path | None = None  #: 0 background, 255 object; `filename` itself if its alpha channel is meant
+    valid: Path | None = None  #: 0 where the photograph shows nothing
+    ambient: Path | None = None  #: the same view without the photograph's own light
+
+
+NO_FILES = Files()
+
+
+@dataclass(frozen=True)
+class Response:
+    """How a camera records radiance. By default the file holds the radiance itself.
+
+    The recorded linear value is `contrasted`((radiance · `gain` · cosine ^ `vignetting`) ^ `gamma`, `contrast`).
+    """
+
+    gamma: float = 1.0  #: exponent of the camera's curve
+    contrast: float = 1.0  #: of the camera's curve, as `mi_ring.images.contrasted` takes it
+    vignetting: float = 0.0  #: exponent of the cosine between the ray of a pixel and the optical axis
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: factors of R, G, B, by exposure and white balance
+
+    def changed(
+        self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
+    ) -> "Response":
+        """With `gamma`, `contrast` and `gain` times these, and `vignetting` plus this."""
+        red, green, blue = np.multiply(self.gain, gain).tolist()
+        return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A photograph of a capture. It never changes; `dataclasses.replace` makes another one with a changed field."""
+
+    name: str  #: the sensor's id in the scene file
+    camera: Camera
+    light: Light | None = None  #: its own light, which lights no other photograph; None as in `own_light`
+    falloff: float = 0.0  #: exponent of the cosine between the direction from a point light and where the camera looks
+    response: Response = Response()
+    files: Files = NO_FILES
+    encoding: Encoding = "auto"  #: of the photograph's file
+    saturation: float = 1.0  #: encoded value from which a pixel is clipped (1 = full scale)
+    calibrated: bool = False  #: are camera and light exact? Then a fit does not refine them by default
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]"""
+        return self.camera.size
+
+    @property
+    def file_name(self) -> str:
+        """Of the photograph's file, without its folder; `name` where it has no file."""
+        return self.files.filename.name if self.files.filename else self.name
+
+    @property
+    def own_light(self) -> Light:
+        """`light`, or where it is None a point light of intensity 1 at the camera's centre."""
+        return self.light or Light("point", self.camera.position, np.ones(3))
+
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
+        """The same photograph, its camera and light in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        light = self.own_light
+        if light.kind == "point":  # as bright as before from scaled distances
+            light = Light("point", scale * rotation @ light.vector + shift, scale**2 * light.rgb)
+        else:
+            light = light._replace(vector=rotation @ light.vector)
+        to_world = moved_pose(self.camera.to_world, scale, rotation, shift)
+        return replace(self, camera=self.camera._replace(to_world=to_world), light=light)

@@ -1,0 +1,125 @@
+"""The object of a synthetic capture, the table that it may stand on, and their pictures under one light."""
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mi_ring.capture.scenefile import Element, emitter_element, table_element
+from mi_ring.errors import InputError
+from mi_ring.geometry.meshes import read_mesh
+from mi_ring.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
+from mi_ring.photogrammetry.marker_sheet import DOTS, page
+from mi_ring.scene.lights import Light
+from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.xml_elements import load_element
+from mi_ring.synthesis.materials import COLOURS, Pattern
+from mi_ring.synthesis.tracing import LensCamera, clamped_radiance_along, hits_along, pixel_means, radiance_along
+
+SMOOTH = 10_000  #: least number of vertices after subdivision
+TABLE, BELOW = 8.0, 2e-3  #: side of the table, and its distance below the sheet [object radii]
+WOOD = 0.42, 0.3, 0.2  #: sRGB colour of the table
+BRIGHTEST = 4.0  #: most indirect light of one path, in units of the radiance of a white surface in the light
+PAPER, INK = 0.8, 0.05  #: albedos
+DOTS_PER_PIXEL = 3  #: of the printed page, in the texture of the sheet
+
+
+class ObjectOnTable:
+    """An object with its BSDF, and the shapes that it stands on, if any."""
+
+    def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
+        """`vertices` (V, 3) of the object: without a table only the pixels around them are rendered."""
+        self.object, self.vertices, self.tables = mesh, vertices, list(tables)
+
+    def under(self, emitter: mi.Object) -> mi.Scene:
+        """The scene with this emitter only."""
+        shapes = {f"shape{k}": shape for k, shape in enumerate([self.object, *self.tables])}
+        return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
+
+    def radiance(
+        self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
+    ) -> np.ndarray:
+        """Linear radiance (H, W, 3) under one light. `hidden`: an environment is invisible itself."""
+        trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
+        if isinstance(light, Light):
+            middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
+            falloff = np.square(light.vector - middle).sum() if light.kind == "point" else 1.0
+            white = light.rgb.max() / (np.pi * falloff)  # radiance of a white surface in the middle of the object
+            trace = partial(clamped_radiance_along, depth=depth, limit=BRIGHTEST * white)
+            light = load_element(emitter_element(light))
+        window = view.around(self.vertices) if hidden and not self.tables else (0, 0, *view.camera.size)
+        return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
+
+    def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
+        """Share of each pixel that shows the object (H, W)."""
+        trace = partial(hits_along, scene=self.under(mi.load_dict({"type": "constant"})), shape=self.object)
+        return pixel_means(trace, view, view.around(self.vertices), spp, 0)[..., 0]
+
+
+def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimesh, np.ndarray | None, np.ndarray]:
+    """A mesh file with the middle of its bounding box at the origin and its farthest vertex at `radius`.
+
+    Returns the mesh, its linear colours (V, 3) or None, and the matrix (4, 4) that moved it. `smooth`: Loop subdivision
+    to at least `SMOOTH` vertices. Raises InputError if the file has no surface.
+    """
+    mesh = read_mesh(path, "MESH")
+    mesh.remove_unreferenced_vertices()
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all() or not np.ptp(mesh.vertices, axis=0).any():
+        raise InputError(f"{path}: MESH: has {len(mesh.faces)} triangles, and must have some, of finite size")
+    colours = None
+    visual: Any = mesh.visual
+    names = "image", "baseColorTexture"  # attributes of trimesh's materials
+    if visual.kind == "texture" and visual.uv is not None:
+        has_picture = any(getattr(visual.material, name, None) is not None for name in names)
+        visual = visual.to_color() if has_picture else visual
+    if visual.kind in ("vertex", "face"):
+        colours = srgb_to_linear(np.asarray(visual.vertex_colors)[:, :3] / 255)
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    while smooth and len(mesh.vertices) < SMOOTH:
+        if colours is not None:  # a new vertex in the middle of an edge has the mean colour of the edge's ends
+            colours = np.concatenate([colours, colours[mesh.edges_unique].mean(1)])
+        try:
+            mesh = mesh.subdivide_loop(1)
+        except ValueError as error:
+            raise InputError(f"{path}: MESH: has edges of more than two triangles, which --smooth cannot subdivide; "
+                             "leave that out") from error  # fmt: skip
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
+        mesh.invert()
+    middle = mesh.bounds.mean(0)
+    scale = radius / np.linalg.norm(mesh.vertices - middle, axis=1).max()
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = -scale * middle
+    mesh.apply_transform(matrix)
+    mesh.vertices = mesh.vertices.astype(np.float32)
+    return mesh, colours, matrix
+
+
+def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
+    """The object as a shape of Mitsuba with smooth normals."""
+    shape = mesh_of(mesh.vertices, mesh.faces, uv=None if pattern is None else pattern.uv)
+    if colours is not None:
+        shape.add_attribute(COLOURS, 3, colours.ravel().tolist())
+    shape.set_bsdf(bsdf)
+    return shape
+
+
+def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
+    """XML of a table at `ground` (3,) with normal `up` (3,), and of the sheet on it. Writes textures to the folder."""
+    right = np.roll(up, 1)
+    pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}
+    if sheet:
+        printed = page("a4").convert("L").reduce(DOTS_PER_PIXEL)
+        albedo = INK + (PAPER - INK) * np.asarray(printed, float)[::-1, :, None] / 255
+        side = np.array(printed.size) * DOTS_PER_PIXEL / DOTS
+        pictures["sheet"] = (np.repeat(linear_to_srgb(albedo), 3, 2), side / 2, 0.0)
+    result = []
+    for name, (picture, half, below) in pictures.items():
+        square = np.eye(4)
+        square[:3] = np.stack([half[0] * right, half[1] * np.cross(up, right), up, ground - below * up], 1)
+        write_image(to_bytes(picture), folder / f"{name}.png")
+        result.append(table_element(f"{name}.png", square))
+    return result

@@ -1,0 +1,96 @@
+"""Standard deviations of what is refined: least squares in closed form, and of a fit's unknowns."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import mi_ring
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.covariance import BLOCK, Equations, Layout, covariance
+from mi_ring.fitting.fit import Fit
+from mi_ring.metrics.capture_findings import moved_far
+from mi_ring.output.calibration_panel import panel
+
+
+@pytest.mark.parametrize("block", [1, BLOCK])
+def test_deviation_of_a_slope_is_that_of_linear_regression(block):
+    random = np.random.default_rng(4)
+    slopes, sigma = random.normal(size=(2, 200, 256, 3)), 0.3
+    noise = sigma * random.normal(size=(200 // block, 256 // block, 3))
+    noise = np.kron(noise, np.ones((block, block, 1)))  # errors that go together count as one
+    equations = Equations(5)
+    telling = torch.ones(200, 256, dtype=torch.bool)
+    telling[:, 248:] = False
+    equations.add(torch.tensor(slopes), torch.tensor(noise), telling, np.array([3, 1]))
+    x = slopes[:, :, :248].reshape(2, -1)
+    expected = x @ x.T / (sigma * block) ** 2
+    got = equations.information()[np.ix_([3, 1], [3, 1])]
+    np.testing.assert_allclose(got, expected, rtol=0.1, atol=0.02 * expected.max())
+    assert not equations.information()[[0, 2, 4]].any()
+
+
+def test_photographs_share_the_unknowns_of_their_lens_and_flash(small_capture):
+    config = Config(refine=("cameras", "focal", "light", "power", "curve"))
+    layout = Layout(Fit(mi_ring.load_capture(small_capture), config).model.calibration)
+    first, other = (layout.of(np.array([k])) for k in (2, 7))
+    shared = {name for (name, _, a), (_, _, b) in zip(first, other) if a == b}
+    assert shared == {"focal", "light", "curve"}
+    own = [int(place[0]) for entry in (first, other) for name, _, place in entry if name not in shared]
+    assert len(own) == len(set(own)) == 2 * 9
+    assert layout.count == 12 * 9 + 1 + 3 + 1
+
+
+def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
+    refined = "cameras", "light", "power", "curve"
+    config = Config(iterations=30, levels=(3,), widths=(56,), shares=(1,), subdivisions=3, refine=refined)
+    running = Fit(mi_ring.load_capture(small_capture), config)
+    for _ in running:
+        pass
+    calibration = running.model.calibration
+    before = {name: value.clone() for name, value in calibration.state_dict().items()}
+    found = covariance(running.problem, running.model, running.renderer, 3)
+    for name, value in calibration.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+    for name, width in calibration.widths.items():
+        assert found[name].shape == getattr(calibration, name).shape
+        assert (found[name] > 0).all() and (found[name] <= width * (1 + 1e-6)).all()  # a photograph cannot know less
+
+    summary = running.result().calibration
+    assert json.loads(json.dumps(summary)) == summary
+    light, unit = summary["unknowns"]["light"], calibration.rig.distance
+    np.testing.assert_allclose(light["before"], [15, 10, 0], atol=1e-3)
+    moved = np.subtract(light["after"], light["before"])
+    np.testing.assert_allclose(moved, unit * calibration.value("light")[0].detach(), atol=1e-4)
+    np.testing.assert_allclose(light["std"], unit * found["light"][0], rtol=1e-6)
+    photograph = summary["photographs"]["003.png"]
+    turn = calibration.value("turn")[3].detach().norm()
+    assert photograph["turned_degrees"] == pytest.approx(np.degrees(float(turn)), rel=1e-5)
+    np.testing.assert_allclose(photograph["std"]["power"], found["power"][3] * photograph["power"], rtol=1e-5)
+    page = panel(running.capture, running.calibrated(), summary)
+    assert [row[0].split()[0] for row in page.rows] == ["place", "exponent", "cameras", "and", "power"]
+    assert page.chart.startswith("data:image/svg")
+
+    assert found["light"].max() < 0.3 * calibration.widths["light"]
+    assert found["power"].max() < 0.7 * calibration.widths["power"]
+
+
+def test_pixels_beside_the_blocks_count_as_well():
+    random = np.random.default_rng(8)
+    slopes, noise = random.normal(size=(1, 213, 301, 1)), 0.2 * random.normal(size=(213, 301, 1))
+    equations = Equations(1)
+    equations.add(torch.tensor(slopes), torch.tensor(noise), torch.ones(213, 301, dtype=torch.bool), np.array([0]))
+    assert equations.information()[0, 0] == pytest.approx((slopes**2).sum() / 0.2**2, rel=0.15)
+
+
+def test_the_room_alone_has_no_deviation(small_capture):
+    running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",)))
+    assert covariance(running.problem, running.model, running.renderer, 3) == {}
+
+
+def test_photographs_that_moved_far_are_told_from_those_that_all_moved():
+    moved = {f"{k}.png": {"moved_px": 3.0 + 0.1 * k} for k in range(9)}
+    assert moved_far(moved) == moved_far({}) == ""
+    moved["4.png"] = {"moved_px": 17.0}
+    assert moved_far(moved) == "4.png (17.0 px)"

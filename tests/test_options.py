@@ -1,0 +1,93 @@
+"""The options of `mi-ring fit` in their groups, and the settings that a results folder says."""
+
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from mi_ring.errors import InputError
+from mi_ring.fit_config import FitConfig, Task, parse_options
+from mi_ring.fitting.config import PRESETS, TASK, WEIGHTS, Ablation, Common, Config, Tuning
+
+
+def names(*kinds):
+    return {f.name.replace("_", "-") for kind in kinds for f in dataclasses.fields(kind)} - {"scene", "weights"}
+
+
+def help_by(argument, capsys):
+    """The help: the options of each box by its title, and its last line. Boxes have no sides where not UTF-8 is."""
+    with pytest.raises(SystemExit) as stop:
+        parse_options(["scene.xml", "--levels", "4", argument])
+    assert not stop.value.code
+    text = capsys.readouterr().out
+    _, *box = re.split(r"^(?:╭─)? ((?:\w+ )?options|positional arguments) +(?:─*╮)?$", text, flags=re.M)
+    options = [set(re.findall(r"^[│ ] --([a-z][a-z.-]+)", rows, re.M)) for rows in box[1::2]]
+    return dict(zip(box[::2], options)), text.strip().splitlines()[-1]
+
+
+def test_help_shows_what_users_set_and_says_how_many_more_options_there_are(capsys):
+    found, below = help_by("--help", capsys)
+    assert found["options"] == names(Task, Common) and len(found["options"]) == 15
+    assert set(found) <= {"positional arguments", "options"}
+    everything, other = help_by("--help-all", capsys)
+    assert everything["options"] == found["options"]
+    assert everything["tuning options"] == names(Tuning) and everything["ablation options"] == names(Ablation)
+    assert everything["weights options"] == {f"weights.{name.replace('_', '-')}" for name in WEIGHTS}
+    hidden = sum(map(len, everything.values())) - len(found["options"])
+    assert below == f"{hidden} more options, for tuning and ablation: --help-all shows them" != other
+
+
+def test_hidden_options_are_options_all_the_same():
+    words = "--levels 3 --widths 64 --shares 1 --weights.mask 2 --no-shadows --optimizer adam --spp=2 --holdout 8"
+    config = parse_options(["scene.xml", *words.split()])
+    assert config == FitConfig(scene=Path("scene.xml"), levels=(3,), widths=(64,), shares=(1.0,), spp=2, holdout=8,
+                               weights={"mask": 2.0}, shadows=False, optimizer="adam")  # fmt: skip
+    assert names(Config) == names(Common, Tuning, Ablation) and names(FitConfig) == names(Task, Config)
+    assert {f.name for f in dataclasses.fields(Task)} == TASK
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_are_read_from_the_results(preset, tmp_path):
+    config = parse_options(["scene.xml", "--preset", preset, "--minutes", "3"])
+    options = json.dumps(dataclasses.asdict(config), default=str)  # as the command writes them
+    (tmp_path / "config.json").write_text(options)
+    assert Config.load(tmp_path) == Config.load(f"{tmp_path}/config.json") == Config.preset(preset)
+
+
+def test_settings_of_all_kinds_are_read_as_they_were(tmp_path):
+    config = Config(domain=("mesh", Path("a.ply")), refine=("cameras", "light"), weights={"mine": 2.0}, levels=(3,),
+                    widths=(64,), shares=(1,), parameters={"haze": (0.0, math.inf)}, deterministic=True)  # fmt: skip
+    (tmp_path / "config.json").write_text(json.dumps(config.settings()))
+    assert Config.load(tmp_path) == config
+    (tmp_path / "config.json").write_text('{"iterations": 7, "scene": "a.xml"}')
+    assert Config.load(tmp_path) == Config(iterations=7)
+
+
+@pytest.mark.parametrize(("content", "words"), [
+    (None, "cannot be read (No such file or directory); give the results folder of a fit"),
+    ("{", "is not JSON"),
+    ("[1]", "holds no settings"),
+    ('{"solver": "euler"}', "solver: is no setting of mi_ring"),
+    ('{"iterations": "many"}', "iterations: is 'many', which this setting cannot be"),
+    ('{"iterations": true}', "iterations: is True"),
+    ('{"blur": 0.06}', "blur: is no setting of mi_ring"),
+    ('{"decay": 1%s}' % ("0" * 400), "decay: is 1000"),
+    ('{"levels": [4, 5.5, 6]}', "levels: is [4, 5.5, 6]"),
+    ('{"parameters": {"haze": [0]}}', "parameters: is {'haze': [0]}"),
+    ('{"domain": ["mesh"]}', "domain: is ['mesh']"),
+    ('{"loss": "l3"}', "loss: is 'l3'"),
+    ('{"refine": ["gian"]}', "refine: is ['gian']"),
+    ('{"weights": {"mask": null}}', "weights: is {'mask': None}"),
+    ('{"learning_rate": -1}', "--learning-rate: is -1.0, must be above 0"),
+    ('{"levels": [4]}', "--widths: is 128 256 512, must be as many values as --levels (1)"),
+])  # fmt: skip
+def test_settings_that_cannot_be_are_one_line(content, words, tmp_path):
+    file = tmp_path / "config.json"
+    if content:
+        file.write_text(content)
+    with pytest.raises(InputError) as error:
+        Config.load(file)
+    assert str(error.value).startswith(f"{file}: {words}") and "\n" not in str(error.value)

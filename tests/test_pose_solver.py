@@ -1,0 +1,235 @@
+"""Gauss-Newton steps of the cameras: how pictures move with them, and where the steps lead."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import mi_ring
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.rig import Rig
+from mi_ring.capture.capture import Observation
+from mi_ring.fitting import losses
+from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.pose_solver import curvature, motion, slopes
+from mi_ring.geometry.camera import Camera
+
+SIZE = (7, 5)
+
+
+def on_sphere(camera, center, radius):
+    """Points (H·W, 3) of a sphere that the pixels see, None for those that miss it."""
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = camera.directions(np.stack([x.ravel(), y.ravel()], 1))
+    away = camera.position - center
+    along = rays @ away
+    inside = along**2 - (away @ away - radius**2)
+    return [camera.position + (-b - np.sqrt(d)) * ray if d > 0 else None for ray, b, d in zip(rays, along, inside)]
+
+
+def test_pixels_move_as_points_of_a_sphere_do_when_the_camera_does():
+    to_world = np.eye(4)
+    to_world[:3, :3] = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    to_world[:3, 3] = 30, -20, 11
+    camera = Camera(to_world, np.array([9.0, 11.0]), np.array([3.0, 2.9]), SIZE)
+    inside = np.array([1.0, -2.0, 40.0])  # in the camera's axes
+    center, radius = to_world[:3, :3] @ inside + to_world[:3, 3], 9.0
+    points = on_sphere(camera, center, radius)
+    seen = [k for k, point in enumerate(points) if point is not None]
+    assert 5 < len(seen) < 30
+    found = motion(torch.tensor([9.0, 11.0, 3.0, 2.9]), SIZE, torch.tensor(inside).float(), radius)
+    found = found.reshape(-1, 2, 6).numpy()
+    for j, step in enumerate(1e-5 * np.eye(6)):
+        moved = to_world.copy()
+        moved[:3, :3] = to_world[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
+        moved[:3, 3] = to_world[:3, 3] + to_world[:3, :3] @ step[3:]
+        for k in seen:
+            before, after = (c.project(points[k][None])[0][0] for c in (camera, camera._replace(to_world=moved)))
+            np.testing.assert_allclose(found[k, :, j], (after - before) / 1e-5, rtol=1e-3, atol=2e-4)
+    assert np.isfinite(found).all()  # of those that miss it, too
+
+
+def test_slopes_are_those_of_a_plane():
+    y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
+    found = slopes(torch.stack([2 * x - 3 * y, 0.5 * y], -1))
+    torch.testing.assert_close(found[1:-1, 1:-1], torch.tensor([[2.0, -3.0], [0.0, 0.5]]).expand(3, 5, 2, 2))
+
+
+def posed(capture, **changes):
+    """A fit that finds calibration alone, at its middle, and photographs that show what it predicts; which of them."""
+    settings = {"refine": ("cameras",), "levels": (4,), "widths": (56,), "shares": (1.0,), "batch": 4, "spp": 16,
+                "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
+    config = mi_ring.Config(**settings | changes)
+    fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
+    fit.course.iteration, chosen = fit.iterations // 2, fit.sampler.draw_photographs(config.batch)
+    fit.sampler.draw_photographs = lambda count: chosen
+    with torch.no_grad():
+        it = iteration_of(fit)
+    seen = it.observation._replace(rgb=it.prediction.rgb, mask=it.prediction.coverage)
+    fit.sampler.observe = lambda *_: seen
+    own = set(fit.model.calibration.parameters())
+    steppers = fit.optimisation.steppers  # without those of the networks, so that the surface stays as it is
+    fit.optimisation.steppers = [s for s in steppers if own & {*s.optimizer.param_groups[0]["params"]}]
+    return fit, it.batch.photographs
+
+
+def iteration_of(fit):
+    """What a step of a fit would draw, see and predict."""
+    batch = fit.sampler.draw(fit.problem, fit.schedule, fit.ring.domain, fit.iteration)
+    seen = fit.sampler.observe(fit.problem, fit.capture, batch)
+    return Iteration(batch, seen, fit.renderer.predict(fit.problem, fit.model, batch), fit.context())
+
+
+@pytest.mark.parametrize("loss", ["l1+log", "l2"])
+def test_cameras_go_where_photographs_were_taken(small_capture, loss):
+    fit, index = posed(small_capture, loss=loss)
+    calibration, center = fit.model.calibration, fit.model.calibration.rig.center
+    random = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        calibration.turn += 2 * torch.randn(calibration.turn.shape, generator=random)
+        calibration.move += 2 * torch.randn(calibration.move.shape, generator=random)
+    untouched = np.setdiff1d(np.arange(len(fit.capture)), index)
+    before = calibration.turn.detach().clone()
+
+    def pixels():
+        """How far the object's centre is from where it was, in photographs of 56 × 40 [px]: (4,)."""
+        cameras = calibration()[0].detach()[index]
+        found = torch.einsum("nji,nj->ni", cameras[:, :, :3], center - cameras[:, :, 3])
+        base = calibration.rig.views.cameras[index]
+        true = torch.einsum("nji,nj->ni", base[:, :, :3], center - base[:, :, 3])
+        return 60 * (found[:, :2] / found[:, 2:] - true[:, :2] / true[:, 2:]).norm(dim=1)
+
+    first = pixels()
+    assert first.mean() > 1
+    for _ in range(8):
+        fit.step()
+    assert pixels().max() < 0.1 * first.mean()
+    assert torch.equal(calibration.turn[untouched], before[untouched])
+
+
+def test_right_cameras_stay(small_capture):
+    fit, _ = posed(small_capture)
+    for _ in range(8):
+        fit.step()
+    # About and along the optical axis pictures tell the least: a quarter moves the rim by a twentieth of a pixel.
+    calibration = fit.model.calibration
+    assert calibration.turn.abs().max() < 0.25 and calibration.move.abs().max() < 0.25
+
+
+@pytest.mark.parametrize("kind", ["colours", "silhouettes", "both"])
+def test_curvature_is_that_of_the_loss(small_capture, kind):
+    """Second differences of the loss of pictures that move as a sphere's do: of squares, Gauss-Newton is exact."""
+    capture, radius = mi_ring.load_capture(small_capture, images=False), 25.0
+    rig = Rig(capture, np.array([400.0, -150.0, 90.0]), 0.3)
+    calibration, index = Calibration(capture, ["cameras"], rig), np.array([3, 8])
+    weights = {"rgb": 1.0, "mask": 2.0, "calibration": 0.5}
+    weights |= {"colours": {"mask": 0.0}, "silhouettes": {"rgb": 0.0}, "both": {}}[kind]
+    width, height = capture.shots[0].size
+    context = SimpleNamespace(model=SimpleNamespace(calibration=calibration, ring=SimpleNamespace(radius=radius)),
+                              config=mi_ring.Config(loss="l2"), exposure=0.3, capture=SimpleNamespace(lit_room=False),
+                              schedule=SimpleNamespace(outline_blur=lambda progress, width: 1.5))  # fmt: skip
+    batch = SimpleNamespace(progress=0.5, photographs=index, all_photographs=index, size=(width, height), scale=1,
+                            total=lambda tensor: tensor)  # fmt: skip
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+
+    def pictures(shift):
+        """Radiance (2, H, W, 3) and coverage (2, H, W) that have moved by `shift` (2, H, W, 2) [px]."""
+        u, v = x + shift[..., 0], y + shift[..., 1]
+        colours = [0.5 + 0.3 * torch.sin(a * u + b * v + c) for a, b, c in ((0.2, 0.1, 0), (-0.1, 0.2, 1), (0.1, 0, 2))]
+        return torch.stack(colours, -1), torch.sigmoid(7 - ((u - 28) ** 2 / 250 + (v - 19) ** 2 / 120) * 6)
+
+    def loss(step):
+        shift = torch.stack([torch.einsum("hwaj,j->hwa", one, step.to(one)) for one in moving])
+        rgb, coverage = pictures(shift)
+        same = torch.zeros_like(rgb, dtype=torch.bool)
+        value = weights["rgb"] * losses.rgb_loss(rgb, seen.rgb, same, 0.3, "l2")
+        value = value + weights["mask"] * losses.mask_loss(coverage, seen.mask, 1.5)
+        return float(value) + weights["calibration"] * float(2 * step.square().sum()) / 2 / len(rig)
+
+    unit = torch.tensor([calibration.widths["turn"]] * 3 + [rig.distance * calibration.widths["move"]] * 3)
+    with torch.no_grad():
+        views = calibration()
+    moving = []
+    for k in index:
+        center = views.cameras[k, :, :3].T @ (rig.center - views.cameras[k, :, 3])
+        moving.append((motion(views.intrinsics[k], (width, height), center, radius) * unit).double())
+    rgb, coverage = pictures(torch.zeros(2, height, width, 2).double())
+    seen = Observation(rgb, torch.zeros_like(rgb, dtype=torch.bool), coverage, torch.ones(2).bool(), None)
+    shown = SimpleNamespace(rgb=rgb.float(), coverage=coverage.float())
+    as_seen = seen._replace(rgb=shown.rgb, mask=shown.coverage)
+    it = Iteration(batch, as_seen, shown, context, weights=weights)
+    found = curvature(it).double().sum(0)  # both cameras take the same step
+    random = torch.Generator().manual_seed(2)
+    for direction in [*torch.eye(6), *torch.randn(6, 6, generator=random)]:
+        step = 0.1 * direction.double()
+        second = (loss(step) + loss(-step) - 2 * loss(0 * step)) / 0.1**2
+        direction = direction.double()
+        assert float(direction @ found @ direction) == pytest.approx(second, rel=0.05), direction
+
+
+def test_terms_whose_curvature_is_not_known_are_refused(small_capture):
+    config = mi_ring.Config(refine=("cameras",))
+    with pytest.raises(mi_ring.InputError, match="terms: rgb: must be the default one for --refine cameras"):
+        mi_ring.Fit(mi_ring.load_capture(small_capture), config, terms={"rgb": lambda it: it.prediction.rgb.mean()})
+
+
+@pytest.mark.parametrize(("domain", "start"), [("hull", 0.2), ("sphere", 0.4)])
+def test_cameras_begin_when_there_is_a_shape(small_capture, domain, start):
+    fit, _ = posed(small_capture, domain=domain)
+    move = fit.model.calibration.move
+    for progress, moved in (start - 0.01, False), (start + 0.05, True):
+        with torch.no_grad():
+            move += 1
+        before = move.detach().clone()
+        fit.course.iteration = round(progress * fit.iterations)
+        fit.step()
+        assert (not torch.equal(move, before)) == moved
+
+
+def test_powers_go_where_photographs_were_lit(small_capture):
+    """Of those that were seen, by one another, and of no others."""
+    fit, index = posed(small_capture, refine=("power",))
+    calibration, random = fit.model.calibration, torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        calibration.power += 1.5 * torch.randn(calibration.power.shape, generator=random)
+    others = np.setdiff1d(np.arange(len(fit.capture)), index)
+
+    def off():
+        return (calibration.power[index] - calibration.power[index].mean(0)).detach().abs().max()
+
+    wrong, before = off(), calibration.power[others].clone()
+    for _ in range(25):
+        fit.step()
+    assert wrong > 1 and off() < 0.1  # of 10 %
+    assert torch.equal(calibration.power[others], before)
+
+
+def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
+    """Blue is a tenth as bright as red; highlights, where the prediction is wrong, are bright in it alone."""
+    fit, _ = posed(small_capture, refine=("power",))
+    powers = ExposureSolver(fit.model.calibration, "power")
+    predicted = torch.tensor([0.4, 0.2, 0.03]).expand(3, 8, 10, 3).clone()
+    factors = torch.tensor([[1.2, 1.0, 0.9], [0.8, 1.1, 1.0], [1.0, 1.0, 1.3]])
+    observed = predicted * factors[:, None, None]
+    predicted[:, :2, :5] += 0.5
+    observed[:, :2, :5] += torch.tensor([0.9, 0.2, 0.5])[:, None, None, None]
+    observed[2, :, :, 1] = 1e-4  # nothing to be told of
+    inside = torch.ones(3, 8, 10)
+    batch = SimpleNamespace(progress=0.5, photographs=np.array([4, 7, 2]), all_photographs=np.array([4, 7, 2]),
+                            gathered=lambda tensor: tensor)  # fmt: skip
+    seen = Observation(observed, torch.zeros(3, 8, 10, 3, dtype=torch.bool), inside, torch.ones(3).bool(), None)
+    it = Iteration(batch, seen, SimpleNamespace(rgb=predicted, coverage=inside), fit.context())
+    powers.look(it)
+    found = torch.stack([brighter for _, brighter in powers.seen])
+    expected = factors.log() - factors.log().mean(0)
+    expected[:, 1] = torch.tensor([-0.5, 0.5, torch.nan]) * np.log(1.1)
+    assert [k for k, _ in powers.seen] == [4, 7, 2]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+    before = fit.model.calibration.power.detach().clone()
+    powers.step()
+    after = fit.model.calibration.power.detach()
+    changed = (after != before).nonzero().tolist()
+    assert after.isfinite().all() and [2, 1] not in changed and {k for k, _ in changed} <= {4, 7, 2}
