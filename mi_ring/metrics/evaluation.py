@@ -16,8 +16,7 @@ from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
-#: Lines of the table by the beginnings of the names of numbers.
-LINES = {
+LINES = {  # of the table, by the beginnings of the names of numbers
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
     "aligned": "truth moved by °, % of the diagonal, factor",
