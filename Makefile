@@ -17,7 +17,7 @@ NPM_CI = cd mi_ring/output/viewer && npm ci --ignore-scripts --no-audit --no-fun
 help:
 	@echo 'make setup                   create $(VENV) with everything in it (the targets below do it when needed)'
 	@echo 'make fit [SCENE=...] [ARGS=] fit $(SCENE); ARGS=--resume goes on after an interrupt'
-	@echo 'make test [ARGS=...]         run pytest'
+	@echo 'make test [ARGS=...]         run pytest; ARGS="-m \"not slow\"" leaves out packaging, notebooks, sphinx, browser'
 	@echo 'make tools                   install what some tests need: Chromium (as root), the validator of glTF (with npm)'
 	@echo 'make viewer                  bundle the viewer of the report anew (needs Node.js)'
 	@echo 'make lint                    run ruff and mypy'
@@ -51,7 +51,7 @@ fit: setup
 	$(RUN) mi_ring.fit "$(SCENE)" $(ARGS)
 
 test: setup
-	$(RUN) pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+	$(RUN) pytest -n auto --maxprocesses 4 --dist loadgroup $(ARGS)
 
 # Without these the tests that need them are skipped.
 tools:

@@ -31,6 +31,21 @@ def pytest_configure(config):
         mi.set_variant(variant)
 
 
+#: Fixtures of the tests that are marked as slow: packaging, sphinx, a browser, and processes that are killed.
+SLOW = {"built", "program", "browser", "begun"}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark slow tests; several processes (`--dist loadgroup`) share out tests, those of one module fixture together."""
+    for item in items:
+        if SLOW & {*item.fixturenames}:
+            item.add_marker("slow")
+        fixtures = [found[-1] for found in item._fixtureinfo.name2fixturedefs.values()]
+        if any(fixture.scope == "module" for fixture in fixtures):
+            item.add_marker(pytest.mark.xdist_group(item.module.__name__))
+
+
 def pytest_collection_finish():
     """What is there by now stays: to look through it would take half a second after each of thousands of tests."""
     gc.collect()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from test_networks import plain
+from helpers.plain_layers import plain
 
 from mi_ring import export
 from mi_ring.capture.loading import load_capture

@@ -246,6 +246,7 @@ def test_the_page_shows_pictures_and_figures_of_reports_and_runs_no_script(tmp_p
     assert 'href="batch/b%23.txt">failed</a>' in page and ">done</td>" in page  # which has printed nothing
 
 
+@pytest.mark.slow
 @needs_ray
 def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, tmp_path, monkeypatch, capsys):
     """One scene whose fit is killed, then its worker of Ray; one that is wrong and stops nothing."""

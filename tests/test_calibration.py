@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from helpers.bumpy_ball import HEIGHT, OFF_CAMERA, WIDTH, Setting, tensor
+from helpers.quick_fits import posed
 from scipy.spatial.transform import Rotation
-from test_bridge import HEIGHT, OFF_CAMERA, WIDTH, Setting, tensor
-from test_pose_solver import posed
 
 import mi_ring
 from mi_ring import InputError, fit

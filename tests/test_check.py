@@ -5,8 +5,8 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.silhouettes import ball, silhouettes
 from PIL import Image
-from test_hull import ball, silhouettes
 
 from mi_ring import check
 from mi_ring.geometry import hull

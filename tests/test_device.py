@@ -6,7 +6,7 @@ import sys
 import drjit as dr
 import pytest
 import torch
-from test_fit import QUICK, distance
+from helpers.quick_fits import QUICK, distance
 from torch.nn import functional as F
 
 import mi_ring

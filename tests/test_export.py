@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.microfacets import directions, twin
 from PIL import Image
 from scipy.ndimage import map_coordinates
-from test_bsdf import directions, twin
 
 from mi_ring import export
 from mi_ring.errors import InputError

@@ -22,6 +22,7 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
+from helpers.quick_fits import QUICK, SPHERE, TABLE, distance
 from PIL import Image
 
 from mi_ring import __main__, fit, render
@@ -46,8 +47,6 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.system import files, machine
 
-QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
-SPHERE = [*QUICK, "--domain", "sphere"]  # whose sizes are known
 FILES = [
     "scene.xml",
     "ring.pt",
@@ -68,15 +67,6 @@ def finished(small_capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit") / "small"
     assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "90", *SPHERE]) == 0
     return folder
-
-
-def distance(mesh_file):
-    """Mean distance of a mesh's vertices from the true ellipsoid, as a share of its size (by its implicit function)."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
-    vertices = trimesh.load(mesh_file, process=False).vertices
-    return np.abs(np.linalg.norm((vertices - CENTER) @ turn / AXES, axis=1) - 1).mean()
 
 
 def test_fit_writes_all_results_and_no_other_files(finished):
@@ -181,10 +171,6 @@ def test_a_second_fit_moves_the_first_result_aside(finished, small_capture):
     assert (aside / "mesh.ply").read_bytes() == before != (finished / "mesh.ply").read_bytes()
     for name in FILES:
         (aside / name).replace(finished / name)
-
-
-TABLE = """<shape type="table"><bsdf type="diffuse"/><transform name="to_world">
-  <scale value="90"/><translate x="400" y="-150" z="60"/></transform></shape></scene>"""
 
 
 @pytest.mark.parametrize("table", [False, True])

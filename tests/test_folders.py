@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.ellipsoid_pictures import AXES, CENTER, hit_ellipsoid, in_a_dim_room, pose_at, poses, rays_of
 from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
-from test_photogrammetry import AXES, CENTER, hit_ellipsoid, in_a_dim_room, pose_at, poses, rays_of
 
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture
@@ -115,6 +115,7 @@ STAGES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_at_any_stage_goes_on(photographs, tmp_path):
     pytest.importorskip("pycolmap")
     arguments = [str(photographs), str(tmp_path / "capture"), "--masks", str(photographs / "masks")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import photographed_ellipsoid
-from test_bridge import OFF_CAMERA, Setting, tensor
+from helpers.bumpy_ball import OFF_CAMERA, Setting, tensor
 
 import mi_ring
 from mi_ring.calibration.calibration import Calibration

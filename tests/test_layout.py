@@ -1,12 +1,11 @@
 """The rooms of the package: who may import whom is what each room's `__init__` says."""
 
 import ast
+import functools
 import graphlib
 import re
 import sys
 from pathlib import Path
-
-import pytest
 
 import mi_ring
 
@@ -33,6 +32,7 @@ OTHERS = {
 }
 
 
+@functools.cache
 def tree(module: str) -> ast.Module:
     return ast.parse((PACKAGE / module).read_text("utf-8"))
 
@@ -77,18 +77,17 @@ def docstring(room: str) -> str:
     return ast.get_docstring(tree(f"{room}/__init__.py"))
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_says_in_one_sentence_what_it_is(room):
-    first = docstring(room).split("\n\n")[0]
-    assert first.endswith(".") and first.count(". ") == 0
+def test_a_room_says_in_one_sentence_what_it_is():
+    first = {room: docstring(room).split("\n\n")[0] for room in ROOMS}
+    assert not {room: text for room, text in first.items() if not text.endswith(".") or ". " in text}
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if room_of(m)])
-def test_modules_import_what_their_room_may(module):
-    room = room_of(module)
-    allowed = may_import(room) | EVERYWHERE | {room}
-    for name in imports(module) - {f"mi_ring.{a}" for a in allowed} - allowed - sys.stdlib_module_names:
-        pytest.fail(f"mi_ring/{module} imports {name}; {room}: may import {', '.join(sorted(may_import(room)))}")
+def test_modules_import_what_their_room_may():
+    wrong = {}
+    for module in filter(room_of, MODULES):
+        allowed = may_import(room_of(module)) | EVERYWHERE | {room_of(module)}
+        wrong[module] = imports(module) - {f"mi_ring.{a}" for a in allowed} - allowed - sys.stdlib_module_names
+    assert not {module: names for module, names in wrong.items() if names}
 
 
 def test_rooms_form_no_circle():
@@ -116,12 +115,13 @@ def untyped(function: ast.FunctionDef) -> set[str]:
     return {name for name, type_ in told.items() if name in OURS and re.fullmatch(vague, type_)}
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if not {m, room_of(m)} & OTHERS.keys()])
-def test_what_is_of_a_type_of_ours_says_so(module):
+def test_what_is_of_a_type_of_ours_says_so():
     """So that the type checker sees what one room asks of another."""
-    functions = [node for node in ast.walk(tree(module)) if isinstance(node, ast.FunctionDef)]
-    found = {function.name: names for function in functions if (names := untyped(function))}
-    assert not found
+    wrong = {}
+    for module in [m for m in MODULES if not {m, room_of(m)} & OTHERS.keys()]:
+        functions = [node for node in ast.walk(tree(module)) if isinstance(node, ast.FunctionDef)]
+        wrong |= {f"{module}: {function.name}": names for function in functions if (names := untyped(function))}
+    assert not wrong
 
 
 def test_what_the_rules_are_for():
@@ -133,10 +133,9 @@ def test_what_the_rules_are_for():
     assert not {m for m in MODULES if room_of(m) == "plugins"} & {m for m in MODULES if "mi_ring.nets" in imports(m)}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_commands_are_imported_by_nobody(module):
+def test_commands_are_imported_by_nobody():
     commands = {f"mi_ring.{Path(command).stem}" for command in COMMANDS} - {f"mi_ring.{room}" for room in ROOMS}
-    assert not imports(module) & commands
+    assert not {module: names for module in MODULES if (names := imports(module) & commands)}
 
 
 def test_the_bridge_is_the_only_seam_between_torch_and_dr_jit():
@@ -162,11 +161,17 @@ def test_terms_and_solvers_see_an_iteration_and_no_fit():
     assert {m for m in MODULES if "fitting/fit.py" in files_imported(m)} == running
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_long_modules_give_a_reason(module):
-    text = (PACKAGE / module).read_text("utf-8")
-    assert text.count("\n") <= LONGEST or "This module is long because" in ast.get_docstring(ast.parse(text))
+def test_long_modules_give_a_reason():
+    long = [m for m in MODULES if (PACKAGE / m).read_text("utf-8").count("\n") > LONGEST]
+    assert not [m for m in long if "This module is long because" not in ast.get_docstring(tree(m))]
 
 
 def test_top_level_modules_know_their_names():
     assert len(COMMANDS) >= 7 and "fit.py" in COMMANDS
+
+
+def test_no_test_module_imports_another():
+    """What several need is in conftest or in helpers."""
+    found = {path.name: re.findall(r"^\s*(?:from|import) (test_\w+)", path.read_text("utf-8"), re.M)
+             for path in Path(__file__).parent.rglob("*.py")}  # fmt: skip
+    assert len(found) > 60 and not any(found.values())

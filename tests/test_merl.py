@@ -3,33 +3,9 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-import test_bsdf
+from helpers.merl_tables import closed_form, directions, evaluate, networks, nodes, write
+from helpers.microfacets import direction, draw
 from scipy.spatial.transform import Rotation
-
-SCALES = np.array([1, 1.15, 1.66]) / 1500
-
-
-def closed_form(theta_h, theta_d, phi_d):
-    """Smooth values (..., 3) whose period in φd is π."""
-    lobe = np.exp(-((theta_h / 0.5) ** 2))
-    return np.stack([0.1 + lobe, 0.2 + 0.5 * lobe * np.cos(theta_d) ** 2, 0.3 + 0.2 * np.cos(2 * phi_d)], -1)
-
-
-def write(path, values):
-    """Values (90, 90, 180, 3) [1/sr], NaN where none was measured, as the database has them."""
-    raw = np.nan_to_num(values / SCALES, nan=-1.0)
-    planes = np.zeros(3 * 90 * 90 * 180)
-    h, d, p = np.meshgrid(np.arange(90), np.arange(90), np.arange(180), indexing="ij")
-    index = p + d * 180 + h * 180 * 90
-    for channel in range(3):
-        planes[channel * 1_458_000 + index] = raw[..., channel]
-    path.write_bytes(np.array([90, 90, 180], "<i4").tobytes() + planes.astype("<f8").tobytes())
-
-
-def nodes():
-    """Angles of the cells."""
-    return np.meshgrid((np.arange(90) / 90) ** 2 * np.pi / 2, np.radians(np.arange(90)), np.radians(np.arange(180)),
-                       indexing="ij")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -37,18 +13,6 @@ def table(tmp_path_factory):
     path = tmp_path_factory.mktemp("merl") / "table.binary"
     write(path, closed_form(*nodes()))
     return path
-
-
-def directions(count, seed, widest=75.0):
-    """Unit vectors (count, 3) of the upper side."""
-    rng = np.random.default_rng(seed)
-    angle, azimuth = np.radians(rng.uniform(2, widest, count)), rng.uniform(-np.pi, np.pi, count)
-    return np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], 1)
-
-
-def evaluate(bsdf, wi, wo):
-    """f · (n·wo) at pairs of directions (n, 3), to the viewer and to the light: (n, 3)."""
-    return test_bsdf.evaluate(bsdf, wo, wi)
 
 
 def rusinkiewicz(wi, wo):
@@ -132,7 +96,7 @@ def test_seen_from_the_light_it_is_the_cell_of_its_angle(table):
 @pytest.mark.parametrize("viewer", [(0, 0), (40, -37), (75, 110)])
 def test_directions_are_drawn_by_the_density(table, viewer):
     sample, pdf = mi.chi2.BSDFAdapter(
-        "merl", f'<string name="filename" value="{table}"/>', wi=test_bsdf.direction(*viewer).tolist()
+        "merl", f'<string name="filename" value="{table}"/>', wi=direction(*viewer).tolist()
     )
     test = mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, ires=16)
     assert test.run(significance_level=0.01, test_count=3, quiet=True), test.messages
@@ -149,20 +113,12 @@ def test_directions_are_drawn_by_the_density_of_a_network(tmp_path):
 def test_drawn_directions_give_the_albedo(table):
     """By samples and by a sum over directions."""
     bsdf, wi = mi.load_dict({"type": "merl", "filename": str(table)}), directions(1, 8)
-    _, weight = test_bsdf.draw(bsdf, wi[0], 1 << 16)
+    _, weight = draw(bsdf, wi[0], 1 << 16)
     drawn = np.array(weight).reshape(3, -1).mean(1)
     mu, phi = np.meshgrid((np.arange(200) + 0.5) / 200, (np.arange(400) + 0.5) / 200 * np.pi, indexing="ij")
     wo = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), np.sqrt(1 - mu**2) * np.sin(phi), mu], -1).reshape(-1, 3)
     summed = evaluate(bsdf, np.repeat(wi, len(wo), 0), wo).sum(0) * (2 * np.pi / len(wo))
     np.testing.assert_allclose(drawn, summed, rtol=0.02)
-
-
-def networks(path, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = {"w1": (6, 21), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3), "b3": (3,)}
-    arrays = {name: rng.normal(0, 0.3, (2, *shape)).astype(np.float32) for name, shape in shapes.items()}
-    np.savez(path, names=["one", "other"], **arrays)
-    return {name: array[1] for name, array in arrays.items()}
 
 
 def test_a_network_is_what_numpy_makes_of_it(tmp_path):

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers.plain_layers import plain
 from scipy.integrate import solve_ivp
-from torch.nn import functional as F
 
 from mi_ring.geometry.domain import Sphere
-from mi_ring.nets import chunks, mlp
+from mi_ring.nets import chunks
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
 from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.shape_net import SPEED, ShapeNet
@@ -72,14 +72,6 @@ def test_shape_net_takes_its_euler_steps_through_its_velocity():
         expected = expected + net.velocity(expected) / 3
     torch.testing.assert_close(net(x), expected)
     torch.testing.assert_close(net.flow(x, 1), x + net.velocity(x) / 3)
-
-
-def plain(net, x):
-    """An MLP, by torch's own layers."""
-    h = net.encoding(x)
-    for layer in net.hidden:
-        h = F.leaky_relu(layer(h), mlp.SLOPE)
-    return net.output(h)
 
 
 @pytest.fixture(params=[(1, 0), (2, 0), (2, 100)], ids=["one", "two, anew", "two, kept"])

@@ -85,6 +85,7 @@ def pictures(notebook) -> int:
     return sum("image/png" in o.get("data", ()) for c in notebook.cells for o in c.get("outputs", ()))
 
 
+@pytest.mark.slow
 def test_notebooks_run_in_order(tmp_path):
     copy(tmp_path)
     run = tmp_path / "out" / "first_fit"

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.ellipsoid_pictures import CENTER, LENS, hit_ellipsoid, in_a_dim_room, poses
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_photogrammetry import CENTER, LENS, hit_ellipsoid, in_a_dim_room, poses
 
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.quick_fits import posed
 from scipy.spatial.transform import Rotation
 
 import mi_ring
@@ -56,31 +57,6 @@ def test_slopes_are_those_of_a_plane():
     y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
     found = slopes(torch.stack([2 * x - 3 * y, 0.5 * y], -1))
     torch.testing.assert_close(found[1:-1, 1:-1], torch.tensor([[2.0, -3.0], [0.0, 0.5]]).expand(3, 5, 2, 2))
-
-
-def posed(capture, **changes):
-    """A fit that finds calibration alone, at its middle, and photographs that show what it predicts; which of them."""
-    settings = {"refine": ("cameras",), "levels": (4,), "widths": (56,), "shares": (1.0,), "batch": 4, "spp": 16,
-                "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
-    config = mi_ring.Config(**settings | changes)
-    fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
-    fit.course.iteration, chosen = fit.iterations // 2, fit.sampler.draw_photographs(config.batch)
-    fit.sampler.draw_photographs = lambda count: chosen
-    with torch.no_grad():
-        it = iteration_of(fit)
-    seen = it.observation._replace(rgb=it.prediction.rgb, mask=it.prediction.coverage)
-    fit.sampler.observe = lambda *_: seen
-    own = set(fit.model.calibration.parameters())
-    steppers = fit.optimisation.steppers  # without those of the networks, so that the surface stays as it is
-    fit.optimisation.steppers = [s for s in steppers if own & {*s.optimizer.param_groups[0]["params"]}]
-    return fit, it.batch.photographs
-
-
-def iteration_of(fit):
-    """What a step of a fit would draw, see and predict."""
-    batch = fit.sampler.draw(fit.problem, fit.schedule, fit.ring.domain, fit.iteration)
-    seen = fit.sampler.observe(fit.problem, fit.capture, batch)
-    return Iteration(batch, seen, fit.renderer.predict(fit.problem, fit.model, batch), fit.context())
 
 
 @pytest.mark.parametrize("loss", ["l1+log", "l2"])

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 import trimesh
-from test_fit import TABLE
+from helpers.quick_fits import TABLE
 
 from mi_ring import fit
 from mi_ring.fitting.processes import ALONE, Processes, Share
@@ -111,6 +111,7 @@ def folder(small_capture, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [5, 1])
 def test_gradients_of_a_step_are_those_of_one_process(folder, batch):
     shared, alone = torch.load(folder / f"batch{batch}.pt")
@@ -120,6 +121,7 @@ def test_gradients_of_a_step_are_those_of_one_process(folder, batch):
         assert float((shared[name] - value).norm()) <= 1e-5 * float(value.norm()), name
 
 
+@pytest.mark.slow
 def test_a_lost_process_ends_the_fit_with_its_checkpoint_whole_which_goes_on_to_the_same_result(folder, small_capture):
     run, one = folder / "two", folder / "one"
     for name in ("checkpoint.pt", "checkpoint.before.pt"):
@@ -157,6 +159,7 @@ def test_one_process_has_all_and_exchanges_nothing():
     assert share.sum(tensor) is tensor and share.gathered(tensor) is tensor and ALONE.exchanged == 0
 
 
+@pytest.mark.slow
 def test_mistakes_are_told_once(folder):
     first, second = ((folder / f"mistake{k}.txt").read_text() for k in (0, 1))
     assert first == "InputError('--iterations: is 0, must be at least 1')" and second == "SystemExit(2)"

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from test_indirect_light import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
+from helpers.lit_cup import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.capture.loading import load_capture

@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from helpers.merl_tables import closed_form, directions, evaluate, networks, nodes, write
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_merl import closed_form, directions, evaluate, networks, nodes, write
 
 import mi_ring
 from mi_ring import check, synthesize

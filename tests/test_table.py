@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_photogrammetry import CENTER, LENS, hit_ellipsoid, poses, rays_of, view
+from helpers.ellipsoid_pictures import CENTER, LENS, hit_ellipsoid, poses, rays_of, view
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import scene_bytes, scene_element

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from test_convert import converted, transforms
+from helpers.foreign_captures import converted, transforms
 
 from mi_ring.geometry.hull import Hull, Silhouette
 from mi_ring.images import linear_to_srgb, srgb_to_linear

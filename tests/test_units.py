@@ -5,9 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
-import test_bridge
 import torch
-from test_bridge import OFF_CAMERA, Setting, tensor
+from helpers.bumpy_ball import COUNT, OFF_CAMERA, Setting, tensor
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.config import Config
@@ -140,4 +139,4 @@ def test_lights_on_the_surface_have_finite_gradients(where):
     light = {"type": "point", "position": place.tolist(), "intensity": {"type": "rgb", "value": [2.0, 1.5, 1.0]}}
     rgb, by_vertices, by_material = gradients(Setting([light, light], shadows=True))
     assert rgb.isfinite().all() and by_vertices.isfinite().all() and all(g.isfinite().all() for g in by_material)
-    assert len(rgb) == test_bridge.COUNT
+    assert len(rgb) == COUNT

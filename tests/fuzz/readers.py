@@ -13,11 +13,9 @@ import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 
 # isort: split
 import mitsuba as mi
-import test_convert
-import test_importers
-import test_merl
 import torch
 import trimesh
+from helpers import foreign_captures, merl_tables, photogrammetry_files
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import fitted_scene_xml
@@ -93,27 +91,29 @@ def colours(seed: int, kind: type = np.uint8, channels: int = 3) -> np.ndarray:
 
 
 def metashape(folder: Path) -> Reader:
-    path = test_importers.metashape(folder, terms=test_importers.SENSOR | test_importers.BROWN, where="chunk")
+    path = photogrammetry_files.metashape(
+        folder, terms=photogrammetry_files.SENSOR | photogrammetry_files.BROWN, where="chunk"
+    )
     return Reader([path], imported(Metashape)(path))
 
 
 def sidecars(folder: Path) -> Reader:
-    test_importers.sidecars(folder)
+    photogrammetry_files.sidecars(folder)
     return Reader([folder / "a.xmp"], imported(RealityCapture)(folder))
 
 
 def table(folder: Path) -> Reader:
-    path = test_importers.csv_table(folder)
+    path = photogrammetry_files.csv_table(folder)
     return Reader([path], imported(RealityCapture)(path))
 
 
 def llff(folder: Path) -> Reader:
-    test_importers.llff(folder)
+    photogrammetry_files.llff(folder)
     return Reader([folder / "poses_bounds.npy"], imported(Llff)(folder))
 
 
 def middlebury(folder: Path) -> Reader:
-    test_importers.middlebury(folder)
+    photogrammetry_files.middlebury(folder)
     return Reader([folder / "pot_par.txt"], imported(Middlebury)(folder))
 
 
@@ -121,12 +121,12 @@ def alicevision(folder: Path) -> Reader:
     files = []
     for version in ("1.2.0", "1.2.14"):
         own = {"distortionType": "radialk3", "type": "radial3", "distortionParams": [0.1, 0.02, 0.01]}
-        files.append(test_importers.alicevision(folder, version, own).rename(folder / f"{version}.sfm"))
+        files.append(photogrammetry_files.alicevision(folder, version, own).rename(folder / f"{version}.sfm"))
     return Reader(files, lambda: [imported(SfmData)(path)() for path in files])
 
 
 def openmvg(folder: Path) -> Reader:
-    path = test_importers.openmvg(folder)
+    path = photogrammetry_files.openmvg(folder)
     return Reader([path], imported(SfmData)(path))
 
 
@@ -136,30 +136,30 @@ def transforms(folder: Path) -> Reader:
         {"file_path": "r_1.png", "camera_angle_x": 0.8, "k1": 0.1, "p1": 0.01, "mask_path": "r_1.png"},
     ]
     top = {"camera_model": "OPENCV", "fl_x": 70.0, "fl_y": 71.0, "cx": 30.0, "cy": 25.0}
-    test_convert.transforms(folder, top, frames, lambda k: test_convert.noise(np.uint8, 4, k))
+    foreign_captures.transforms(folder, top, frames, lambda k: foreign_captures.noise(np.uint8, 4, k))
     return Reader([folder / "transforms.json"], imported(Transforms)(folder))
 
 
 def neus(folder: Path) -> Reader:
-    test_convert.neus(folder, max_intensity=0.9, **{f"light_energy_{k}": [2.0, 3.0, 4.0] for k in range(3)})
+    foreign_captures.neus(folder, max_intensity=0.9, **{f"light_energy_{k}": [2.0, 3.0, 4.0] for k in range(3)})
     return Reader([folder / "cameras_sphere.npz"], imported(Neus)(folder))
 
 
 def wildlight(folder: Path) -> Reader:
     neus(folder)
     np.save(
-        folder / "images.npy", np.random.default_rng(1).uniform(0, 7, (3, *test_convert.SIZE[::-1], 3)).astype("f4")
+        folder / "images.npy", np.random.default_rng(1).uniform(0, 7, (3, *foreign_captures.SIZE[::-1], 3)).astype("f4")
     )
     return Reader([folder / "images.npy"], imported(Neus)(folder))
 
 
 def iron(folder: Path) -> Reader:
-    test_convert.iron(folder)
+    foreign_captures.iron(folder)
     return Reader([folder / "train/cam_dict_norm.json"], imported(Iron)(folder))
 
 
 def diligent(folder: Path) -> Reader:
-    test_convert.diligent.__wrapped__(folder)
+    foreign_captures.diligent_folder(folder)
     folder /= "bearPNG"
     view = folder / "view_01"
     files = [folder / "Calib_Results.mat", view / "light_directions.txt", view / "light_intensities.txt"]
@@ -176,7 +176,7 @@ def colmap_binary(folder: Path) -> Reader:
 
 def colmap_of(folder: Path, model: str, suffix: str) -> Reader:
     """The model of the tests, in one of its forms."""
-    test_convert.colmap.__wrapped__(folder)
+    foreign_captures.colmap_folder(folder)
     folder /= "colmap"
     return Reader(
         sorted((folder / model).glob(f"*{suffix}")), imported(colmap.Colmap, images=folder / "images")(folder / model)
@@ -185,8 +185,12 @@ def colmap_of(folder: Path, model: str, suffix: str) -> Reader:
 
 def detected(folder: Path) -> Reader:
     """All that is looked for beside photographs."""
-    files = [test_importers.metashape(folder), test_importers.csv_table(folder), test_importers.alicevision(folder)]
-    test_importers.sidecars(folder)
+    files = [
+        photogrammetry_files.metashape(folder),
+        photogrammetry_files.csv_table(folder),
+        photogrammetry_files.alicevision(folder),
+    ]
+    photogrammetry_files.sidecars(folder)
     return Reader([*files, folder / "a.xmp"], lambda: formats.detect(folder))
 
 
@@ -340,7 +344,7 @@ def merl(folder: Path) -> Reader:
 
 def networks(folder: Path) -> Reader:
     path = folder / "networks.npz"
-    test_merl.networks(path)
+    merl_tables.networks(path)
     return Reader([path], lambda: plugin_error(lambda: MerlNetwork(path, "one")))
 
 
@@ -355,7 +359,7 @@ def synthesized(folder: Path) -> Reader:
     ball.export(mesh_file)
     material.write_text('<bsdf type="principled"><float name="roughness" value="0.3"/><texture type="bitmap" '
                         'name="base_color"><string name="filename" value="colours.png"/></texture></bsdf>')  # fmt: skip
-    test_merl.networks(measured)
+    merl_tables.networks(measured)
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
     config = SynthesizeConfig(mesh_file, folder / "out", material=str(material), second=f"{measured}:one",
                               pattern=str(pattern), environment=sky)  # fmt: skip

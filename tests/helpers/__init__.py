@@ -1,0 +1,1 @@
+"""What several test modules share: small scenes, formulas by hand, quick fits. No tests."""
