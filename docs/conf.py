@@ -1,5 +1,6 @@
 """Sphinx's settings: `make docs`. Docstrings, `--help` and CONTRIBUTING.md are shown from where they are written."""
 
+import builtins
 import contextlib
 import dataclasses
 import importlib
@@ -16,9 +17,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 os.environ["COLUMNS"] = "100"  # of the commands' help
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.ext.napoleon import Config, GoogleDocstring
 from sphinx.util.docutils import SphinxDirective
-from sphinx.util.nodes import make_refnode
+from sphinx.util.nodes import find_pending_xref_condition, make_refnode
 
 import mi_ring
 from mi_ring.__main__ import COMMANDS, summary
@@ -192,6 +194,13 @@ def link(app, env, node, content):
     return content if isinstance(getattr(module, name, None), TypeVar) else None  # which are described nowhere
 
 
+def leave_builtins(app, doctree):
+    """`object` in a signature is Python's, also if a field somewhere has that name."""
+    for node in list(doctree.findall(addnodes.pending_xref)):
+        if node.get("reftarget") in vars(builtins):
+            node.replace_self((find_pending_xref_condition(node, "resolved") or node).children)
+
+
 def setup(app):
     """What Sphinx calls."""
     for name in modules_of(mi_ring):
@@ -208,4 +217,5 @@ def setup(app):
     app.connect("autodoc-skip-member", skip)
     app.connect("autodoc-process-docstring", clean)
     app.connect("missing-reference", link)
+    app.connect("doctree-read", leave_builtins)
     return {"parallel_read_safe": True}

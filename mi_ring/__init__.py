@@ -32,14 +32,18 @@ if TYPE_CHECKING:
     from mi_ring.fitting.config import Config
     from mi_ring.fitting.fit import Fit
     from mi_ring.fitting.iteration import Iteration
+    from mi_ring.fitting.light_selection import choose_lighting
+    from mi_ring.fitting.lighting import Lighting
     from mi_ring.fitting.terms import Term, default_terms
     from mi_ring.geometry.camera import Camera
+    from mi_ring.metrics.evaluation import evaluate
     from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
     from mi_ring.nets.mlp import plain_autograd
     from mi_ring.nets.registry import register_network
     from mi_ring.nets.shape_net import Flow, ShapeNet
     from mi_ring.objects.fitted_object import FittedObject
     from mi_ring.objects.ring_file import load_fit
+    from mi_ring.output.exporting import export
     from mi_ring.scene.lights import Light
     from mi_ring.scene.shot import Response, Shot
 
@@ -51,38 +55,24 @@ _API = {
     "register_network": "nets.registry", "plain_autograd": "nets.mlp",
     "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
     "Lighting": "fitting.lighting", "choose_lighting": "fitting.light_selection",
+    "evaluate": "metrics.evaluation", "export": "output.exporting",
     "Camera": "geometry.camera", "Light": "scene.lights", "Response": "scene.shot", "Shot": "scene.shot",
 }  # fmt: skip
 
 __all__ = [
-    "BRDFNet",
-    "Camera",
-    "Capture",
-    "Config",
-    "Fit",
-    "FittedObject",
-    "Flow",
-    "InputError",
-    "Iteration",
-    "Light",
-    "MaterialNet",
-    "Response",
-    "ShapeNet",
-    "Shot",
-    "Term",
-    "__version__",
-    "default_terms",
-    "load_capture",
-    "load_fit",
-    "plain_autograd",
-    "register_network",
+    "BRDFNet", "Camera", "Capture", "Config", "Fit", "FittedObject", "Flow", "InputError", "Iteration", "Light",
+    "Lighting", "MaterialNet", "Response", "ShapeNet", "Shot", "Term", "__version__", "choose_lighting",
+    "default_terms", "evaluate", "export", "load_capture", "load_fit", "plain_autograd", "register_network",
 ]  # fmt: skip
 
+_COMMANDS = "evaluate", "export"  #: functions that share their name with the module of a command
 #: Names up to version 0.2, with the present ones.
 _RENAMED = {"Ring": "FittedObject", "ReflectanceMap": "MaterialNet"}
 
 
 def __getattr__(name: str) -> object:
+    if name in _COMMANDS:
+        return importlib.import_module(f"{__name__}.{name}")
     if name in _RENAMED:
         raise AttributeError(f"mi_ring.{name} is now mi_ring.{_RENAMED[name]}")
     if name not in _API:

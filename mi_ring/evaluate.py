@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
-from mi_ring.metrics.evaluation import evaluate_fit, evaluation_table, rounded
+from mi_ring.metrics.evaluation import evaluate, evaluation_table, rounded
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.output.ambiguity import ambiguity_of
 from mi_ring.system import command
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> None:
     if out.suffix.lower() != ".json":
         raise InputError(f"{out}: --out: must end in .json")
     require_place(out, "--out")
-    numbers = rounded(evaluate_fit(config.run, config.mesh, config.novel, config.spp, config.seen, config.align))
+    numbers = rounded(evaluate(config.run, config.mesh, config.novel, config.spp, config.seen, config.align))
     write_file(out, json.dumps(numbers, indent=2))
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
@@ -72,6 +72,8 @@ def main(arguments: Sequence[str]) -> None:
         print(f"{ambiguity} Novel views in a known light may be too bright or have another colour", file=sys.stderr)
     print(json.dumps(totals))
 
+
+command.make_callable(__name__, evaluate)
 
 if __name__ == "__main__":
     command.run("mi_ring.evaluate", main)

@@ -1,6 +1,5 @@
 """Write a fitted object for other programs: `python -m mi_ring.export RUN FILE.{ply,obj,glb,xml}`."""
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +9,14 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_views
-from mi_ring.errors import InputError, require_range
+from mi_ring.errors import InputError
 from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
-from mi_ring.output import gltf
 from mi_ring.output.ambiguity import ambiguity_of
-from mi_ring.output.atlas import rasterise, reflectances, unwrap
-from mi_ring.output.mitsuba_scene import first_photograph, write_scene
-from mi_ring.output.obj import write_obj
-from mi_ring.output.ply import write_mesh
+from mi_ring.output.exporting import RESOLUTION, export, require_exportable
+from mi_ring.output.mitsuba_scene import first_photograph
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import command
-from mi_ring.system.files import require_place, write_file
-
-KINDS = (".ply", ".obj", ".glb", ".xml")
-GLB_LEVEL = 5  #: of the mesh in a GLB; finer details are in the normal map
-MAX_LEVEL, MAX_PLY_LEVEL = 8, 10  #: of a mesh with textures, and of one without
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +38,7 @@ class ExportConfig(MaterialOptions):
     subdivisions: int | None = None
     """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
     Without it: that of the fit, and 5 for .glb, whose normal map has the finer detail."""
-    resolution: int = 2048
+    resolution: int = RESOLUTION
     """Width and height of the textures [texels]."""
     time: float = 1.0
     """Time of the flow: 0 is the surface where the fit started, 1 the object."""
@@ -57,22 +48,8 @@ class ExportConfig(MaterialOptions):
 
 
 def require_options(config: ExportConfig) -> None:
-    """Raise InputError for options out of range, and for a file that cannot be written."""
-    kind = config.file.suffix.lower()
-    if kind not in KINDS:
-        raise InputError(f"{config.file}: must end in {', '.join(KINDS)}")
-    finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
-    if config.subdivisions is not None and not 0 <= config.subdivisions <= finest:
-        more = f"; textures have what is finer, and .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
-        raise InputError(f"--subdivisions: is {config.subdivisions}, must be 0 to {finest}{more}")
-    require_range(config, "resolution", 64, 4096)
-    require_range(config, "time", 0, 1)
-    if config.metres is not None and not 0 < config.metres < math.inf:
-        raise InputError(f"--metres: is {config.metres}, must be a positive number")
-    if config.metres is not None and kind != ".glb":
-        raise InputError(f"--metres: is for .glb alone; {config.file.name} keeps the scene's units")
-    if config.file.is_dir():
-        raise InputError(f"{config.file}: is a folder; name the file to write")
+    """Raise InputError for options out of range, and for a file that must not be overwritten."""
+    kind = require_exportable(config.file, config.subdivisions, config.resolution, config.time, config.metres)
     run = config.run if config.run.is_dir() else config.run.parent
     capture = kind == ".xml" and config.file.is_file() and b'"photograph"' in config.file.read_bytes()
     if capture or config.file.resolve() == (run / "mesh.ply").resolve():
@@ -95,37 +72,21 @@ def main(arguments: Sequence[str]) -> None:
     ring = load_fit(config.run)
     edit_material(ring, config)
     kind = config.file.suffix.lower()
-    level = config.subdivisions
-    if level is None:
-        level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
-    if kind in (".glb", ".obj"):
-        gltf.require_expressible(ring)
     photograph = first_photograph(config.run) if kind == ".xml" else None
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
-    require_place(config.file)
-    files = [config.file]
     if kind != ".ply":
         print("Cutting the surface open and baking its material", flush=True)
-    if kind == ".ply":
-        write_mesh(ring, level, config.file, config.time, views)
-    elif kind == ".glb":
-        metres = config.metres or ring.metres
-        write_file(config.file, gltf.glb(ring, level, config.resolution, config.time, metres, views, ring.up))
-        if metres is None:
-            print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
-                  file=sys.stderr)  # fmt: skip
-    else:
-        atlas = unwrap(ring, level, config.resolution, config.time)
-        texels = rasterise(ring, atlas, config.resolution, config.time)
-        values = reflectances(ring, texels.s)
-        if photograph:
-            files = write_scene(config.file, atlas, texels, ring.bsdf, values, *photograph)
-        else:
-            files = write_obj(config.file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+    files = export(ring, config.file, config.subdivisions, config.resolution, config.time, config.metres, views,
+                   photograph)  # fmt: skip
+    if kind == ".glb" and not (config.metres or ring.metres):
+        print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
+              file=sys.stderr)  # fmt: skip
     if unknown := ambiguity_of(config.material or config.run):
         print(unknown, file=sys.stderr)
     print("\n".join(map(str, files)))
 
+
+command.make_callable(__name__, export)
 
 if __name__ == "__main__":
     command.run("mi_ring.export", main)

@@ -79,7 +79,7 @@ def test_a_short_fit_of_the_teapot_is_already_near_and_our_numbers_are_the_judge
     fit.main([str(folder / "scene.xml"), "--out", str(out), "--iterations", "30", "--levels", "3", "4",
               "--widths", "64", "128", "--shares", "0.5", "0.5", "--subdivisions", "5",
               "--refine", "none"])  # fmt: skip
-    ours = evaluation.evaluate_fit(out, folder / "truth/mesh.ply", spp=1)
+    ours = evaluation.evaluate(out, folder / "truth/mesh.ply", spp=1)
     # The start sphere is off by about 50 degrees; half a minute of one core gets this far.
     assert ours["normal_mean"] < 15 and ours["iou"] > 0.9
     render.main([str(out), str(folder / "scene.xml"), str(tmp_path / "pictures"), "--spp", "1"])

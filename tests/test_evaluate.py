@@ -16,7 +16,6 @@ from mi_ring import evaluate, render
 from mi_ring.capture import loading, scenefile
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import image_errors, surfaces
-from mi_ring.metrics.evaluation import evaluate_fit
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import ply
@@ -299,7 +298,7 @@ def test_the_command_agrees_with_the_pictures_that_render_writes(sphere_run, sma
     # What the fit has not seen is no input, though its scene has it.
     kept_out, record = [1, 4], sphere_run / "calibration.json"
     record.write_text(json.dumps({"held_out": {"photographs": [views[k]["name"] for k in kept_out]}}))
-    parted = evaluate_fit(sphere_run, sphere_run / "truth.ply", spp=4)
+    parted = evaluate(sphere_run, sphere_run / "truth.ply", spp=4)
     record.unlink()
     assert [view["name"] for view in parted["views"]] == [view["name"] for view in views]
     for name, index in (("held_out", kept_out), ("input", np.setdiff1d(np.arange(len(views)), kept_out))):

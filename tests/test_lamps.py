@@ -16,8 +16,8 @@ import mi_ring
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.fitting.covariance import covariance
-from mi_ring.fitting.light_selection import Trials, brightest
-from mi_ring.fitting.lighting import Lighting, lit, moved
+from mi_ring.fitting.light_selection import CoarseFits, brightest
+from mi_ring.fitting.lighting import Lighting, with_found_lamps, with_lighting
 from mi_ring.fitting.refinement import refined_of
 from mi_ring.rendering import prediction
 from mi_ring.scene.assembly import lamp_lights, lamps_of, with_lamps
@@ -116,7 +116,7 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
     said = (((30.0, 40.0, -20.0), (900.0, 900.0, 900.0)), ((-0.6, 0.0, 0.8), (450.0, 100.0, 1800.0)))
     for distant in (False, True):
         lighting = Lighting("lamps", said, distant)
-        under = lit(capture, lighting)
+        under = with_lighting(capture, lighting)
         (lamp,) = lamp_lights(under.scene)
         own = under.photographs.lights[3]
         assert own.kind == lamp.kind == ("directional" if distant else "point")
@@ -124,17 +124,17 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
             scale = np.linalg.norm(vector) if distant else 1.0
             np.testing.assert_allclose(light.vector, np.array(vector) / scale, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(light.rgb, rgb, rtol=1e-5)
-        assert moved(lighting, under, center)._replace(lamps=()) == lighting._replace(lamps=())
-        for found, light in zip(moved(lighting, under, center).lamps, (own, lamp)):
+        assert with_found_lamps(lighting, under, center)._replace(lamps=()) == lighting._replace(lamps=())
+        for found, light in zip(with_found_lamps(lighting, under, center).lamps, (own, lamp)):
             np.testing.assert_allclose(found, light[1:], rtol=1e-5, atol=1e-6)
         assert not lamps_of(capture.scene)
     near = Lighting("lamps", said)
     away = tuple((center + 3 * (np.array(said[0][0]) - center)).tolist())
-    gone = lit(capture, Lighting("lamps", ((away, said[0][1]), said[1])))  # where a coarse fit has moved it
-    far = moved(near, gone, center)
+    gone = with_lighting(capture, Lighting("lamps", ((away, said[0][1]), said[1])))  # where a coarse fit has moved it
+    far = with_found_lamps(near, gone, center)
     np.testing.assert_allclose(far.lamps[0], (away, np.multiply(9, said[0][1])), rtol=1e-4)
     np.testing.assert_allclose(far.lamps[1][1], np.multiply(9, said[1][1]), rtol=1e-4)
-    seen, said_first = (lit(capture, lighting).reflectance(center, exposure) for lighting in (far, near))
+    seen, said_first = (with_lighting(capture, lighting).reflectance(center, exposure) for lighting in (far, near))
     assert seen == pytest.approx(said_first)  # the albedo's gauge
     assert [str(Lighting("lamps", said[:1])), str(Lighting("lamps", said, True)), str(Lighting("environment"))] == [
         "1 lamp", "2 distant lamps", "environment",
@@ -145,12 +145,12 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
 def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture):
     """As far away as the cameras, in the directions that the environment has, by its colours."""
     capture = mi_ring.load_capture(small_capture)
-    trials = Trials(capture, mi_ring.Config())
+    trials = CoarseFits(capture, mi_ring.Config())
     toward, colour = np.array([0.48, 0.6, -0.64]), np.array([1.0, 0.8, 0.5])
     values = dr.sh_eval(mi.Vector3f(*toward.tolist()), 4)
     trials.environment = np.stack([np.ravel(v)[0] for v in values])[:, None] * colour, np.ones(25)
     trials.errors[Lighting("environment")] = 0.1
-    under = lit(capture, trials.brightest(1, distant))
+    under = with_lighting(capture, trials.brightest(1, distant))
     center = capture.sphere()[0]
     own = under.photographs.lights[0]
     away = -own.vector if distant else own.vector - center

@@ -18,7 +18,7 @@ from mi_ring.calibration.rig import Rig
 from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
 from mi_ring.fitting import light_selection, priors
-from mi_ring.fitting.lighting import Lighting, lit, moved
+from mi_ring.fitting.lighting import Lighting, with_found_lamps, with_lighting
 from mi_ring.fitting.refinement import refined_of
 from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table
@@ -102,7 +102,7 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     values = iter(true)
     said = re.sub(r'(name="intensity" value=)"0 0 0"', lambda _: '{}"{} {} {}"'.format(_[1], *next(values)), text)
     (exposed / "said.xml").write_text(said)
-    told = lit(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
+    told = with_lighting(mi_ring.load_capture(exposed / "said.xml"), Lighting("environment"))
     np.testing.assert_allclose([shot.response.gain for shot in told.shots], true / true.mean(0), rtol=1e-5)
     with pytest.raises(InputError, match="--refine: is power gain, must be without power or without gain"):
         mi_ring.Config(refine=("power", "gain"))
@@ -221,7 +221,7 @@ def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_en
     ):
         assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5) == refined
     exact = tuple(replace(shot, calibrated=True) for shot in dark.shots)
-    said = lit(replace(dark, shots=exact), Lighting("environment"))
+    said = with_lighting(replace(dark, shots=exact), Lighting("environment"))
     assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5) == ("ambient",)
 
 
@@ -255,7 +255,7 @@ def test_a_lamp_is_one_for_all(small_capture):
     fit = mi_ring.Fit(capture, config, lighting=one)
     assert fit.model.calibration.refined == ("light", "gain", "ambient")
     assert len(fit.model.calibration.light) == 1  # one place for all photographs
-    alone = lit(capture.part(np.array([0])), one)  # in which it might be a flash that moves with the camera
+    alone = with_lighting(capture.part(np.array([0])), one)  # in which it might be a flash that moves with the camera
     assert Rig(alone, np.zeros(3), 0.5, guessed=True).flash is None
 
 
@@ -313,8 +313,8 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
                 (vector, rgb), _, *others = lighting.lamps
                 near = tuple((np.array(vector) + 0.2 * np.linalg.norm(vector) * np.array([0.6, 0.8, 0])).tolist())
                 lighting = lighting._replace(lamps=((vector, rgb), (near, rgb), *others))
-            self.capture = lit(capture, lighting)
-            ended[name] = moved(begun, self.capture, center)
+            self.capture = with_lighting(capture, lighting)
+            ended[name] = with_found_lamps(begun, self.capture, center)
 
         def calibrated(self):
             return self.capture
@@ -432,7 +432,7 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture, mon
         schedule, model = SimpleNamespace(iterations=60), SimpleNamespace(calibration=None)
 
         def __init__(self, capture, config, lighting):
-            self.capture = lit(capture, lighting)
+            self.capture = with_lighting(capture, lighting)
 
         def calibrated(self):
             return self.capture

@@ -245,7 +245,7 @@ def test_with_one_thread_nothing_else_runs_meanwhile(monkeypatch):
 
 def test_a_signal_is_heard_without_a_word(capsys):
     """It may come while something is being printed, which cannot be begun anew within itself."""
-    with session.heeding_signals() as heard:
+    with session.ending_signals() as heard:
         signal.raise_signal(signal.SIGTERM)
         assert heard() == signal.SIGTERM
     assert "".join(capsys.readouterr()) == ""

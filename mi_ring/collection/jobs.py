@@ -92,11 +92,11 @@ class Job:
     @property
     def progress(self) -> str:
         """How far a running fit is, as text."""
-        planned: list[str] = []
-        with contextlib.suppress(OSError):
-            planned = re.findall(r"iteration \d+(/\d+)", self.output.read_text(errors="replace"))
+        planned = ""
+        with contextlib.suppress(OSError, IndexError):
+            planned = re.findall(r"iteration \d+/(\d+)", self.output.read_text(errors="replace"))[-1]
         iteration = self.iteration(self.record.since)
-        return f"iteration {iteration}{''.join(planned[-1:]).replace('/', ' of ')}" if iteration else "begins"
+        return f"iteration {iteration}{' of ' * bool(planned)}{planned}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
         """Are there complete results for this fingerprint?"""

@@ -38,7 +38,7 @@ def each_dataset(**fields: Any) -> ListRuns:
 
 
 def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> ListRuns:
-    """A run for each dataset and each value of a label. `settings`: by value; `quick`: values for --quick."""
+    """A run for each dataset and each value of a label. `settings`: of `Config`; `quick`: values for --quick."""
 
     def list_runs(options: ExperimentOptions) -> list[Run]:
         values = [*settings] if not (options.quick and quick) else quick

@@ -15,7 +15,7 @@ from mi_ring.experiments.datasets import PerturbedCameras, Synthetic
 from mi_ring.experiments.experiment import ExperimentOptions, Row, Run
 from mi_ring.experiments.single_view import TO_MITSUBA, SingleView
 from mi_ring.metrics.embedding import exactly_crossing, inside_out
-from mi_ring.metrics.evaluation import evaluate_fit
+from mi_ring.metrics.evaluation import evaluate
 from mi_ring.metrics.surfaces import compare_surfaces, hits, load_true_mesh
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
@@ -35,7 +35,7 @@ SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str = "", seen: bool = False) -> list[Row]:
     """The numbers of `mi-ring evaluate`, crossing and inverted triangles in % of all, and the time of the fit [s]."""
     truth, novel = run.dataset.truth / "mesh.ply", run.dataset.truth / "scene.xml"
-    numbers = evaluate_fit(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
+    numbers = evaluate(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
     row = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     mesh, _ = load_true_mesh(folder / "mesh.ply")
     row["crossing"] = crossing(mesh.vertices, mesh.faces)

@@ -60,7 +60,7 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
     colours, silhouettes = Equations(layout.count), Equations(layout.count)
     for index in problem.capture.together(problem.fitted):
         scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
-        compare(Comparison(problem, model, surface, index, scale), layout, colours, silhouettes)
+        compare(CovarianceGroup(problem, model, surface, index, scale), layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
     precision = np.eye(layout.count) + colours.information() + silhouettes.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
@@ -97,7 +97,7 @@ class Equations:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CovarianceGroup:
     """Photographs `index` of one size, `scale` times smaller, with what the model predicts for them."""
 
     problem: Problem
@@ -140,7 +140,7 @@ class Comparison:
         return bounced, room_light
 
 
-def compare(at: Comparison, layout: Layout, colours: "Equations", silhouettes: "Equations") -> None:
+def compare(at: CovarianceGroup, layout: Layout, colours: "Equations", silhouettes: "Equations") -> None:
     """Add photographs to the equations: their errors, and their derivatives by central differences."""
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)

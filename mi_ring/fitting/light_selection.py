@@ -12,7 +12,7 @@ from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.lighting import Lighting, exposures, moved, require_compatible, unlit
+from mi_ring.fitting.lighting import Lighting, exposures, is_unlit, require_compatible, with_found_lamps
 from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
@@ -52,7 +52,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     if exposed.max() > ALIKE * exposed.min():
         print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
               "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
-    trials = Trials(capture, config)
+    trials = CoarseFits(capture, config)
     if config.light in ("environment", "turntable"):
         found = Lighting(config.light)
     elif config.light == "lamps":
@@ -61,7 +61,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
         likely = [Lighting("environment"), Lighting("turntable")]
         if math.isfinite(trials.error(likely[0])):  # it tells where lamps are
             likely.insert(1, trials.brightest(1))
-        if not unlit(capture):
+        if not is_unlit(capture):
             own = trials.error(Lighting("capture"))
             likely = [one for one in likely if trials.error(one) < BETTER[one.kind] * own] or [Lighting("capture")]
         found = trials.best(*likely)
@@ -77,7 +77,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     return found
 
 
-class Trials:
+class CoarseFits:
     """Coarse fits of a capture under different lights, each made once."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
@@ -105,7 +105,7 @@ class Trials:
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
-        self.found[lighting] = moved(lighting, fit.calibrated(), self.center)
+        self.found[lighting] = with_found_lamps(lighting, fit.calibrated(), self.center)
         if lighting == Lighting("environment") and fit.model.calibration:
             room = fit.model.calibration.room
             information = room.matrix.diagonal(dim1=1, dim2=2).mean(0)
@@ -123,12 +123,12 @@ class Trials:
     def lamps(self) -> Lighting:
         """The fewest lamps that explain the photographs well enough, at the cameras' distance or infinitely far."""
         several = [self.brightest(count) for count in range(1, MOST + 1)]
-        enough = FEWER * min(self.error(some) for some in several if self.apart(some))
-        lamps = next(some for some in several if self.apart(some) and self.error(some) <= enough)
+        enough = FEWER * min(self.error(some) for some in several if self.are_apart(some))
+        lamps = next(some for some in several if self.are_apart(some) and self.error(some) <= enough)
         distant = self.brightest(len(lamps.lamps), distant=True)
-        return self.best(lamps, distant) if self.apart(distant) else lamps
+        return self.best(lamps, distant) if self.are_apart(distant) else lamps
 
-    def apart(self, lamps: Lighting) -> bool:
+    def are_apart(self, lamps: Lighting) -> bool:
         """Are the lamps that were found apart, seen from the object? Else two of them stand for one."""
         self.error(lamps)
         if len(lamps.lamps) < 2:
@@ -154,7 +154,7 @@ class Trials:
     def plain(self, lighting: Lighting) -> Lighting:
         """The lighting that was found; with one material at first if that explains the photographs as well."""
         one = lighting._replace(plain=1.0)
-        if self.error(one) >= PLAIN * self.error(lighting) or not self.apart(one):
+        if self.error(one) >= PLAIN * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
         return self.found[one]._replace(plain=LOOSE)
 

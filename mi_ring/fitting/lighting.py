@@ -68,7 +68,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
         if own and capture.photographs.dark:
             raise InputError(f"{capture.path}: --refine {min(own)}: is of the photographs' own lights, of which there "
                              "are none; leave it out")  # fmt: skip
-        if unlit(capture) and not others:
+        if is_unlit(capture) and not others:
             raise InputError(f"{capture.path}: emitter: nothing lights the object; give lights, or --light auto")
         return
     if not hasattr(capture.shape.bsdf(), "lobes"):
@@ -90,7 +90,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
                          f"{config.light} puts another; leave it out")  # fmt: skip
 
 
-def unlit(capture: Capture) -> bool:
+def is_unlit(capture: Capture) -> bool:
     """Have the photographs neither lights of their own nor room light?"""
     return capture.photographs.dark and capture.room is None
 
@@ -107,7 +107,7 @@ def exposures(capture: Capture) -> np.ndarray:
     return strengths / strengths.mean(0)
 
 
-def moved(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
+def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
     """The lighting with the lamps that a fit has found: those of `capture`, which it has calibrated.
 
     All lamps are scaled so that the first brings as much light as before to the object at `center` (3,): the albedo
@@ -123,7 +123,7 @@ def moved(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
     return lighting._replace(lamps=tuple((tuple(vector.tolist()), tuple(rgb.tolist())) for vector, rgb in lamps))
 
 
-def lit(capture: Capture, lighting: Lighting) -> Capture:
+def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
     """The capture under these lights. An environment starts grey and constant.
 
     Lamps after the first become lamps of the scene.
@@ -146,7 +146,7 @@ def lit(capture: Capture, lighting: Lighting) -> Capture:
     return replace(capture, scene=scene, shots=tuple(shots), room=room)
 
 
-def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
+def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
     """Move the scene's environment into the harmonics of the room's light, whose reflection has no noise.
 
     Returns the capture with that room, the scene without the environment, and its harmonics (BASIS, 3) or None. Nothing
@@ -162,7 +162,7 @@ def smoothed(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
     return replace(capture, room=room), scene, known
 
 
-def frames(capture: Capture, lighting: Lighting) -> Collection[str]:
+def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
     """Axes in which unknown room light is fixed."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

@@ -11,7 +11,7 @@ import torch
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.lighting import Lighting, frames, lit, smoothed
+from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, room_frames, with_lighting
 from mi_ring.fitting.processes import Processes, current
 from mi_ring.system.machine import device
 
@@ -38,7 +38,7 @@ class Problem:
         """Raises InputError if no photographs are left to fit, or if the object is black in them."""
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
-        as_lit, scene, environment = smoothed(lit(capture, lighting))
+        as_lit, scene, environment = environment_as_harmonics(with_lighting(capture, lighting))
         seen = as_lit.part(fitted) if len(held_out) else as_lit
         return cls(capture, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
                    current(), device())  # fmt: skip
@@ -46,7 +46,7 @@ class Problem:
     @property
     def room_frames(self) -> Collection[str]:
         """Axes in which unknown room light is fixed: "world", "camera"."""
-        return frames(self.capture, self.lighting)
+        return room_frames(self.capture, self.lighting)
 
     def albedo(self, center: np.ndarray) -> float:
         """Albedo of an object at `center` (3,) according to the lights' intensities; above 1 they cannot be true."""

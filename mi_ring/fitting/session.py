@@ -32,7 +32,7 @@ WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an ite
 
 
 @contextlib.contextmanager
-def heeding_signals() -> Iterator[Callable[[], int]]:
+def ending_signals() -> Iterator[Callable[[], int]]:
     """Yields a function that returns the first signal that ends a fit, 0: none. A second Ctrl-C ends it at once.
 
     Shells, schedulers and the kernel send the other signals more than once.
@@ -159,7 +159,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
 
 
 @contextlib.contextmanager
-def telling_how_to_go_on(folder: Path) -> Iterator[None]:
+def resume_hint(folder: Path) -> Iterator[None]:
     """Context in which a second Ctrl-C, which drops the results, says how to resume."""
     try:
         yield
@@ -192,7 +192,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
     """
     processes, model, config = fit.problem.processes, fit.model, fit.problem.config
     fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))
-    with heeding_signals() as heard, tolerating_closed_output():
+    with ending_signals() as heard, tolerating_closed_output():
 
         def interrupted() -> int:
             return processes.maximum(heard())
@@ -214,7 +214,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             print(f"Start: {start_of(fit)}")
             processes.on_first(lambda: write_inputs(fit, folder))
         keeper = Keeper(fit, folder, prepare)
-        with telling_how_to_go_on(folder):
+        with resume_hint(folder):
             try:
                 train(fit, keeper, interrupted, costs)
             except ProcessLost:

@@ -15,26 +15,26 @@ from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
 CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares above which there is a finding
-ODD_POWER = 3.0  #: a fitted light power is odd if it is this many times that of the others, or one over it
-FAR, LEAST_FAR = 4.0, 2.0  #: a fitted camera has moved far: this many times the median, and at least so far [px]
+ODD_POWER = 3.0  #: a light is odd if a fit finds it so many times as strong as the others, or as weak
+FAR, LEAST_FAR = 4.0, 2.0  #: a fit has moved a camera far: so many times the median, and at least so far [px]
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Photographs, by a fit's `summary`, that it has moved much farther than the others, with distances, as text."""
+    """Names of photographs that a fit has moved much farther than the others. `photographs`: from its summary."""
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """Photographs, by a fit's `summary`, whose light is much stronger or weaker than the others', as text."""
+    """Names of photographs whose light is much stronger or weaker than the others', by the summary of a fit."""
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
     return ", ".join(f"{name} ({power:.2g} times)" for name, power in odd.items())
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """`moved_far` and `odd_powers` of these photographs by a fit's calibration.json beside the scene file, if any."""
+    """`moved_far` and `odd_powers` of these photographs, by calibration.json beside the scene; empty without it."""
     record = read_json(scene.parent / "calibration.json")
     try:
         known = {name: entry for name, entry in record["photographs"].items() if name in names}

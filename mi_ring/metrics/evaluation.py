@@ -16,8 +16,7 @@ from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
-#: Lines of the table by the beginnings of the names of numbers.
-LINES = {
+LINES = {  # of the table, by the beginnings of the names of numbers
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
     "aligned": "truth moved by °, % of the diagonal, factor",
@@ -28,9 +27,10 @@ LINES = {
 }  # fmt: skip
 
 
-def evaluate_fit(
-    run: Path, mesh: Path, novel: Path | None = None, spp: int = SPP, seen: bool = False, align: str | None = None
-) -> dict:
+def evaluate(
+    run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
+    align: str | None = None,
+) -> dict:  # fmt: skip
     """Errors of the results folder `run`, and lists of those of each photograph: `views` and `novel_views`.
 
     `mesh`: true surface; `novel`: scene file of novel views; `seen`: distances between surfaces are of parts that a
@@ -38,6 +38,7 @@ def evaluate_fit(
     the motion is `aligned_*`. Numbers of fitted photographs end in `_input`, those of held-out ones in `_held_out`.
     Undefined numbers are missing: the genus of an open surface, for instance.
     """
+    run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml")
     unseen = novel and load_capture(novel)
     truth_mesh, truth = load_true_mesh(mesh)

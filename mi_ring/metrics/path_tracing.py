@@ -46,9 +46,9 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with one `flash` emitter, by which stock integrators see the light of a photograph, and without rooms.
+    """The scene with exactly one `flash`, the photographs' light for stock integrators, and without a `room`.
 
-    A `shapenet` has a `flash`. The light of a `room` is path traced by both renderers. Raises SceneError for several.
+    A `shapenet` has a `flash` already. Both renderers path trace the light of a `room`. Raises SceneError for several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:

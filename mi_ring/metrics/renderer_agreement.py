@@ -22,7 +22,7 @@ class Comparison:
     name: str
     radiance: float  #: mean of `path` over all pixels and channels
     difference: float  #: mean of photometric − path
-    absolute_difference: float  #: mean over pixels of |photometric − path|
+    absolute_difference: float  #: mean over pixels of abs(photometric − path)
     noise: float  #: part of the absolute difference that Monte Carlo noise explains
     psnr: float  #: photometric against path [dB], sRGB, at most 100
     shadows: float  #: light that shadows remove

@@ -132,13 +132,13 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (n,) of points of a surface, or of those that `views` show, from another. `middle` (3,): near both."""
+    """Distances (n,) from random points of a surface, or from those that one of the `views` shows, to another one."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]
         if not len(points):
             raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
                              "same frame, and do the faces of both point outwards?")  # fmt: skip
-    mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)
+    mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)  # near 0, for precision
     squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
     return np.sqrt(squared)

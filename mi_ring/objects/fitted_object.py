@@ -2,13 +2,21 @@
 
 from collections.abc import Sequence
 
+import mitsuba as mi
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mi_ring.geometry.camera import Camera
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets.brdf_net import COOK_TORRANCE, BRDFNet, MaterialNet, Parameter
 from mi_ring.nets.shape_net import Flow, ShapeNet
+from mi_ring.rendering import prediction
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.assembly import assembled
+from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Shot
 
 
 class FittedObject(nn.Module):
@@ -57,6 +65,24 @@ class FittedObject(nn.Module):
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
         """`surface` and `material`."""
         return self.surface(s, time), self.material(s)
+
+    def render(
+        self, camera: Camera, light: Light | None = None, spp: int = 16, level: int | None = None, shadows: bool = True,
+        seed: int = 0,
+    ) -> Tensor:  # fmt: skip
+        """A picture (H, W, 3), linear radiance by direct light, of the size of the camera.
+
+        `light`: default is a point light of intensity 1 at the camera. `level`: of the icosphere; default:
+        `subdivisions`. `spp`: samples per pixel. The picture has gradients with respect to the parameters of both
+        networks, moving outlines and shadows included, for one backward pass; none within `torch.no_grad()`.
+        """
+        shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
+        surface = Surface(assembled([shape]), shape, self)
+        s, faces = self.domain.sample(self.subdivisions if level is None else level)
+        surface.set_faces(faces)
+        vertices, material = self(s.to(self.center.device))
+        shot = Photographs.of([Shot("view", camera, light)])
+        return prediction.render(surface, shot, vertices, material, spp, seed, shadows)[0][0]
 
     def to_scene(self, points: Tensor) -> Tensor:
         """Points (V, 3) of the normalised frame in scene units, none of them below the ground."""

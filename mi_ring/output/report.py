@@ -178,7 +178,7 @@ def sides(x: float, y: float) -> str:
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
-class Prediction(NamedTuple):
+class PredictedPhotograph(NamedTuple):
     """The prediction of one photograph."""
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance
@@ -191,7 +191,7 @@ def scale_of(result: FitResult, size: tuple[int, int]) -> int:
     return -(-size[0] // result.width)
 
 
-def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Prediction]:
+def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[PredictedPhotograph]:
     """Predictions of photographs `index`, all of one size."""
     capture, ring = result.capture, result.ring
     size = capture.shots[index[0]].size
@@ -202,19 +202,19 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
     small = capture.selected(index, max(scale, max(size) // PICTURE))
     maps = prediction.maps(surface, small, ring.brdf_net.bsdf_parameters)
     return [
-        Prediction(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
+        PredictedPhotograph(rgb[n].numpy(), coverage[n].numpy(), {name: values[n] for name, values in maps.items()})
         for n in range(len(index))
     ]
 
 
 def panels_of(
-    result: FitResult, index: np.ndarray, predictions: Sequence[Prediction]
+    result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
     """`panel_of` of several photographs."""
     return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
-def panel_of(result: FitResult, k: int, prediction: Prediction) -> tuple[PhotographPanel, float]:
+def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
     """The row of photograph `k`, and its mean squared error in sRGB over the pixels that are `comparable`."""
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)

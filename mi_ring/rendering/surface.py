@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.edge_selection import Edges
-from mi_ring.scene.assembly import lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
+from mi_ring.scene.assembly import RenderedObject, lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
@@ -31,8 +30,9 @@ class Surface:
     """
 
     def __init__(
-        self, scene: mi.Scene, shape: mi.Mesh, ring: FittedObject | None = None, in_scene_units: bool = False
+        self, scene: mi.Scene, shape: mi.Mesh, ring: RenderedObject | None = None, in_scene_units: bool = False
     ) -> None:
+        self.given = scene, shape  #: kept alive: Dr.Jit fails if objects go between a picture and its backward pass
         scene, self.table = split_tables(scene)
         self.unit = 1.0
         if ring is not None:
@@ -103,7 +103,7 @@ class Surface:
             self.params = mi.traverse(self.scene)
         move_lamps(self.scene, places, strengths)
 
-    def show(self, ring: FittedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
+    def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
         """Write a `FittedObject` at domain points (V, 3) with triangles (F, 3), at a `time` of the flow in [0, 1]."""
         with torch.no_grad():
             self.set_faces(faces)

@@ -1,16 +1,35 @@
 """Scenes made of the parts of other scenes: with other lamps, another surface, or without tables."""
 
 from collections.abc import Iterable
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from torch import Tensor
 
 from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.xml_elements import load_bsdf
 
 MAX_EXTENT = 4.0  #: radius of a ball that holds the object during a fit, in radii of the normalising sphere
+
+
+class RenderedObject(Protocol):
+    """What is rendered of a `FittedObject`, which is above this room."""
+
+    center: Any  #: (3,) tensor of the normalising sphere [scene units]
+    radius: Any  #: its radius, a tensor
+    bsdf: str  #: the BSDF as Mitsuba's XML
+    brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
+
+    def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
+        """Surface points (V, 3) of domain points (V, 3)."""
+        ...
+
+    def __call__(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
+        """Surface points and the parameters of the BSDF by name."""
+        ...
 
 
 def top_level_emitters(scene) -> list:
@@ -63,7 +82,9 @@ def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
     return assembled(shapes, emitters, scene.sensors(), scene.integrator())
 
 
-def with_fitted_shape(scene: mi.Scene, shape: mi.Mesh, ring, unit: float = 1.0) -> tuple[mi.Scene, mi.Mesh]:
+def with_fitted_shape(
+    scene: mi.Scene, shape: mi.Mesh, ring: RenderedObject, unit: float = 1.0
+) -> tuple[mi.Scene, mi.Mesh]:
     """A scene with a new shape instead of `shape`, with the BSDF and attributes of a `FittedObject`; and that shape.
 
     The shape is in units of `unit` scene units. At first it is a ball about the object: when a scene is assembled, its

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mi_ring.geometry.camera import Camera
-from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.assembly import RenderedObject
 from mi_ring.scene.plain_mesh import mesh_of
 
 SURFACE_OFFSET = 1e-5  #: of a ray's origin from the surface, for a mesh of size 1: more than float32's rounding error
@@ -72,7 +72,7 @@ def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
 
 
 def visible_points(
-    ring: FittedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
+    ring: RenderedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
 ) -> tuple[np.ndarray, float]:
     """Which domain points (V, 3), vertices of faces (F, 3), are seen on the object, (V,) bool.
 

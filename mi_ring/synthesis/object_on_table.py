@@ -91,8 +91,7 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
         mesh.invert()
     middle = mesh.bounds.mean(0)
     scale = radius / np.linalg.norm(mesh.vertices - middle, axis=1).max()
-    matrix = np.diag([scale, scale, scale, 1.0])
-    matrix[:3, 3] = -scale * middle
+    matrix = trimesh.transformations.scale_and_translate(scale, -scale * middle)
     mesh.apply_transform(matrix)
     mesh.vertices = mesh.vertices.astype(np.float32)
     return mesh, colours, matrix

@@ -68,14 +68,12 @@ class Studio:
             pattern = pattern_of(config.pattern, self.mesh.vertices, config.bands, "xyz".index(config.up), "--pattern")
             bsdf = pattern.blend(bsdf, second)
         self.shape = shape_of(self.mesh, colours, bsdf, pattern)
-        #: as XML; replaces the photographs' lights
-        self.environment = self.environment_element() if config.environment else None
+        self.environment = self.environment_element() if config.environment else None  #: replaces all other lights
         self.room = light_sources.random_room(config.room_kind, config.cameras == "turntable", self.random(1))
         self.room_level = config.room / np.pi  #: mean radiance of the room; the photographs' light brings 1 W/m²
         self.tables: list[Element] = []  #: elements of the scene file
         self.spp = int(np.ceil(np.sqrt(config.spp))) ** 2  #: paths per pixel, a square number
-        #: (views, 3) exposure of the photographs, relative to their mean
-        self.gains = exposures(config.views, config.wrong_exposure, self.random(6))
+        self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
 
     def random(self, *purpose: int) -> np.random.Generator:
         """A generator for one purpose, so that an option changes nothing but what it is for."""
@@ -130,19 +128,23 @@ class Studio:
             shapes.append(load_element(element))
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
-    def radiance(self, scene: ObjectOnTable, photograph: PlannedPhotograph, spp: int, scale: int = 1) -> tuple:
-        """Linear radiance (H, W, 3), `scale` times smaller: by lamps, the first of 1 W/m²; and by the room, or 0."""
-        config, view = self.config, LensCamera(photograph.camera.shrunk(scale))
-        light = photograph.light if self.environment is None else load_element(self.environment)
-        picture = scene.radiance(view, light, spp, photograph.seed, config.depth, hidden=self.environment is None)
-        for n, lamp in enumerate(self.further_lamps(photograph.light), 1):
-            picture = picture + scene.radiance(view, lamp, spp, photograph.seed + LAMP_SEED_STEP * n, config.depth)
-        if not config.room:
-            return picture, 0.0
-        # In a picture of its own: paths that choose between two lights are much noisier.
-        room = self.room_level * room_envmap(self.room, photograph.camera.to_world)
+    def radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
+        """Linear radiance (H, W, 3) by all lamps, of which the first brings 1 W/m². `scale`: times smaller."""
+        depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
+        light = taken.light if self.environment is None else load_element(self.environment)
+        picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
+        for n, lamp in enumerate(self.further_lamps(taken.light), 1):
+            picture = picture + scene.radiance(view, lamp, spp, taken.seed + LAMP_SEED_STEP * n, depth)
+        return picture
+
+    def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
+        """As `radiance`, by the room. It is a picture of its own: paths that choose between lights are noisier."""
+        view = LensCamera(taken.camera.shrunk(scale))
+        if not self.config.room:
+            return np.zeros((*reversed(view.camera.size), 3))
+        room = self.room_level * room_envmap(self.room, taken.camera.to_world)
         light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(room.astype(np.float32))})
-        return picture, scene.radiance(view, light, spp, photograph.seed + 1, config.depth)
+        return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
         """Pixel value of radiance 1: from --exposure, or such that a share --clipped of the object is clipped."""
@@ -152,8 +154,8 @@ class Studio:
         values, scale = [], max(1, min(TRIAL_SCALE, min(config.size) // 8))
         for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
             inside = scene.coverage(LensCamera(photograph.camera.shrunk(scale)), 16) > 0.9
-            own, ambient = self.radiance(scene, photograph, 36, scale)
-            values.append((own + ambient)[inside].max(-1))
+            both = self.radiance(scene, photograph, 36, scale) + self.room_radiance(scene, photograph, 36, scale)
+            values.append(both[inside].max(-1))
         if not np.concatenate(values).size:
             raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows it alone, by which "
                              "the exposure would be chosen; give --exposure, for instance 0.5")  # fmt: skip
@@ -181,8 +183,8 @@ def write_capture(config: SynthesizeConfig) -> None:
             for photograph in photographs if not (folder / "images" / photograph.file).is_file()
             or not (folder / "masks" / f"{photograph.name}.png").is_file()]  # fmt: skip
     for photograph, folder in progress(todo, "photographing", unit="photograph", leave=True):
-        own, ambient = studio.radiance(scene, photograph, studio.spp)
-        pictures = {"images": exposure * (own + ambient)}
+        ambient = studio.room_radiance(scene, photograph, studio.spp)
+        pictures = {"images": exposure * (studio.radiance(scene, photograph, studio.spp) + ambient)}
         coverage = scene.coverage(LensCamera(photograph.camera))
         write_image(to_bytes(coverage[..., None] >= 0.5), folder / "masks" / f"{photograph.name}.png")
         if folder == out:  # novel views have neither noise nor errors

@@ -1,0 +1,85 @@
+"""Writes a fitted object as a file of another program."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.output import gltf
+from mi_ring.output.atlas import rasterise, reflectances, unwrap
+from mi_ring.output.mitsuba_scene import write_scene
+from mi_ring.output.obj import write_obj
+from mi_ring.output.ply import write_mesh
+from mi_ring.scene.shot import Shot
+from mi_ring.scene.visibility import MaskedCamera
+from mi_ring.system.files import require_place, write_file
+
+KINDS = ".ply", ".obj", ".glb", ".xml"
+GLB_LEVEL = 5  #: of its mesh; finer detail is in the normal map
+MAX_LEVEL, MAX_PLY_LEVEL = 8, 10  #: finest level of a mesh with textures, and of one without
+RESOLUTION = 2048  #: width of textures [px]
+
+
+def export(
+    ring: FittedObject, file: str | Path, subdivisions: int | None = None, resolution: int = RESOLUTION,
+    time: float = 1.0, metres: float | None = None, views: Sequence[MaskedCamera] | None = None,
+    photograph: tuple[Shot, np.ndarray | None] | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
+
+    `subdivisions`: level of the mesh, about 10 · 4^level vertices; default: that of the fit, at most 5 for GLB.
+    `resolution`: width of textures [px]. `time`: of the flow, in [0, 1]. `metres`: length of a scene unit, for GLB;
+    default: as the object knows it. `views`: cameras of the photographs; PLY and GLB then say what they show.
+    `photograph`: camera and light of an XML scene, with the light of its room (BASIS, 3).
+
+    Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
+    """
+    file = Path(file)
+    kind = require_exportable(file, subdivisions, resolution, time, metres)
+    if kind == ".xml" and photograph is None:
+        raise InputError(f"{file}: a scene for Mitsuba needs a photograph, for its camera and light")
+    if kind in (".glb", ".obj"):
+        gltf.require_expressible(ring)
+    require_place(file)
+    level = subdivisions
+    if level is None:
+        level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
+    if kind == ".ply":
+        write_mesh(ring, level, file, time, views)
+        return [file]
+    if kind == ".glb":
+        write_file(file, gltf.glb(ring, level, resolution, time, metres or ring.metres, views, ring.up))
+        return [file]
+    atlas = unwrap(ring, level, resolution, time)
+    texels = rasterise(ring, atlas, resolution, time)
+    values = reflectances(ring, texels.s)
+    if photograph is not None:
+        return write_scene(file, atlas, texels, ring.bsdf, values, *photograph)
+    return write_obj(file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+
+
+def require_exportable(
+    file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
+) -> str:  # fmt: skip
+    """The suffix of a file. Raises InputError for one that is not among `KINDS`, and for values out of range."""
+    kind = file.suffix.lower()
+    if kind not in KINDS:
+        raise InputError(f"{file}: must end in {', '.join(KINDS)}")
+    finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
+    if subdivisions is not None and not 0 <= subdivisions <= finest:
+        more = f"; textures have what is finer, and .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
+        raise InputError(f"--subdivisions: is {subdivisions}, must be 0 to {finest}{more}")
+    if not 64 <= resolution <= 4096:
+        raise InputError(f"--resolution: is {resolution}, must be 64 to 4096")
+    if not 0 <= time <= 1:
+        raise InputError(f"--time: is {time}, must be 0 to 1")
+    if metres is not None and not 0 < metres < math.inf:
+        raise InputError(f"--metres: is {metres}, must be a positive number")
+    if metres is not None and kind != ".glb":
+        raise InputError(f"--metres: is for .glb alone; {file.name} keeps the scene's units")
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; name the file to write")
+    return kind
