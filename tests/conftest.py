@@ -2,6 +2,7 @@
 
 import gc
 import os
+import time
 from pathlib import Path
 
 # Each of several processes has cores of its own: with more threads than cores they mostly wait for one another.
@@ -56,9 +57,14 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True)
 def no_scenes_of_other_tests():
-    """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others."""
+    """Free what a test leaves: as long as a scene lives, Dr.Jit compiles its objects into the kernels of all others.
+
+    Not after the many tests that take no time, for looking for garbage takes longer.
+    """
+    started = time.process_time()
     yield
-    gc.collect()
+    if time.process_time() - started > 0.1:
+        gc.collect()
 
 
 def missing_package(error: BaseException | None) -> str | None:

@@ -45,7 +45,9 @@ def lobe(path):
 
 @pytest.fixture(autouse=True)
 def short_trials(monkeypatch):
-    monkeypatch.setattr(light_selection, "COARSE", light_selection.COARSE | {"iterations": 18, "batch": 4})
+    monkeypatch.setattr(
+        light_selection, "COARSE", light_selection.COARSE | {"iterations": 14, "levels": (2,), "batch": 4}
+    )
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """From photographs to a capture, piece by piece: pictures, masks, the table, crops."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -57,7 +58,9 @@ def test_masks_of_a_dim_room_with_lamps():
     np.testing.assert_allclose(found.object.points.mean(0), CENTER, atol=0.15)
 
 
-def test_a_trial_fit_covers_the_object_without_any_mask():
+def test_a_trial_fit_covers_the_object_without_any_mask(monkeypatch):
+    few = replace(shading_trial.SETTINGS, iterations=30, levels=(3,), widths=(80,), subdivisions=3)
+    monkeypatch.setattr(shading_trial, "SETTINGS", few)
     random = np.random.default_rng(5)
     views, true = [], []
     for k, pose in enumerate(poses(20)):

@@ -24,7 +24,8 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.output import report, svg
 
 VIEWER = Path(report.__file__).parent / "viewer"
-QUICK = ["--levels", "2", "--widths", "56", "--shares", "1", "--batch", "4", "--subdivisions", "3", "--no-indirect"]
+QUICK = ["--levels", "2", "--widths", "56", "--shares", "1", "--batch", "4", "--subdivisions", "3", "--no-indirect",
+         "--domain", "sphere"]  # fmt: skip
 DRAWING = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # without a GPU
 COLOUR = np.array([230, 170, 120])  # of the box, sRGB
 
@@ -127,7 +128,7 @@ def test_it_is_one_self_contained_file(page_file, fitted):
     page = page_file.read_text("utf-8")
     body = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', body)
-    assert len(sources) == 1 + 12 * 7 and all(s.startswith("data:") for s in sources)
+    assert len(sources) == 2 + 12 * 7 and all(s.startswith("data:") for s in sources)
     assert page.count("<script") == page.count("</script>") == 4 and "<link" not in page
     assert all(f"{k:03}.png" in body for k in range(12))
     without = report.report_html(fitted)

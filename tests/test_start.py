@@ -140,7 +140,7 @@ def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, ca
     path, _ = broken_capture
     no_masks(path)
     run = tmp_path / "run"
-    assert fit.main([str(path), "--out", str(run), "--iterations", "90", *QUICK]) == 0
+    assert fit.main([str(path), "--out", str(run), "--iterations", "40", *QUICK]) == 0
     assert '"mask"' in (run / "log.jsonl").read_text() and distance(run / "mesh.ply") < 0.05
     with pytest.raises(InputError, match="--domain hull: there are no masks of the whole object"):
         fit.main([str(path), "--out", str(run), "--domain", "hull", "--masks", "given", *QUICK])

@@ -269,7 +269,7 @@ def test_p_values_of_photometric_and_path_are_uniform(tmp_path):
     """Of a convex object's photographs, which the two see alike."""
     scene, sensors = path_tracing.open_lit_scene(write(tmp_path, ELLIPSOID, *CONVEX))
     photographs, p = Photographs.of([sensor.shot for sensor in sensors]), []
-    for seed in range(50):
+    for seed in range(25):
         for k in range(3):
             pictures = path_tracing.render_both(scene, photographs, k, sensors[k], 1, 4, 2, 32 * (3 * seed + k))
             p.append(renderer_agreement.p_of_agreement(pictures.photometric.astype(float), pictures.path.astype(float)))
