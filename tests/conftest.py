@@ -37,12 +37,14 @@ SLOW = {"built", "program", "browser", "begun"}
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark slow tests; several processes (`--dist loadgroup`) share out tests, those of one module fixture together."""
+    """Mark slow tests; mark those that share a fit, which `--dist loadgroup` then gives to one process."""
     for item in items:
         if SLOW & {*item.fixturenames}:
             item.add_marker("slow")
         fixtures = [found[-1] for found in item._fixtureinfo.name2fixturedefs.values()]
-        if any(fixture.scope == "module" for fixture in fixtures):
+        if "finished" in item.fixturenames:
+            item.add_marker(pytest.mark.xdist_group("finished"))
+        elif any(fixture.scope == "module" for fixture in fixtures):
             item.add_marker(pytest.mark.xdist_group(item.module.__name__))
 
 
@@ -152,6 +154,18 @@ def small_capture(tmp_path_factory):
         ))  # fmt: skip
     (folder / "small.xml").write_text(SCENE.format(sensors="".join(sensors)))
     return folder / "small.xml"
+
+
+@pytest.fixture(scope="session")
+def finished(small_capture, tmp_path_factory):
+    """The results folder of a quick fit, for tests that only read it."""
+    from helpers.quick_fits import SPHERE
+
+    from mi_ring import fit
+
+    folder = tmp_path_factory.mktemp("fit") / "small"
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "90", *SPHERE]) == 0
+    return folder
 
 
 @pytest.fixture

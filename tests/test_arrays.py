@@ -162,7 +162,8 @@ def test_visual_hulls_are_shared_by_captures_of_the_same_masks_and_cameras(small
 def test_a_fit_of_arrays_is_saved_with_its_photographs(small_capture, tmp_path):
     """The same fit as of the scene file; its scene opens in Mitsuba, and is a capture again."""
     read = mi_ring.load_capture(small_capture)
-    config = mi_ring.Config.preset("fast", iterations=4, levels=(2,), widths=(28,), shares=(1,), subdivisions=3)
+    config = mi_ring.Config.preset("fast", iterations=4, levels=(2,), widths=(28,), shares=(1,), subdivisions=3,
+                                    domain="sphere")  # fmt: skip
     fits = [mi_ring.Fit(capture, config) for capture in (read, Capture.from_arrays(**arrays_of(read)))]
     losses = [[it.loss for it in fit] for fit in fits]
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)

@@ -254,7 +254,7 @@ def test_the_power_that_is_refined_begins_with_a_usual_albedo(broken_capture):
     path, _ = broken_capture
     path.write_text(re.sub(r'name="intensity" value="[^"]*"', 'name="intensity" value="1"', path.read_text()))
     capture = mi_ring.load_capture(path)
-    fit = Fit(capture, Config.preset("fast"))
+    fit = Fit(capture, Config.preset("fast", domain="sphere"))
     assert fit.model.albedo > 1 and "scale" in fit.model.calibration.refined and fit.ring.indirect
     lights = fit.calibrated().photographs.lights
     center = fit.ring.center.numpy()
@@ -575,7 +575,8 @@ def test_distortion_goes_where_the_lens_has_it(small_capture):
 
 def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_capture, monkeypatch):
     capture = mi_ring.load_capture(small_capture)
-    config = Config(iterations=4, levels=(2,), widths=(56,), shares=(1,), refine=("light", "curve"), holdout=5)
+    config = Config(iterations=4, levels=(2,), widths=(56,), shares=(1,), refine=("light", "curve"), holdout=5,
+                    domain="sphere")  # fmt: skip
     running = Fit(capture, config)
     assert running.problem.held_out.tolist() == [2, 7]
     for every, out in ((24, 0), (1000, 0)):
@@ -613,7 +614,7 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
 def test_a_fit_says_what_photographs_that_are_kept_out_say(small_capture, tmp_path):
     """To its end, with what is shared, what is of each photograph, and what is solved for; and without any of it."""
     tiny = ["--iterations", "10", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2",
-            "--holdout", "5"]  # fmt: skip
+            "--holdout", "5", "--domain", "sphere"]  # fmt: skip
     for refine in (["light", "power", "scale", "ambient"], ["none"]):
         out = tmp_path / refine[0]
         assert fit.main([str(small_capture), "--out", str(out), *tiny, "--refine", *refine]) == 0
@@ -631,11 +632,13 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
 
     capture = mi_ring.load_capture(edited(small_capture, tmp_path / "known", declare))
-    assert Fit(capture).model.calibration is None
-    assert Fit(capture, Config(refine=("cameras",))).model.calibration.refined == ("cameras",)
     unknown = mi_ring.load_capture(small_capture)
-    assert Fit(unknown).model.calibration.refined == ("light", "power", "ambient")
-    assert Fit(unknown, Config(refine=("none",))).model.calibration is None
+    for of, refine, refined in (
+        (capture, ("auto",), None), (capture, ("cameras",), ("cameras",)),
+        (unknown, ("auto",), ("light", "power", "ambient")), (unknown, ("none",), None),
+    ):  # fmt: skip
+        calibration = Fit(of, Config(refine=refine, domain="sphere")).model.calibration
+        assert (calibration and calibration.refined) == refined
     # In whatever order: it is the same fit, which may be resumed.
     for words in ("light cameras", "cameras light", "cameras light cameras"):
         assert fit.parse_options(["scene.xml", "--refine", *words.split()]).refine == ("cameras", "light")

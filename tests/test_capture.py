@@ -336,7 +336,7 @@ def test_a_fit_keeps_the_ground_of_the_xml(broken_capture, tmp_path):
          '<vector name="up" x="0" y="3" z="4"/><float name="metres" value="0.001"/>')  # fmt: skip
     capture = loading.load_capture(path)
     np.testing.assert_allclose(capture.shape.ground, [[1, 2, -3], [0, 0.6, 0.8]], atol=1e-6)
-    ring = Fit(capture, Config(iterations=2, levels=(1,), widths=(32,), shares=(1.0,))).ring
+    ring = Fit(capture, Config(iterations=2, levels=(1,), widths=(32,), shares=(1.0,), domain="sphere")).ring
     write_state(ring_state(ring), tmp_path / "ring.pt")
     saved = load_fit(tmp_path)
     np.testing.assert_allclose(saved.ground, capture.shape.ground, atol=1e-6)

@@ -32,7 +32,7 @@ def test_deviation_of_a_slope_is_that_of_linear_regression(block):
 
 
 def test_photographs_share_the_unknowns_of_their_lens_and_flash(small_capture):
-    config = Config(refine=("cameras", "focal", "light", "power", "curve"))
+    config = Config(refine=("cameras", "focal", "light", "power", "curve"), domain="sphere")
     layout = Layout(Fit(mi_ring.load_capture(small_capture), config).model.calibration)
     first, other = (layout.of(np.array([k])) for k in (2, 7))
     shared = {name for (name, _, a), (_, _, b) in zip(first, other) if a == b}
@@ -85,7 +85,7 @@ def test_pixels_beside_the_blocks_count_as_well():
 
 
 def test_the_room_alone_has_no_deviation(small_capture):
-    running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",)))
+    running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",), domain="sphere"))
     assert covariance(running.problem, running.model, running.renderer, 3) == {}
 
 

@@ -9,8 +9,10 @@ import sys
 import threading
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 import torch
+from helpers.quick_fits import SPHERE
 
 from mi_ring.errors import InputError
 from mi_ring.fitting import session
@@ -299,3 +301,40 @@ write_image(pixels, path)
 assert (read_image(path) == pixels).all()
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+def test_fits_on_one_thread_read_an_exr_one_after_the_other(broken_capture, tmp_path):
+    path, replace = broken_capture
+    image = path.parent / "images/000"
+    mi.Bitmap(f"{image}.png").convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False).write(f"{image}.exr")
+    replace("images/000.png", "images/000.exr")
+    code = """
+import sys
+from mi_ring import fit
+for out in "ab":
+    assert fit.main([*sys.argv[1:], "--out", out, "--iterations", "1", "--threads", "1"]) == 0
+"""
+    subprocess.run([sys.executable, "-c", code, path, *SPHERE], check=True, timeout=300, cwd=tmp_path)
+
+
+def test_on_one_core_an_exr_is_written_and_read(tmp_path):
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import mi_ring, numpy
+from mi_ring.images import write_image
+from pathlib import Path
+write_image(numpy.ones((5, 7, 3), numpy.float32), Path("one.exr"))
+import mitsuba as mi
+assert tuple(mi.Bitmap("one.exr").size()) == (7, 5)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, cwd=tmp_path)
+
+
+def test_writes_are_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.pt"
+    files.write_state({"iteration": 1}, path)
+    monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        files.write_state({"iteration": 2}, path)
+    assert torch.load(path)["iteration"] == 1

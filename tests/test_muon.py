@@ -3,7 +3,10 @@
 import pytest
 import torch
 
+from mi_ring.fitting.config import Config
 from mi_ring.fitting.muon import Muon, orthogonalised
+from mi_ring.fitting.optimisation import network_steppers
+from mi_ring.objects.fitted_object import FittedObject
 
 SHAPES = (24, 17), (9, 31), (16, 16)
 
@@ -59,3 +62,14 @@ def test_its_state_can_be_saved_and_taken_up():
     assert other.param_groups[0]["lr"] == 0.02
     assert torch.equal(other.state[other.param_groups[0]["params"][1]]["momentum_buffer"],
                        optimizer.state[ours[1]]["momentum_buffer"])  # fmt: skip
+
+
+def test_muon_has_the_hidden_weights_and_adam_all_the_others():
+    ring = FittedObject([0, 0, 0], 1.0)
+    adam, muon = (stepper.optimizer for stepper in network_steppers(ring, Config(), torch.device("cpu")))
+    assert isinstance(adam, torch.optim.Adam) and isinstance(muon, Muon)
+    ours, theirs = ([p for group in o.param_groups for p in group["params"]] for o in (muon, adam))
+    assert [tuple(p.shape) for p in ours] == 2 * [(256, 96), (256, 256), (256, 256)] + 2 * [(256, 256)]
+    assert sorted(map(id, ours + theirs)) == sorted(map(id, ring.parameters()))
+    (alone,) = network_steppers(ring, Config(optimizer="adam"), torch.device("cpu"))
+    assert len(alone.optimizer.param_groups[0]["params"]) == len(list(ring.parameters()))

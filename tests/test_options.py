@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mi_ring import fit
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, Task, parse_options
 from mi_ring.fitting.config import PRESETS, TASK, WEIGHTS, Ablation, Common, Config, Tuning
@@ -91,3 +92,36 @@ def test_settings_that_cannot_be_are_one_line(content, words, tmp_path):
     with pytest.raises(InputError) as error:
         Config.load(file)
     assert str(error.value).startswith(f"{file}: {words}") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--preset", "quick"], ["--preset: is quick; must be one of fast"]),
+        (["--preset"], ["--preset: has no value"]),
+        (["--weights.mask", "-5"], ["--weights", "0 or more"]),
+        (["--seed", str(2**70)], ["--seed", "below 2^63"]),
+        (["--iterations", "many"], ["--iterations: is many; must be a whole number"]),
+        (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
+        (["--steps", "0"], ["--steps: is 0, must be at least 1"]),
+        (["--velocity-decay", "0"], ["--velocity-decay", "0", "above 0"]),
+        (["--iteration", "5"], ["Unrecognized options: --iteration", "--iterations"]),
+        (["--levels", "4", "9"], ["--levels", "0 to 8"]),
+        (["--levels", "4"], ["--widths", "as many"]),
+        (["--loss", "l3"], ["--loss: is l3; must be one of", "log"]),
+        (["--domain", "cube"], ["--domain: is cube; must be auto|sphere|hull|mesh PATH"]),
+        (["--domain", "mesh"], ["--domain: is mesh; must be"]),
+        (["--learning-rate", "-1"], ["--learning-rate", "above 0"]),
+        (["--learning-rate", "fast"], ["--learning-rate: is fast; must be a number"]),
+        (["--widths", "128", "wide"], ["--widths: is 128 wide, must be INT [INT ...]"]),
+        (["--widths"], ["--widths: is empty, must be as many values as --levels (3)"]),
+        (["--parameters", "principled"], ["--parameters: must be STR FLOAT FLOAT [STR FLOAT FLOAT ...]"]),
+        (["--refine", "gian"], ["--refine: is gian; must be one of auto, none", "; perhaps you meant gain"]),
+        (["--refine", "power", "gain"], ["--refine: is power gain, must be without power or without gain"]),
+    ],
+)
+def test_an_unusable_option_is_one_line_that_names_it(options, words):
+    with pytest.raises(InputError) as error:
+        fit.parse_options(["scene.xml", *options])
+    complaint = str(error.value)
+    assert complaint.startswith(words[0]) and "\n" not in complaint and all(word in complaint for word in words)

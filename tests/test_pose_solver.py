@@ -147,7 +147,7 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
 
 
 def test_terms_whose_curvature_is_not_known_are_refused(small_capture):
-    config = mi_ring.Config(refine=("cameras",))
+    config = mi_ring.Config(refine=("cameras",), domain="sphere")
     with pytest.raises(mi_ring.InputError, match="terms: rgb: must be the default one for --refine cameras"):
         mi_ring.Fit(mi_ring.load_capture(small_capture), config, terms={"rgb": lambda it: it.prediction.rgb.mean()})
 

@@ -18,7 +18,8 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene import xml_elements
 
-QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3"]
+QUICK = ["--levels", "3", "--widths", "56", "--shares", "1", "--iterations", "12", "--subdivisions", "3",
+         "--domain", "sphere"]  # fmt: skip
 PRINCIPLED = """<bsdf type="principled"><rgb name="base_color" value="0.3, 0.4, 0.5"/>
   <float name="roughness" value="0.6"/><float name="spec_tint" value="0.2"/><float name="eta" value="1.4"/></bsdf>"""
 PREDICT = {"base_color": (0.0, 0.9), "roughness": (0.2, 1.0)}

@@ -47,3 +47,17 @@ def iteration_of(fit):
     batch = fit.sampler.draw(fit.problem, fit.schedule, fit.ring.domain, fit.iteration)
     seen = fit.sampler.observe(fit.problem, fit.capture, batch)
     return Iteration(batch, seen, fit.renderer.predict(fit.problem, fit.model, batch), fit.context())
+
+
+FILES = [
+    "scene.xml",
+    "ring.pt",
+    "mesh.ply",
+    "config.json",
+    "log.jsonl",
+    "inputs.png",
+    "report.html",
+    "checkpoint.before.pt",
+    "checkpoint.pt",
+    "calibration.json",
+]
