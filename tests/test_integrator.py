@@ -328,7 +328,7 @@ def test_colocated_means_every_light_is_at_its_camera(unit):
                 position = pose[:3, 3] + light * np.linalg.norm(pose[:3, 3]) * pose[:3, 0]
                 light = {"type": "point", "position": position.tolist(), "intensity": 2.0}
             sensors.append(mi.load_dict(photograph(k, light, to_world=mi.ScalarTransform4f(pose))))
-        return Photographs.of(sensors).colocated
+        return Photographs.of([sensor.shot for sensor in sensors]).colocated
 
     assert colocated(None, None)
     assert colocated(0.0, None, 0.0)
@@ -341,7 +341,7 @@ def test_a_direction_is_not_mistaken_for_a_position():
     """Not even where its numbers are those of the camera's centre."""
     pose = mi.ScalarTransform4f().look_at([0.6, 0.0, -0.8], [0, 0, 0], [0, 1, 0])
     light = {"type": "directional", "direction": [0.6, 0.0, -0.8], "irradiance": 1.0}
-    assert not Photographs.of([mi.load_dict(photograph(0, light, to_world=pose))]).colocated
+    assert not Photographs.of([mi.load_dict(photograph(0, light, to_world=pose)).shot]).colocated
 
 
 @pytest.mark.parametrize(
@@ -354,4 +354,4 @@ def test_a_direction_is_not_mistaken_for_a_position():
 def test_other_kinds_of_light_are_refused(light, kind):
     sensors = [mi.load_dict(photograph(0)), mi.load_dict(photograph(1, light))]
     with pytest.raises(ValueError, match=f'photograph "001".*{kind}.*"point" or "directional"'):
-        Photographs.of(sensors)
+        Photographs.of([sensor.shot for sensor in sensors])
