@@ -246,7 +246,7 @@ class Gain(Exposure):
 
 
 class Scale(Unknown):
-    """Logarithm of the power of all lights. The albedo changes with it, so only indirect light has its gradient."""
+    """Logarithm of a factor of all lights. The albedo undoes it in direct light, so it is found from indirect light."""
 
     changes = "indirect"
 

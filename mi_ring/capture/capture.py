@@ -212,9 +212,9 @@ class Capture:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels; without masks, of all pixels that are not black.
+        """Mean linear radiance of the object's pixels; without masks, of pixels above 2 % of the photograph's maximum.
 
-        Estimated from `SOME` photographs.
+        Estimated from `SOME` photographs. Raises InputError if all these pixels are black.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):
