@@ -6,7 +6,6 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from torch import Tensor
 
 from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
@@ -16,18 +15,18 @@ MAX_EXTENT = 4.0  #: radius of a ball that holds the object during a fit, in rad
 
 
 class RenderedObject(Protocol):
-    """What is rendered of a `FittedObject`, which is above this room."""
+    """What is rendered of a `FittedObject`, which is above this room. Tensors are torch's."""
 
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
     radius: Any  #: its radius, a tensor
     bsdf: str  #: the BSDF as Mitsuba's XML
     brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
 
-    def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
+    def surface(self, s: Any, time: float = 1.0) -> Any:
         """Surface points (V, 3) of domain points (V, 3)."""
         ...
 
-    def __call__(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
+    def __call__(self, s: Any, time: float = 1.0) -> tuple[Any, dict[str, Any]]:
         """Surface points and the parameters of the BSDF by name."""
         ...
 
