@@ -31,7 +31,8 @@ class CheckConfig:
     masks: Literal["auto", "given", "none"] = "auto"
     """Which masks are used.
     given: those of the scene, if it has any. auto: the same, otherwise what is brighter than a dark room.
-    none: the scene's masks are ignored, the object is what is brighter than a dark room."""
+    none: the scene's masks are ignored, the object is what is brighter than a dark room.
+    Use none if the scene's masks are wrong and the background is dark."""
 
 
 def main(arguments: Sequence[str]) -> int:

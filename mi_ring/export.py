@@ -57,7 +57,10 @@ def require_options(config: ExportConfig) -> None:
 
 
 def seen_from(run: Path) -> list[MaskedCamera] | None:
-    """The view of each photograph of a fit; None, with a warning, if they cannot be read."""
+    """Camera and mask of each photograph of a fit: `run` is its folder or a file in it.
+
+    None, with a warning, if its scene.xml cannot be read.
+    """
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
     except InputError as error:

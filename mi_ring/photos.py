@@ -75,7 +75,8 @@ class PhotosConfig:
     """Use it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
     """Where the masks come from.
-    auto: they are found. alpha: the alpha channels of the photographs. rembg: the package rembg, if it is installed.
+    auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
+    rembg: found by the package rembg, which must be installed.
     Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object in the frame of the sheet [mm], as XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.

@@ -1,5 +1,6 @@
 """Captures from arrays: the same as from a scene file, what is refused, a fit from the first array to the results."""
 
+import re
 from dataclasses import FrozenInstanceError, replace
 
 import mitsuba as mi
@@ -10,6 +11,7 @@ from conftest import CENTER
 
 import mi_ring
 from mi_ring import Camera, Capture, InputError, Light, Response
+from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.synthesis.viewpoints import look_at
 
 WIDTH, HEIGHT = 7, 5
@@ -202,3 +204,34 @@ def test_files_have_all_bits_of_the_arrays(tmp_path):
     np.testing.assert_allclose(read.room[0], [0.1, 0.2, 0.3], rtol=1e-6)
     with pytest.raises(InputError, match="has the scene file .*pair.xml"):
         read.save(tmp_path / "copy.xml")
+
+
+def test_what_was_replaced_is_saved(tmp_path):
+    sixteen = (IMAGE.astype(np.uint16) * 257, IMAGE[::-1].astype(np.uint16) * 257)
+    capture = Capture.from_arrays(sixteen, cameras=[CAMERA] * 2, names=["first", "second"])
+    changes = {"encoding": "srgb", "saturation": 0.7, "calibrated": True}
+    capture = replace(capture, shots=tuple(replace(shot, **changes) for shot in capture.shots))
+    read = mi_ring.load_capture(capture.save(tmp_path / "two.xml").path)
+    for ours, theirs in zip(capture.shots, read.shots, strict=True):
+        assert {name: getattr(theirs, name) for name in changes} == changes
+        assert ours.name == theirs.name
+    torch.testing.assert_close(read.observe([0, 1]).rgb, capture.observe([0, 1]).rgb, rtol=0, atol=0)
+
+
+def test_a_part_of_a_capture_is_saved_alone(tmp_path):
+    images = [np.roll(IMAGE, k, 0) for k in range(3)]
+    part = Capture.from_arrays(images, cameras=[CAMERA] * 3, names=list("abc")).part([2, 0])
+    read = mi_ring.load_capture(part.save(tmp_path / "part.xml").path)
+    assert [shot.name for shot in read.shots] == ["c", "a"]
+    for k, image in enumerate((images[2], images[0])):
+        np.testing.assert_array_equal(read.images[k], image)
+
+
+def test_a_scene_file_of_more_photographs_is_written_for_a_part(small_capture):
+    capture = mi_ring.load_capture(small_capture)
+    part = capture.part([3, 1])
+    names = re.findall(rb'<sensor[^>]* id="([^"]+)"', recalibrated_xml(capture.xml, part.shots))
+    assert sorted(names) == sorted(shot.name.encode() for shot in part.shots)
+    unnamed = re.sub(rb'(<sensor[^>]*) id="[^"]+"', rb"\1", capture.xml)
+    with pytest.raises(InputError, match="have no ids"):
+        recalibrated_xml(unnamed, part.shots)

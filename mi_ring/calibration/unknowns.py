@@ -10,7 +10,7 @@ the flash is beside the lens.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -21,6 +21,7 @@ from torch import Tensor
 from mi_ring.calibration.rig import Estimate, LightTensors, Rig
 from mi_ring.capture.capture import Capture
 from mi_ring.geometry.rotations import rotations
+from mi_ring.scene.shot import Shot
 
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
 
@@ -34,6 +35,11 @@ class Found(NamedTuple):
     power: float  #: factor of all lights' strengths that was found
     lamps: LightTensors  #: the scene's own lamps as found
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
+
+    def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
+        """Means of a number of all photographs, before and after."""
+        before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
+        return before, after
 
 
 @dataclass(frozen=True)
@@ -189,8 +195,7 @@ class Falloff(Unknown):
         return replace(now, falloff=now.falloff + value)
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (np.mean([shot.falloff for shot in side.shots]) for side in (found.before, found.after))
-        return "exponent of the flash's cone", before, after, std
+        return "exponent of the flash's cone", *found.means(lambda shot: shot.falloff), std
 
 
 class Vignetting(Unknown):
@@ -202,10 +207,7 @@ class Vignetting(Unknown):
         return replace(now, response=now.response._replace(vignetting=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (
-            np.mean([shot.response.vignetting for shot in side.shots]) for side in (found.before, found.after)
-        )
-        return "exponent of the lens' vignetting", before, after, std
+        return "exponent of the lens' vignetting", *found.means(lambda shot: shot.response.vignetting), std
 
 
 class CurveExponent(Unknown):
@@ -217,7 +219,7 @@ class CurveExponent(Unknown):
         return replace(now, response=now.response._replace(exponent=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (np.mean([shot.response.gamma for shot in side.shots]) for side in (found.before, found.after))
+        before, after = found.means(lambda shot: shot.response.gamma)
         return "exponent of the camera's curve", before, after, after * std
 
 
@@ -230,9 +232,7 @@ class Contrast(Unknown):
         return replace(now, response=now.response._replace(contrast=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = (
-            np.mean([shot.response.contrast for shot in side.shots]) for side in (found.before, found.after)
-        )
+        before, after = found.means(lambda shot: shot.response.contrast)
         return "contrast of the camera's curve", before, after, after * std
 
 
@@ -246,7 +246,7 @@ class Gain(Exposure):
 
 
 class Scale(Unknown):
-    """Logarithm of the power of all lights. The albedo changes with it, so only indirect light has its gradient."""
+    """Logarithm of a factor of all lights. The albedo undoes it in direct light, so it is found from indirect light."""
 
     changes = "indirect"
 

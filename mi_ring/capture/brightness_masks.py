@@ -47,7 +47,7 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """The mask (H, W) uint8 of what is brighter than the threshold, without specks."""
+    """Mask (H, W) uint8, 0 or 255: pixels above the threshold, without pieces below 1 % of the largest one's size."""
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 

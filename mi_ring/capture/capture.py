@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from mi_ring.capture import arrays
 from mi_ring.capture.observation import Observation, ObservationCache, observed
 from mi_ring.capture.pixels import Pixels
-from mi_ring.capture.scenefile import recalibrated_xml
+from mi_ring.capture.scenefile import recalibrated_xml, with_photographs
 from mi_ring.errors import InputError, SceneError
 from mi_ring.geometry.camera import Camera, NoParallax, nearest_point
 from mi_ring.geometry.hull import MAX_MASKS, MAX_WIDTH, Hull, Silhouette, evenly_spaced, shrink_mask, small_silhouette
@@ -128,15 +128,16 @@ class Capture:
         path = Path(path)
         if not self.in_memory:
             raise InputError(f"{path}: is for a capture from arrays; this one has the scene file {self.path}")
-        shots = []
+        relative, shots = [], []
         for k, shot in enumerate(self.shots):
             own = arrays.files_of(shot, self.images[k], self.masks.given[k], self.valid.given[k])
             files = Files(*(file and path.parent / file for file in own))
             for file, pixels in zip(files, (self.images, self.masks, self.valid)):
                 if file:
                     arrays.write_array(pixels[k], file)
+            relative.append(replace(shot, files=own))
             shots.append(replace(shot, files=files))
-        xml = recalibrated_xml(self.xml, shots, self.room)
+        xml = recalibrated_xml(with_photographs(self.xml, relative), relative, self.room)
         write_file(path, xml)
         return replace(self, path=path, xml=xml, shots=tuple(shots))
 
@@ -211,9 +212,9 @@ class Capture:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels; without masks, of all pixels that are not black.
+        """Mean linear radiance of the object's pixels; without masks, of pixels above 2 % of the photograph's maximum.
 
-        Estimated from `SOME` photographs.
+        Estimated from `SOME` photographs. Raises InputError if all these pixels are black.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):

@@ -11,7 +11,7 @@ def disk(radius: float) -> np.ndarray:
 
 
 def grown(coverage: np.ndarray, share: float) -> np.ndarray:
-    """(H, W) uint8: a coverage (H, W) uint8, 0 or 1, and around it such a share of its size; less where negative."""
+    """Dilate a coverage (H, W) uint8, 0 or 1, by `share` times the square root of its area; erode it if negative."""
     radius = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
     return cv2.dilate(coverage, radius) if share > 0 else cv2.erode(coverage, radius)
 

@@ -81,7 +81,10 @@ def require_headers(shot: Shot, scene: Path, masks: str) -> None:
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Raise InputError, one line, for most of what `load_capture` refuses, without decoding any photograph."""
+    """Check a scene file and the headers of its photographs. Raises InputError; what is wrong in pixels is not found.
+
+    `masks`: as `load_capture` has it.
+    """
     for shot in load_capture(path, images=False).shots:
         require_headers(shot, path, masks)
 

@@ -182,6 +182,15 @@ def recalibrated_xml(
     return scene_bytes(root)
 
 
+def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
+    """A scene file with these photographs instead of its own."""
+    root = ElementTree.fromstring(scene)
+    for element in root.findall("sensor[@type='photograph']"):
+        root.remove(element)
+    root.extend(map(photograph_element, shots))
+    return scene_bytes(root)
+
+
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
     """A scene file of these photographs with other masks for some: files relative to it, by a photograph's index."""
     root = ElementTree.fromstring(scene)
@@ -194,11 +203,20 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """The photographs of a scene file, each with its index in `shots`: by name; unnamed ones in order."""
+    """The photographs of a scene file, each with its index in `shots`: by name; unnamed ones in order.
+
+    Photographs that are not in `shots` are removed. Raises InputError if these have no names.
+    """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}
-    numbered = zip(elements, range(len(shots)), strict=True)
-    return [(element, named.get(element.get("id", ""), k)) for element, k in numbered]
+    if len(elements) > len(shots):  # the capture is a part of the scene's photographs
+        for parent in [root, *root.iter()]:
+            for other in [e for e in parent if e in elements and e.get("id", "") not in named]:
+                parent.remove(other)
+        elements = root.findall(".//sensor[@type='photograph']")
+    if len(elements) != len(shots):
+        raise InputError("scene file: a part of its photographs cannot be written, because they have no ids")
+    return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:

@@ -54,8 +54,9 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
 
 
 def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, on_poll: Callable[[], None]) -> None:
-    """Fit all jobs, given with their fingerprints. The record of each job has its outcome.
+    """Fit all jobs on Ray and return when all have ended; the record of each then has its outcome.
 
+    `jobs`: with their fingerprints. `retries`: as `fit_to_the_end` has it.
     `on_poll` is called about once a second. Ray replaces a worker that dies; its fit resumes from the last checkpoint.
     """
     with ray_cluster(resources) as ray:

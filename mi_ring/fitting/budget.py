@@ -32,6 +32,7 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
         # A stage that shapes the surface: one with a fixed surface takes less time.
         last = trial.schedule.iterations
         trial.schedule = replace(trial.schedule, stages=(stage._replace(first=0, last=last, settles=False),))
+        trial.optimisation.settle(trial.schedule, trial.schedule.iterations - 2)
         for _ in range(2):
             if interrupted():
                 return {}

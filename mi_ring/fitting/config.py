@@ -121,7 +121,7 @@ class Tuning:
     learning_rate: float = 3e-3
     """Learning rate of Adam at the start."""
     muon_rate: float = 3e-2
-    """Learning rate of Muon at the start."""
+    """Learning rate at the start of Muon, which trains the hidden layers (see --optimizer)."""
     decay: float = 0.1
     """Share of the learning rates that is left at the end. Those of cameras fall to a half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
@@ -145,8 +145,9 @@ class Ablation:
     optimizer: Literal["muon", "adam"] = "muon"
     """muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """The network that deforms the domain. ring: the paper's flow, with the same velocity field in all steps.
-    resnet: a block of its own for each step, with as many weights in all. wide-resnet: blocks as wide as the ring."""
+    """The network that deforms the domain. ring: the paper's flow; all steps share one network.
+    resnet: each step has its own, narrower network, with about as many weights in total.
+    wide-resnet: each step has its own network, as wide as that of ring, so there are more weights."""
     encoding: Literal["linear", "octaves", "none"] = "linear"
     """Positional encoding of both networks.
     linear: frequencies 1, 2, 3, … octaves: 1, 2, 4, 8, … none: no encoding."""

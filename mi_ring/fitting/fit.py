@@ -3,6 +3,7 @@
 import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,8 @@ class Fit(Renamed):
         if it.number == it.stage.last:
             release_memory()  # what comes next has other sizes
         if last and len(self.problem.held_out):
-            self.course.validation = validate(self.problem, self.model, self.renderer, self.schedule.final_level)
+            masked = replace(self.problem, capture=self.capture)
+            self.course.validation = validate(masked, self.model, self.renderer, self.schedule.final_level)
         self.course.record(it, self.optimisation.learning_rate, self.regulariser, last)
         for callback in self.callbacks:
             callback(it)
@@ -163,8 +165,7 @@ class Fit(Renamed):
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """The current prediction of photograph `k`: (H, W, 3) linear radiance, at most `width` pixels wide.
 
-        `level`: of the surface. Not to be called from within a term of the loss: the renderer keeps the picture of the
-        iteration for its backward pass.
+        `level`: of the surface. Do not call it within a term of the loss, whose backward pass needs the renderer.
         """
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 

@@ -106,7 +106,7 @@ class Optimisation:
         self.model.update_albedo()
 
     def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Fix the surface during the settling stage, and forget the room's light at its beginning."""
+        """Fix the surface during the settling stage, and start the room's normal equations anew at its beginning."""
         fixed = schedule.surface_fixed(iteration)
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:

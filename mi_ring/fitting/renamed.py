@@ -11,6 +11,7 @@ FIT = {
     "seconds": "course.seconds", "outlines": "course.masks", "confirmed": "course.validation",
     "restraint": "regulariser", "caution": "optimisation.guard", "optimizers": "optimisation.optimizers",
     "rounds": "sampler", "random": "sampler.random", "summary": "result().calibration",
+    "progress": "schedule.progress", "shaping": "schedule.shaping", "near": "model.starts_near",
 }  # fmt: skip
 ITERATION = {
     "fit": "context", "s": "batch.points", "faces": "batch.faces", "index": "batch.photographs",

@@ -1,6 +1,8 @@
 """From the parts of a fit to its `FitResult`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -24,18 +26,34 @@ def result_of(
 ) -> FitResult:  # fmt: skip
     """`capture`: with the masks that the fit ends with. `terms`: names of the loss's terms."""
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
-    record = None
-    if calibration:
-        record = summary(problem, model, refined, covariance(problem, model, renderer, ring.subdivisions))
-    found = calibration is not None
+
+    def summarised() -> dict[str, Any]:
+        masked = replace(problem, capture=capture)
+        return summary(problem, model, refined, covariance(masked, model, renderer, ring.subdivisions))
+
     return FitResult(
-        ring, renderer.showing(model, ring.subdivisions), capture, refined, problem.config.settings(), course.log,
-        terms, [stage.first for stage in schedule.stages], problem.config.widths[-1], course.iteration,
-        schedule.iterations, course.seconds, unexplained, record, problem.held_out, course.validation,
-        list(course.masks), room_of(problem, refined) if found else None,
-        calibration.room.frames if calibration and problem.lighting.kind != "capture" else None,
-        lamp_lights(refined.scene) if calibration and "lamps" in calibration.refined else None,
-    )  # fmt: skip
+        ring=ring,
+        surface=renderer.showing(model, ring.subdivisions),
+        given=problem.given,
+        before=capture,
+        capture=refined,
+        settings=problem.config.settings(),
+        log=course.log,
+        terms=terms,
+        stage_starts=[stage.first for stage in schedule.stages],
+        width=problem.config.widths[-1],
+        iteration=course.iteration,
+        iterations=schedule.iterations,
+        seconds=course.seconds,
+        unexplained=unexplained,
+        summary=summarised if calibration else None,
+        held_out=problem.held_out,
+        validation=course.validation,
+        masks=list(course.masks),
+        room=room_of(problem, refined) if calibration else None,
+        room_frames=calibration.room.frames if calibration and problem.lighting.kind != "capture" else None,
+        lamps=lamp_lights(refined.scene) if calibration and "lamps" in calibration.refined else None,
+    )
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:

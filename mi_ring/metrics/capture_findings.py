@@ -202,7 +202,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 
 def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
-    """The capture without masks that have nothing in them, and the names of the photographs with these masks."""
+    """The capture with all photographs but without empty masks, and the names of the photographs that had them."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
     empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     masks = capture.masks.replaced(dict.fromkeys(empty))

@@ -73,7 +73,10 @@ class Layers:
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
     def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
-        """Encoding and activations of all hidden layers (without `keep`, the last ones) and output at points (n, 3)."""
+        """Activations and output at points (n, 3).
+
+        Activations are those of the encoding and all hidden layers; without `keep`, of the last hidden layer alone.
+        """
         activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
             activations.append(F.leaky_relu_(F.linear(activations[-1], w, b), SLOPE))

@@ -91,7 +91,10 @@ def assemble(
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, and `Atlas.uncut`."""
+    """The surface at points `s` (V, 3) of the domain with triangles `faces`, at `time` of the flow.
+
+    Returns points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, and `Atlas.uncut`.
+    """
     unique, uncut = np.unique(s, axis=0, return_inverse=True)
     uncut = uncut.ravel()
     points = flow_points(ring, unique, time)

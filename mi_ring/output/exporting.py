@@ -56,7 +56,7 @@ def export(
     atlas = unwrap(ring, level, resolution, time)
     texels = rasterise(ring, atlas, resolution, time)
     values = reflectances(ring, texels.s)
-    if photograph is not None:
+    if kind == ".xml" and photograph is not None:
         return write_scene(file, atlas, texels, ring.bsdf, values, *photograph)
     return write_obj(file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
 

@@ -35,7 +35,7 @@ class Material(NamedTuple):
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
-    """The parameters of glTF for a BSDF, given as Mitsuba's XML, with parameters (N, 3) or (N,) by name.
+    """Convert a BSDF (Mitsuba's XML) and its `values`, (N, 3) or (N,) by name, to glTF's metallic-roughness parameters.
 
     ``cooktorrance``: glTF's dielectric is (1 − F) c/π + F D V with Schlick's F between F₀ = min(0.04 k, 1) w and
     F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25, F is w at all angles, and

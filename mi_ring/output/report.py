@@ -97,7 +97,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
         name=scene_name(result.given.path), version=__version__, rows=rows, numbers=numbers, curve=loss_curve(result),
         settings=result.settings,
         findings=fit_findings(fitted, result.iteration, result.iterations, refined, result.unexplained),
-        refined=refined and panel(result.given, capture, refined),
+        refined=refined and panel(result.before, capture, refined),
         view=first_view(capture, ring), glb=glb and base64.b64encode(glb).decode(),
         saturated=SATURATED, viewer=(files / "viewer" / "viewer.min.js").read_text("utf-8"),
     )  # fmt: skip

@@ -148,7 +148,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     write_state(ring_state(ring, result.settings), folder / "ring.pt")
     views = capture.views
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
-    if result.calibration:
+    if result.summary:
         scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps)
     if result.masks:
         scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))

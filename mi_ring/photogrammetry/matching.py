@@ -106,7 +106,7 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Of each matched pair in COLMAP's database: both images, and the matches' positions (n, 2) in each [px]."""
+    """Both images of each matched pair in COLMAP's database, and the verified matches (n, 2) in each [px]."""
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}

@@ -58,8 +58,9 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
     throughput and a direction: of paths that leave the scene, and of paths that hit another surface next to `si`. Both
     throughputs are 0 for other paths.
 
-    `known`: BSDFs that `reflected_harmonics` has. Paths from these that leave the scene at once are not in `escaped`,
-    and only paths from these are in `blocked`: `reflected_harmonics` has the former, and must not have the latter.
+    `known`: BSDFs whose unoccluded room light the caller has from `reflected_harmonics`. Of paths from these,
+    `escaped` leaves out those that leave the scene at once. Those that hit something at once are in `blocked`, for the
+    caller to subtract.
     `random`: a source of 2-D samples.
     """
     context, active = mi.BSDFContext(), si.is_valid()

@@ -99,7 +99,7 @@ class SynthesizeConfig:
     """Linear pixel value of a white surface at the object that faces the light.
     Without it: chosen by --clipped."""
     clipped: float = 0.02
-    """Share of the object's pixels that are overexposed."""
+    """Chooses the exposure: this share of the object's pixels is overexposed. Not used with --exposure."""
     electrons: float = 0.0
     """Electrons of a pixel at full scale. Fewer electrons give more shot noise.
     0: no shot noise."""

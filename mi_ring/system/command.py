@@ -134,7 +134,7 @@ class Interrupted(KeyboardInterrupt):
 
 def exit_status(stop: KeyboardInterrupt) -> int:
     """The exit status of an interrupted command: 128 + the signal's number."""
-    return 128 + next(iter(stop.args), signal.SIGINT)
+    return 128 + (stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
 _received: list[tuple[int, float]] = []  #: signals within `resumable`: number, time of arrival [s]
