@@ -32,7 +32,7 @@ TINY = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def under_two_lamps(tmp_path_factory):
     """Path of a capture of an ellipsoid by two lamps; scene.xml says nothing of the second, truth/exact.xml all."""
     folder = tmp_path_factory.mktemp("lamps")

@@ -50,7 +50,7 @@ def short_trials(monkeypatch):
     )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def in_an_environment(tmp_path_factory):
     """Path of a scene of an ellipsoid in `lobe`, of which the scene says nothing."""
     folder = tmp_path_factory.mktemp("environment")
