@@ -168,11 +168,11 @@ class Calibration(nn.Module):
         """Half the sum of squares of all unknowns, in standard deviations, divided by the number of photographs."""
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
-    def shared_parameters(self) -> list[list[Tensor]]:
-        """Parameters of unknowns that several photographs share, grouped by option."""
+    def parameters_without_solver(self) -> list[list[Tensor]]:
+        """Parameters of unknowns that have no solver of their own, grouped by option."""
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
-            if unknown.per != "photograph":
+            if not unknown.solved:
                 groups.setdefault(unknown.option, []).append(getattr(self, name))
         return list(groups.values())
 

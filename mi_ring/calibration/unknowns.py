@@ -56,6 +56,7 @@ class Unknown(ABC):
     #: What it changes in a picture. view: how things are seen and lit; recording: only how that is recorded; light: the
     #: photograph's own light by a factor of each colour; gain: the same of all that is recorded; indirect: only that.
     changes: ClassVar[Literal["view", "recording", "light", "gain", "indirect"]] = "view"
+    solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
         """Shape of its parameter."""
@@ -91,6 +92,8 @@ class Unknown(ABC):
 class Turn(Unknown):
     """Rotation of each camera about its own axes [rad]."""
 
+    solved = True
+
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         turned = rig.views.cameras[:, :, :3] @ rotations(value)
         return replace(now, cameras=torch.cat([turned, now.cameras[:, :, 3:]], 2))
@@ -102,6 +105,8 @@ class Turn(Unknown):
 
 class Move(Unknown):
     """Motion of each camera along its own axes [rig's distance]."""
+
+    solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         along = rig.views.cameras[:, :, :3] @ (value * rig.distance)[..., None]
@@ -173,6 +178,8 @@ class LightPlace(Unknown):
 
 class Exposure(Unknown):
     """Logarithm of a factor of each photograph, by colour. Their mean over all photographs is 0."""
+
+    solved = True
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
         factor = np.exp(value)

@@ -104,7 +104,8 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
         numbers(getattr(camera, name), shape, f"{what}: {name}")
         for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()))
     )
-    own = Camera(to_world, focal, centre, (image.shape[1], image.shape[0]), float(distortion))
+    size = image.shape[1], image.shape[0]
+    own = camera._replace(to_world=to_world, focal=focal, centre=centre, size=size, distortion=float(distortion))
     if tuple(camera.size) != own.size:
         raise InputError(f"{what}: size is {tuple(camera.size)}, (width, height); its image is {sides(image)}")
     if not (own.focal > 0).all():

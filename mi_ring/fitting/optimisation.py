@@ -51,8 +51,8 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
 
 
 def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
-    """Adam for the unknowns that several photographs share; those of single photographs have solvers."""
-    groups = calibration.shared_parameters()
+    """Adam for the unknowns that have no solver."""
+    groups = calibration.parameters_without_solver()
     if not groups:
         return []
     adam = torch.optim.Adam([{"params": group} for group in groups], lr=CALIBRATION_RATE)
