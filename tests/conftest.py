@@ -204,3 +204,21 @@ def photographed_ellipsoid(folder, *options):
     material = ["--material", "diffuse reflectance=0.5"]
     synthesize.main([str(folder / "ball.ply"), str(folder / "capture"), *small, *material, *options])
     return folder / "capture/scene.xml"
+
+
+@pytest.fixture(scope="session")
+def in_an_environment(tmp_path_factory):
+    """Path of a scene of an ellipsoid in the `lobe`, of which the scene says nothing."""
+    from helpers.unknown_light import lobe
+
+    folder = tmp_path_factory.mktemp("environment")
+    return photographed_ellipsoid(folder, "--environment", str(lobe(folder / "lobe.exr")), "--wrong-room")
+
+
+@pytest.fixture
+def short_trials(monkeypatch):
+    """Coarse fits of few iterations."""
+    from mi_ring.fitting import light_selection
+
+    brief = {"iterations": 14, "levels": (2,), "batch": 4}
+    monkeypatch.setattr(light_selection, "COARSE", light_selection.COARSE | brief)

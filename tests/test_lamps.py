@@ -16,7 +16,6 @@ import mi_ring
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.fitting.covariance import covariance
-from mi_ring.fitting.light_selection import CoarseFits, brightest
 from mi_ring.fitting.lighting import Lighting, with_found_lamps, with_lighting
 from mi_ring.fitting.refinement import refined_of
 from mi_ring.rendering import prediction
@@ -92,23 +91,6 @@ def test_gradients_of_lamps_equal_finite_differences():
     np.testing.assert_allclose(light_of(lamps_of(given)[0]).vector, LAMPS[0].vector, rtol=1e-6)  # left as it was
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_lamps_begin_where_the_environment_is_brightest(count):
-    """Harmonics of light from a single direction are their values there."""
-    toward = np.array([[0.48, 0.6, -0.64], [-0.6, 0.64, 0.48], [0.36, -0.8, 0.48]])[:count]
-    colours = np.array([[1.0, 0.8, 0.5], [0.6, 0.6, 0.2], [0.3, 0.1, 0.2]])[:count]
-    harmonics = np.stack(
-        [np.ravel(v) + np.zeros(count) for v in dr.sh_eval(mi.Vector3f(*toward.T.astype(np.float32)), 4)]
-    )
-    room = harmonics @ colours
-    room[0] += 0.2  # and as much from all sides
-    found = brightest(room, np.repeat([1, 4 / 9, 1 / 16, 0, 0], [1, 3, 5, 7, 9]), count)  # as a diffuse surface tells
-    assert len(found[0]) == count
-    for direction, colour, true, strength in zip(*found, toward, colours):
-        assert np.degrees(np.arccos(np.dot(direction, true))) < 10
-        np.testing.assert_allclose(colour, strength / colours[0], rtol=0.35, atol=0.05)
-
-
 def test_the_first_lamp_is_the_photographs_own(small_capture):
     """The others are the scene's; a fit under them begins there, and says where they have gone."""
     capture = mi_ring.load_capture(small_capture)
@@ -139,25 +121,6 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
     assert [str(Lighting("lamps", said[:1])), str(Lighting("lamps", said, True)), str(Lighting("environment"))] == [
         "1 lamp", "2 distant lamps", "environment",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("distant", [False, True])
-def test_lamps_begin_as_strong_as_makes_the_albedo_a_half(distant, small_capture):
-    """As far away as the cameras, in the directions that the environment has, by its colours."""
-    capture = mi_ring.load_capture(small_capture)
-    trials = CoarseFits(capture, mi_ring.Config())
-    toward, colour = np.array([0.48, 0.6, -0.64]), np.array([1.0, 0.8, 0.5])
-    values = dr.sh_eval(mi.Vector3f(*toward.tolist()), 4)
-    trials.environment = np.stack([np.ravel(v)[0] for v in values])[:, None] * colour, np.ones(25)
-    trials.errors[Lighting("environment")] = 0.1
-    under = with_lighting(capture, trials.brightest(1, distant))
-    center = capture.sphere()[0]
-    own = under.photographs.lights[0]
-    away = -own.vector if distant else own.vector - center
-    distances = [np.linalg.norm(shot.camera.position - center) for shot in capture.shots]
-    assert np.linalg.norm(away) == pytest.approx(1.0 if distant else np.median(distances), rel=1e-4)
-    assert np.degrees(np.arccos(away @ toward / np.linalg.norm(away))) < 8
-    assert np.pi * under.reflectance(center, capture.exposure()) == pytest.approx(0.5, rel=1e-4)
 
 
 def test_one_material_is_the_mean_of_all_until_it_may_vary():

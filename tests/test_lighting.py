@@ -10,51 +10,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import photographed_ellipsoid
+from helpers.unknown_light import TINY, TOWARD
 
 import mi_ring
 from mi_ring import export
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.pixels import Pixels
 from mi_ring.errors import InputError
-from mi_ring.fitting import light_selection, priors
-from mi_ring.fitting.lighting import Lighting, with_found_lamps, with_lighting
+from mi_ring.fitting import priors
+from mi_ring.fitting.lighting import Lighting, with_lighting
 from mi_ring.fitting.refinement import refined_of
 from mi_ring.images import read_image, write_image
 from mi_ring.metrics.capture_findings import measure, quality_table
 from mi_ring.output.ambiguity import ambiguity, ambiguity_of
 from mi_ring.rendering import prediction
-from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, room_envmap, world_harmonics
+from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, room_envmap
 from mi_ring.scene.lights import is_room, shared_emitters
 
-TINY = {
-    "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
-}  # fmt: skip
-TOWARD = np.array([0.48, 0.6, -0.64])  #: the brightest direction of `lobe`, a unit vector
-
-
-def lobe(path):
-    """An environment, brightest in one direction: 1 + 2 max(0, cos)."""
-    rows = 32
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
-    polar, azimuth = np.pi * v, 2 * np.pi * u
-    away = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)], -1)
-    write_image((1 + 2 * np.maximum(away @ TOWARD, 0))[..., None].repeat(3, -1).astype(np.float32), path)
-    return path
-
-
-@pytest.fixture(autouse=True)
-def short_trials(monkeypatch):
-    monkeypatch.setattr(
-        light_selection, "COARSE", light_selection.COARSE | {"iterations": 14, "levels": (2,), "batch": 4}
-    )
-
-
-@pytest.fixture(scope="session")
-def in_an_environment(tmp_path_factory):
-    """Path of a scene of an ellipsoid in `lobe`, of which the scene says nothing."""
-    folder = tmp_path_factory.mktemp("environment")
-    return photographed_ellipsoid(folder, "--environment", str(lobe(folder / "lobe.exr")), "--wrong-room")
+pytestmark = pytest.mark.usefixtures("short_trials")
 
 
 def test_an_environment_is_found_and_written(in_an_environment, tmp_path):
@@ -108,13 +81,6 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
     np.testing.assert_allclose([shot.response.gain for shot in told.shots], true / true.mean(0), rtol=1e-5)
     with pytest.raises(InputError, match="--refine: is power gain, must be without power or without gain"):
         mi_ring.Config(refine=("power", "gain"))
-
-
-def test_coarse_fits_find_that_it_is_an_environment(in_an_environment, monkeypatch):
-    monkeypatch.setattr(light_selection, "MOST", 1)
-    capture = mi_ring.load_capture(in_an_environment)
-    config = mi_ring.Config.preset("fast", **TINY, light="auto")
-    assert mi_ring.choose_lighting(capture, config).kind == "environment"
 
 
 def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_path, capsys):
@@ -261,89 +227,12 @@ def test_a_lamp_is_one_for_all(small_capture):
     assert Rig(alone, np.zeros(3), 0.5, guessed=True).flash is None
 
 
-#: What coarse fits leave (None: they fail), by how lightings are called; what is believed, and until when plain.
-DECISIONS = [
-    ("lamps", {"1 lamp": 0.083, "2 lamps": 0.069, "3 lamps": 0.0685, "2 distant lamps": 0.074,
-               "2 lamps on one material": 0.082}, "2 lamps on one material", 0.35),
-    ("lamps", {"1 lamp": 0.086, "2 lamps": 0.081, "3 lamps": 0.07, "3 distant lamps": 0.074,
-               "3 lamps on one material": 0.09}, "3 lamps", 0),
-    ("lamps", {"1 lamp": 0.08, "2 lamps": 0.079, "3 lamps": 0.09, "1 distant lamp": 0.07,
-               "1 distant lamp on one material": 0.09}, "1 distant lamp", 0),
-    ("lamps", {"1 lamp": 0.08, "2 lamps": None, "3 lamps": 0.079, "1 distant lamp": 0.09,
-               "1 lamp on one material": None}, "1 lamp", 0),
-    ("lamps", {"1 lamp": 0.06, "2 lamps": 0.05, "3 lamps": 0.058, "together": ("2 lamps", "3 lamps"),
-               "1 distant lamp": 0.07, "1 lamp on one material": 0.08}, "1 lamp", 0),
-    ("environment", {"environment": 0.1, "environment on one material": 0.11}, "environment on one material", 0.35),
-    ("environment", {"environment": 0.1, "environment on one material": 0.13}, "environment", 0),
-    ("turntable", {"turntable": 0.1, "turntable on one material": 0.13}, "turntable", 0),
-    ("auto", {"environment": 0.095, "1 lamp": 0.094, "turntable": 0.07, "capture": 0.1}, "capture", 0),
-    ("auto", {"environment": None, "turntable": 0.05, "capture": 0.1, "turntable on one material": 0.09},
-     "turntable", 0),
-    ("auto", {"environment": 0.08, "1 lamp": 0.085, "turntable": 0.07, "capture": 0.1, "2 lamps": 0.06, "3 lamps": 0.06,
-              "2 distant lamps": 0.09, "2 lamps on one material": 0.08}, "2 lamps", 0),
-    ("auto", {"environment": 0.08, "1 lamp": 0.095, "turntable": 0.07, "capture": 0.1, "2 lamps": 0.09, "3 lamps": 0.09,
-              "1 distant lamp": 0.09, "2 distant lamps": 0.09, "environment on one material": 0.09},
-     "environment on one material", 0.35),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("light", "errors", "believed", "plain"), DECISIONS)
-def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monkeypatch):
-    """Nothing else is tried than what is to be decided, and the fit goes on where the trial of it has ended."""
-    tried, ended, together = [], {}, errors.get("together", ())
-
-    class Trial:
-        schedule = SimpleNamespace(iterations=60)
-        harmonics = torch.zeros(BASIS, 3)
-        harmonics[:25] = torch.from_numpy(
-            world_harmonics(np.eye(3)) @ np.diag([3.0, 2.0, 1.0]).sum(1, keepdims=True)
-        ).float()
-        room = SimpleNamespace(harmonics=harmonics, matrix=torch.eye(BASIS).expand(3, -1, -1))
-        model = SimpleNamespace(calibration=SimpleNamespace(room=room))
-
-        def __init__(self, capture, config, lighting):
-            tried.append(name := str(lighting))
-            begun = lighting
-            assert config.light == lighting.kind and config.widths == (64,)
-            self.error = errors.get(name, 0.1)
-            if self.error is None:
-                raise InputError("diverged at iteration 9")
-            if lighting.plain and lighting.lamps:  # which has found the first lamp farther away
-                (vector, rgb), *others = lighting.lamps
-                lighting = lighting._replace(lamps=((tuple(2 * x for x in vector), rgb), *others))
-            if name in together:  # its second lamp has moved to the first
-                (vector, rgb), _, *others = lighting.lamps
-                near = tuple((np.array(vector) + 0.2 * np.linalg.norm(vector) * np.array([0.6, 0.8, 0])).tolist())
-                lighting = lighting._replace(lamps=((vector, rgb), (near, rgb), *others))
-            self.capture = with_lighting(capture, lighting)
-            ended[name] = with_found_lamps(begun, self.capture, center)
-
-        def calibrated(self):
-            return self.capture
-
-        def __iter__(self):
-            return iter([SimpleNamespace(terms={"rgb": 9.0})] * 48 + [SimpleNamespace(terms={"rgb": self.error})] * 12)
-
-    config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
-    center, _ = capture.sphere()
-    monkeypatch.setattr(light_selection, "Fit", Trial)
-    found = mi_ring.choose_lighting(capture, config)
-    assert str(found) == believed and found.plain == plain and found.lamps == ended[believed].lamps
-    assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
-
-
 def test_other_reflectances_than_cooktorrance_are_refused(small_capture, tmp_path):
     scene = small_capture.with_name("diffuse.xml")
     scene.write_text(small_capture.read_text().replace('<bsdf type="cooktorrance"/>', '<bsdf type="diffuse"/>'))
     capture = mi_ring.load_capture(scene)
     with pytest.raises(InputError, match="bsdf: --light environment is for cooktorrance alone"):
         mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", light="environment"))
-
-
-def test_a_flash_capture_is_found_to_be_one(small_capture):
-    capture = mi_ring.load_capture(small_capture)
-    config = mi_ring.Config.preset("fast", **TINY, light="auto")
-    assert mi_ring.choose_lighting(capture, config) == Lighting("capture")
 
 
 def test_a_map_shows_the_radiance_of_harmonics():
@@ -426,30 +315,6 @@ def test_what_settles_does_not_get_darker_for_it(small_capture):
     for some in values.values():
         torch.testing.assert_close(*some)
         assert some[0] > 0
-
-
-@pytest.mark.parametrize(("wrong", "ends"), [(1, False), (60, True)])
-def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture, monkeypatch):
-    class Trial:
-        schedule, model = SimpleNamespace(iterations=60), SimpleNamespace(calibration=None)
-
-        def __init__(self, capture, config, lighting):
-            self.capture = with_lighting(capture, lighting)
-
-        def calibrated(self):
-            return self.capture
-
-        def __iter__(self):
-            errors = [0.1] * (60 - wrong) + [np.nan] * wrong
-            return iter([SimpleNamespace(terms={"rgb": error}) for error in errors])
-
-    config, capture = mi_ring.Config.preset("fast", light="environment"), mi_ring.load_capture(small_capture)
-    monkeypatch.setattr(light_selection, "Fit", Trial)
-    if ends:
-        with pytest.raises(InputError, match="small.xml: a coarse fit .* has no finite error"):
-            mi_ring.choose_lighting(capture, config)
-    else:
-        assert mi_ring.choose_lighting(capture, config).plain > 0
 
 
 def test_only_light_that_was_unknown_is_said_to_be(tmp_path):
