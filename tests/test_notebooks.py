@@ -17,10 +17,8 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 #: What takes the place of each notebook's own parameters. View 5 of these is photograph 020.
-SMALL = ["--iterations", "6", "--levels", "4", "--widths", "64", "--shares", "1", "--subdivisions", "4",
-         "--domain", "sphere"]  # fmt: skip
-SMALL_SETTINGS = {"iterations": 6, "levels": (4,), "widths": (64,), "shares": (1.0,), "subdivisions": 4,
-                  "domain": "sphere"}  # fmt: skip
+SMALL = ["--iterations", "6", "--levels", "4", "--widths", "64", "--shares", "1", "--subdivisions", "4"]
+SMALL_SETTINGS = {"iterations": 6, "levels": (4,), "widths": (64,), "shares": (1.0,), "subdivisions": 4}
 QUICK = {
     "1_first_fit": {"options": SMALL, "view": 5, "spp": 4},
     "2_plugins": {"size": 40, "spp": 4},
