@@ -9,16 +9,25 @@ import mitsuba as mi
 from mi_ring.errors import SceneError
 
 
+class Members(mi.TraversalCallback):
+    """Keeps the named members of an object that it traverses; `mi.traverse` itself only keeps numbers.
+
+    Not a local class: Python frees those late, with the objects that they have seen, and as long as a BSDF lives, Dr.Jit
+    compiles it into the kernels of all scenes.
+    """
+
+    def __init__(self, parent):
+        super().__init__()
+        self.found = []
+        parent.traverse(self)
+
+    def put(self, name, value, *flags):
+        self.found.append((name, value))
+
+
 def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
     """The textures of a BSDF or texture, and of all objects nested in it, each with its name."""
-    found = []
-
-    class Collect(mi.TraversalCallback):  # `mi.traverse` itself only keeps numbers
-        def put(self, name, value, *flags):
-            found.append((name, value))
-
-    bsdf.traverse(Collect())
-    for name, value in found:
+    for name, value in Members(bsdf).found:
         if isinstance(value, mi.Texture):
             yield name, value
         if isinstance(value, mi.Object):
