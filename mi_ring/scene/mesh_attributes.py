@@ -12,8 +12,8 @@ from mi_ring.errors import SceneError
 class Members(mi.TraversalCallback):
     """Keeps the named members of an object that it traverses; `mi.traverse` itself only keeps numbers.
 
-    Not a local class: Python frees those late, with the objects that they have seen, and as long as a BSDF lives, Dr.Jit
-    compiles it into the kernels of all scenes.
+    Not a local class: Python frees those late, together with the objects that they have seen. As long as a BSDF lives,
+    Dr.Jit compiles it into the kernels of all scenes.
     """
 
     def __init__(self, parent):
