@@ -43,7 +43,7 @@ def test_a_capture_from_arrays_is_that_of_the_scene_file(small_capture):
         np.testing.assert_array_equal(ours.light.vector, theirs.light.vector)
         np.testing.assert_array_equal(ours.light.rgb, theirs.light.rgb)
     for name in ("cameras", "intrinsics"):
-        np.testing.assert_array_equal(getattr(made.photographs, name), getattr(read.photographs, name))
+        np.testing.assert_array_equal(getattr(made.photographs.views, name), getattr(read.photographs.views, name))
     for scale in (1, 4):
         for one, other in zip(made.observe([7, 2, 5], scale)[:4], read.observe([7, 2, 5], scale)[:4], strict=True):
             assert torch.equal(one, other)

@@ -32,6 +32,7 @@ from mi_ring.images import linear_to_srgb
 from mi_ring.output.calibration_panel import held_out_text
 from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import BASIS
+from mi_ring.rendering.views import Views
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
 FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes
@@ -74,18 +75,22 @@ def losses(setting, calibration, vertices, spp=16, seed=5):
 
 
 def calibration_of(setting):
-    photographs = setting.photographs
-    shapes = {"cameras": (-1, 3, 4), "intrinsics": (-1, 4)}
-    tensors = [tensor(np.array(getattr(photographs, name))).reshape(shape) for name, shape in shapes.items()]
-    tensors += [tensor(photographs.lights.positions()), tensor(photographs.lights.rgb())]
-    return [t.requires_grad_() for t in tensors]
+    views, count = setting.photographs.views, len(setting.photographs)
+    shapes = {"cameras": (-1, 3, 4), "intrinsics": (-1, 4), "places": (-1, 3), "strengths": (-1, 3)}
+    tensors = {name: tensor(np.array(getattr(views, name))).reshape(shape) for name, shape in shapes.items()}
+    zeros = {name: torch.zeros(count) for name in ("falloff", "distortion")}
+    return Views(**{name: t.requires_grad_() for name, t in (tensors | zeros).items()})
+
+
+def detached(views, **changed):
+    return Views(*(t.detach() for t in views))._replace(**changed)
 
 
 def test_pictures_are_those_of_the_photographs_own_cameras_and_lights():
     setting = Setting(OFF_CAMERA, shadows=True)
     given = prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3)
     same = prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3,
-                         calibration=[t.detach() for t in calibration_of(setting)])  # fmt: skip
+                         views=detached(calibration_of(setting)))  # fmt: skip
     for a, b in zip(given, same):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
 
@@ -93,35 +98,34 @@ def test_pictures_are_those_of_the_photographs_own_cameras_and_lights():
 @pytest.mark.parametrize("name", ["places", "strengths"])
 def test_gradients_of_lights_equal_finite_differences(name):
     """The same rays hit the same points, and there are no shadows that move."""
-    setting, which = Setting(OFF_CAMERA, shadows=False), {"places": 2, "strengths": 3}[name]
+    setting = Setting(OFF_CAMERA, shadows=False)
     calibration = calibration_of(setting)
     losses(setting, calibration, setting.vertices)[0].backward()
     step = tensor(np.random.default_rng(2).uniform(0.2, 1, (2, 3))) * (0.01 if name == "places" else 0.1)
     if name == "places":  # the direction toward a distant light stays a unit vector
-        away = calibration[2][1].detach()
+        away = calibration.places[1].detach()
         step[1] -= away * (step[1] @ away)
     sides = []
     for sign in (1, -1):
-        moved = [t.detach() for t in calibration]
-        moved[which] = moved[which] + sign * step
+        moved = detached(calibration, **{name: getattr(calibration, name).detach() + sign * step})
         sides.append(losses(setting, moved, setting.vertices)[0])
     difference = ((sides[0] - sides[1]) / 2).item()
-    assert (calibration[which].grad * step).sum().item() == pytest.approx(difference, rel=0.01)
+    assert (getattr(calibration, name).grad * step).sum().item() == pytest.approx(difference, rel=0.01)
 
 
 def test_gradient_of_the_flashs_cone_equals_finite_differences_and_its_picture_is_the_cosines_power():
     setting = Setting([OFF_CAMERA[0], OFF_CAMERA[0]], shadows=False)
     falloff = tensor([1.3, 0.0]).requires_grad_()
-    calibration = [*(t.detach() for t in calibration_of(setting)), falloff]
+    calibration = detached(calibration_of(setting), falloff=falloff)
     losses(setting, calibration, setting.vertices)[0].backward()
     step = tensor([0.02, -0.03])
 
     def picture(falloff):
         return prediction.render(setting.surface, setting.photographs, setting.vertices, setting.material, 4, 3, False,
-                             [*calibration[:4], falloff])[0]  # fmt: skip
+                             detached(calibration, falloff=falloff))[0]  # fmt: skip
 
     moved = [(falloff + sign * step).detach() for sign in (1, -1)]
-    high, low = (losses(setting, [*calibration[:4], value], setting.vertices)[0] for value in moved)
+    high, low = (losses(setting, calibration._replace(falloff=value), setting.vertices)[0] for value in moved)
     assert (falloff.grad * step).sum().item() == pytest.approx(((high - low) / 2).item(), rel=0.01)
     # Exponent 2: the squared cosine between where the camera looks and where the ray from the light ends.
     pictures = [picture(tensor([n, 0.0])) for n in (0.0, 2.0)]
@@ -199,7 +203,7 @@ def test_gradients_of_cameras_and_lights_balance_those_of_the_surface(shadows):
     vertices = setting.vertices.clone().requires_grad_()
     calibration = calibration_of(setting)
     sum(losses(setting, calibration, vertices)).backward()
-    cameras, _, places, _ = calibration
+    cameras, places = calibration.cameras, calibration.places
     axis = tensor([0.4, -0.7, 0.5])
     motions = {
         "shift": (axis.expand_as(vertices), torch.cat([torch.zeros(2, 3, 3), axis.expand(2, 3)[..., None]], -1),
@@ -220,12 +224,13 @@ def test_gradient_of_the_focal_length_is_that_of_a_surface_that_comes_nearer():
     vertices, calibration = setting.vertices.clone().requires_grad_(), calibration_of(setting)
     setting.coverage_weight[1] = 0
     losses(setting, calibration, vertices)[1].backward()
-    camera = calibration[0][0].detach()
+    camera = calibration.cameras[0].detach()
     depth = (vertices.detach() - camera[:, 3]) @ camera[:, 2]
     nearer = (vertices.grad * (-depth[:, None] * camera[:, 2])).sum().item()
-    focal = (calibration[1].grad[0, :2] * calibration[1][0, :2].detach()).sum().item()
+    lens = calibration.intrinsics
+    focal = (lens.grad[0, :2] * lens[0, :2].detach()).sum().item()
     assert focal == pytest.approx(nearer, rel=2e-3) and abs(focal) > 1
-    assert (calibration[1].grad[1] == 0).all()
+    assert (lens.grad[1] == 0).all()
 
 
 def test_rotations_are_scipys():
@@ -538,10 +543,8 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     path.unlink()
     np.testing.assert_allclose(read.photographs.room, applied.photographs.room, rtol=1e-5)
     np.testing.assert_allclose(read.part([3, 1]).photographs.room, applied.photographs.room, rtol=1e-5)
-    for a, b in ((applied.photographs, read.photographs), (applied.photographs.lights, read.photographs.lights)):
-        for name in ("cameras", "intrinsics", "distortion", "places", "strengths"):
-            if hasattr(a, name):
-                np.testing.assert_allclose(np.array(getattr(a, name)), np.array(getattr(b, name)), rtol=1e-5, atol=1e-5)
+    for a, b in zip(applied.photographs.views, read.photographs.views):
+        np.testing.assert_allclose(np.array(a), np.array(b), rtol=1e-5, atol=1e-5)
     for a, b in zip(read.shots, applied.shots):
         np.testing.assert_allclose(a.response.gain, b.response.gain, rtol=1e-6)
     assert [s.response.gamma for s in read.shots] == pytest.approx([s.response.gamma for s in applied.shots])

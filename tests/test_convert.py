@@ -30,7 +30,7 @@ from mi_ring import convert, foreign, images
 from mi_ring.capture import loading
 from mi_ring.errors import InputError
 from mi_ring.importers import colmap as importer
-from mi_ring.rendering import pinhole
+from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.system import command
 
 
@@ -42,8 +42,9 @@ def by_hand(R, t, calibration=K):
 
 def in_scene(shot):
     """Pixels of the points in a photograph of ours, corner of the image at the origin."""
-    lens = mi.Point2f(shot.camera.focal), mi.Point2f(shot.camera.centre), None
-    x, depth = pinhole.project(mi.Matrix4f(shot.camera.to_world), *lens, mi.Point3f(POINTS.T.astype("f4")))
+    camera = shot.camera
+    camera = Pinhole(mi.Matrix4f(camera.to_world), mi.Point2f(camera.focal), mi.Point2f(camera.centre))
+    x, depth = camera.project(mi.Point3f(POINTS.T.astype("f4")))
     assert np.array(depth).min() > 0
     return np.array(x).T
 

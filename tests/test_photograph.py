@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mi_ring.geometry.camera import Camera
-from mi_ring.rendering.pinhole import camera_ray, project, project_tangent
+from mi_ring.rendering.pinhole import Pinhole
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 7, 5, 9.5, 7.25, 3.1, 2.8  # [px]; nothing in the middle, nothing square
 POSE = np.array(mi.ScalarTransform4f().look_at([1.3, -0.7, 2.9], [0.2, 0.1, -0.3], [0.2, 1, 0.1]).matrix)
@@ -54,35 +54,35 @@ def rays_of(sensor, u, v, size=(WIDTH, HEIGHT)):
 
 
 def camera():
-    """The arguments of `camera_ray` and `project` for the camera above."""
-    return mi.Matrix4f(POSE), mi.Point2f(FX, FY), mi.Point2f(CX, CY), None
+    """The camera above."""
+    return Pinhole(mi.Matrix4f(POSE), mi.Point2f(FX, FY), mi.Point2f(CX, CY))
 
 
 # Rays. float32 keeps about seven digits: 1e-5 leaves room for a few operations.
 
 
-def test_camera_ray_is_the_pinhole_of_the_conventions():
+def test_a_ray_is_that_of_the_pinhole_of_the_conventions():
     u, v = np.random.default_rng(1).uniform([0, 0], [WIDTH, HEIGHT], (50, 2)).T
-    origin, direction = camera_ray(*camera(), mi.Point2f(mi.Float(u), mi.Float(v)))
+    origin, direction = camera().ray(mi.Point2f(mi.Float(u), mi.Float(v)))
     expected_origin, expected = pinhole(u, v)
     np.testing.assert_allclose(np.array(direction).T, expected, atol=1e-5)
     np.testing.assert_allclose(np.array(origin).ravel(), expected_origin, atol=1e-5)
 
 
 def test_a_pixel_further_right_looks_further_right_and_a_lower_one_further_down():
-    _, axis = camera_ray(mi.Matrix4f(np.eye(4)), *camera()[1:], mi.Point2f(CX + 2, CY + 1))
+    _, axis = camera()._replace(to_world=mi.Matrix4f(np.eye(4))).ray(mi.Point2f(CX + 2, CY + 1))
     # By hand, camera frame x left, y up, z forward: (-2 / fx, -1 / fy, 1), normalised
     expected = np.array([-2 / FX, -1 / FY, 1]) / np.sqrt((2 / FX) ** 2 + (1 / FY) ** 2 + 1)
     np.testing.assert_allclose(np.array(axis).ravel(), expected, atol=1e-6)
 
 
-def test_project_inverts_camera_ray():
+def test_project_inverts_ray():
     random = np.random.default_rng(2)
     u, v = random.uniform([0, 0], [WIDTH, HEIGHT], (50, 2)).T
     origin, direction = pinhole(u, v)
     depth = random.uniform(0.5, 20, 50)
     point = origin + direction * (depth / (direction @ POSE[:3, 2]))[:, None]
-    pixel, z = project(*camera(), mi.Point3f(*point.T.astype(np.float32)))
+    pixel, z = camera().project(mi.Point3f(*point.T.astype(np.float32)))
     np.testing.assert_allclose(np.array(pixel).T, np.stack([u, v], -1), atol=1e-4)  # [px], of numbers below 10
     np.testing.assert_allclose(np.array(z), depth, rtol=1e-5)
 
@@ -95,8 +95,8 @@ def test_a_lens_bends_rays_as_opencvs_does(distortion):
     terms = np.array([distortion, 0, 0, 0])
     photographed = cv2.projectPoints(local, np.zeros(3), np.zeros(3), matrix, terms)[0][:, 0]
     there = local * [-1, -1, 1] @ POSE[:3, :3].T + POSE[:3, 3]
-    lens = (*camera()[:3], mi.Float(distortion))
-    pixel, depth = project(*lens, mi.Point3f(*there.T.astype(np.float32)))
+    lens = camera()._replace(distortion=mi.Float(distortion))
+    pixel, depth = lens.project(mi.Point3f(*there.T.astype(np.float32)))
     np.testing.assert_allclose(np.array(pixel).T, photographed, atol=1e-4)
     np.testing.assert_allclose(np.array(depth), 4, rtol=1e-5)
     ours = Camera(POSE, np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), distortion)
@@ -104,7 +104,7 @@ def test_a_lens_bends_rays_as_opencvs_does(distortion):
     away = there - POSE[:3, 3]
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     np.testing.assert_allclose(ours.directions(photographed), away, atol=1e-9)
-    _, rays = camera_ray(*lens, mi.Point2f(*photographed.T.astype(np.float32)))
+    _, rays = lens.ray(mi.Point2f(*photographed.T.astype(np.float32)))
     np.testing.assert_allclose(np.array(rays).T, away, atol=1e-5)
     u, v = pixel_centres()
     inside = (ours.directions(np.stack([u, v], 1)) @ POSE[:3, 2]).reshape(HEIGHT, WIDTH)
@@ -116,20 +116,21 @@ def test_a_lens_bends_rays_as_opencvs_does(distortion):
 
 
 def test_a_step_along_an_edge_is_photographed_by_a_lens_as_finite_differences_say():
-    to_world, focal, _, _ = camera()
     point, tangent = np.array([0.4, 0.1, -0.2]), np.array([0.3, -0.5, 0.2])
     ours = Camera(POSE, np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), -0.2)
     high, low = (ours.project((point + t * tangent)[None])[0][0] for t in (1e-5, -1e-5))
-    found = project_tangent(to_world, focal, mi.Float(-0.2), mi.Point3f(point.tolist()), mi.Vector3f(tangent.tolist()))
+    found = camera()._replace(distortion=mi.Float(-0.2)).project_tangent(
+        mi.Point3f(point.tolist()), mi.Vector3f(tangent.tolist())
+    )
     np.testing.assert_allclose(np.array(found).ravel(), (high - low) / 2e-5, rtol=1e-4)
 
 
 def test_what_is_beyond_the_fold_of_a_lens_is_not_seen():
     """A point 1.8 focal lengths off the axis would be photographed beside the principal point, were it not told."""
-    camera = Camera(np.eye(4), np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), -0.3)
-    assert np.isnan(camera.project(np.array([[1.8, 0.0, 1.0]]))[0]).all()
-    pixel, _ = project(mi.Matrix4f(np.eye(4)), mi.Point2f(FX, FY), mi.Point2f(CX, CY), mi.Float(-0.3),
-                       mi.Point3f(1.8, 0, 1))  # fmt: skip
+    ours = Camera(np.eye(4), np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), -0.3)
+    assert np.isnan(ours.project(np.array([[1.8, 0.0, 1.0]]))[0]).all()
+    lens = camera()._replace(to_world=mi.Matrix4f(np.eye(4)), distortion=mi.Float(-0.3))
+    pixel, _ = lens.project(mi.Point3f(1.8, 0, 1))
     assert abs(pixel.x[0] - CX) > 1e3
 
 
@@ -394,12 +395,12 @@ def test_scenes_open_in_every_variant_and_after_switching(tmp_path):
             assert pixel == pytest.approx([0.05] * 3, rel=0.1 if "spectral" in variant else 1e-3), variant
 
 
-def test_gradients_pass_through_the_camera_ray():
+def test_gradients_pass_through_rays():
     """Against central differences, in the parameters that a calibration would refine."""
     pose = mi.Matrix4f(POSE)
 
     def pixel_x(cx, fx, distortion):
-        _, d = camera_ray(pose, mi.Point2f(fx, FY), mi.Point2f(cx, CY), distortion, mi.Point2f(5.2, 1.4))
+        _, d = Pinhole(pose, mi.Point2f(fx, FY), mi.Point2f(cx, CY), distortion).ray(mi.Point2f(5.2, 1.4))
         return d.x
 
     cx, fx, distortion = mi.Float(CX), mi.Float(FX), mi.Float(-0.3)

@@ -15,16 +15,17 @@ from torch import Tensor, nn
 
 from mi_ring.calibration.camera_response import CameraResponse
 from mi_ring.calibration.light_tensors import LightTensors
-from mi_ring.calibration.rig import Estimate, Rig, Views
+from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera, undistortion_factor
+from mi_ring.geometry.camera import undistortion_factor
 from mi_ring.rendering import bridge, prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.rendering.surface import Surface
+from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import device
@@ -51,7 +52,6 @@ class Calibration(nn.Module):
         if "falloff" in refined and rig.flash is None:
             raise InputError(f"{rig.path}: emitter: the lights do not move with the cameras, but --refine falloff "
                              "is for a flash that does; leave it out")  # fmt: skip
-        self.bent = bool(rig.views.distortion.any()) or "distortion" in refined  #: Is there any lens distortion?
         self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
         for name, unknown in self.unknowns.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
@@ -73,7 +73,7 @@ class Calibration(nn.Module):
 
     def forward(self, scale: int = 1) -> Views:
         """Cameras and lights with the current values, for photographs `scale` times smaller."""
-        views = self.rig.views_of(self.estimate(), self.bent)
+        views = self.rig.views_of(self.estimate())
         return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
 
     def lamps(self) -> LightTensors:
@@ -123,8 +123,7 @@ class Calibration(nn.Module):
         x = (torch.arange(width) + 0.5 - cx) / fx
         y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
         distance2 = x**2 + y**2
-        if self.bent:
-            distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
+        distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
         return (1 + distance2)[..., None] ** -0.5
 
     def response(self) -> CameraResponse:
@@ -142,10 +141,10 @@ class Calibration(nn.Module):
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
-    def refined_photographs(self, photographs: Photographs, views: Sequence[Tensor]) -> Photographs:
+    def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
         """Photographs with these cameras and lights, and the current room light; without gradients."""
         room = self.room_harmonics().double().numpy(force=True)
-        return replace(prediction.calibrated(photographs, views), room=room if room.any() else None)
+        return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
 
     def room_harmonics(self) -> Tensor:
         """(BASIS, 3) current harmonics of the room light; if only the scene says them, `scale` applies to them."""
@@ -187,7 +186,7 @@ class Calibration(nn.Module):
     def applied(self, capture: Capture) -> Capture:
         """The capture with the current cameras, lights and response."""
         estimate = self.estimate()
-        views, lamps = self.rig.views_of(estimate, self.bent), self.rig.lamps_of(estimate)
+        views, lamps = self.rig.views_of(estimate), self.rig.lamps_of(estimate)
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
         gains = np.ones((len(self.rig), 3))
         if "gain" in self.refined:
@@ -195,13 +194,12 @@ class Calibration(nn.Module):
         # The curve keeps the exposure here, and full scale in a scene file.
         level = self.rig.exposure ** ((1 - gamma) / gamma)
         lights = LightTensors(views.places, self.rig.finite, level * views.strengths.double()).lights()
-        poses, intrinsics, _, _, falloff, distortion = (part.double().numpy() for part in views)
+        views = Views(*(part.double().numpy() for part in views))
         shots = []
         for k, shot in enumerate(capture.shots):
-            pose, lens = np.vstack([poses[k], [0, 0, 0, 1]]), intrinsics[k]
-            camera = Camera(pose, lens[:2], lens[2:], shot.size, float(distortion[k]))
             response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
-            shots.append(replace(shot, camera=camera, light=lights[k], falloff=float(falloff[k]), response=response))
+            shots.append(replace(shot, camera=views.camera(k, shot.size), light=lights[k],
+                                 falloff=float(views.falloff[k]), response=response))  # fmt: skip
         scene, room = capture.scene, None
         if "lamps" in self.refined:
             scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())

@@ -1,7 +1,6 @@
 """The rig: what a capture says about its cameras and lights, as tensors, and estimates that differ from it."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,36 +11,27 @@ from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.capture.capture import Capture
 from mi_ring.geometry.camera import distortion_range
 from mi_ring.geometry.rotations import quarter_turns
+from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import lamp_lights
 
 RIGID = 0.02  #: how much a flash may move in the cameras' axes and still be one flash [rig's distance]
 INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 
-class Views(NamedTuple):
-    """Cameras and lights of all P photographs, in the order in which the renderer takes them."""
-
-    cameras: Tensor  #: (P, 3, 4) camera-to-world
-    intrinsics: Tensor  #: (P, 4) fx, fy, cx, cy [px]
-    places: Tensor  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
-    strengths: Tensor  #: (P, 3) intensities, of distant lights irradiances
-    falloff: Tensor  #: (P,) exponents of flashes' cones
-    distortion: Tensor  #: (P,) first radial distortions of the lenses
-
-
 @dataclass(frozen=True)
 class Estimate:
     """What an `Unknown` changes: cameras and lights, starting from those of the capture."""
 
-    cameras: Tensor  #: as of `Views`
-    intrinsics: Tensor
-    falloff: Tensor
-    distortion: Tensor
+    views: Views  #: lights as in the capture
     offset: Tensor  #: (light places, 3) or (): of the lights [rig's distance], of distant ones [rad]
     log_power: Tensor  #: (P, 3) or (): logarithm of a factor of the lights' strengths
     lamp_offset: Tensor  #: (L, 3) or (): as `offset`, of the scene's own lamps
     log_lamp_power: Tensor  #: (L, 3) or (): as `log_power`, of these lamps
     response: CameraResponse
+
+    def seen(self, **views: Tensor) -> "Estimate":
+        """The estimate with other tensors of its `views`."""
+        return replace(self, views=self.views._replace(**views))
 
 
 class Rig:
@@ -62,21 +52,17 @@ class Rig:
         the scene's own lamps are unknown.
         """
         self.path, self.exposure, self.power, self.guessed = capture.path, exposure, power, guessed
-        cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
-        to_world = np.stack([camera.to_world[:3] for camera in cameras])
-        intrinsics = np.array([[*camera.focal, *camera.centre] for camera in cameras])
-        cones = np.array([shot.falloff for shot in capture.shots])
-        distortion = np.array([camera.distortion for camera in cameras])
-        arrays = to_world, intrinsics, lights.positions(), power * lights.rgb(), cones, distortion
-        self.views = Views(*(torch.from_numpy(array).float() for array in arrays))
+        lights = capture.photographs.lights
+        views = Views.of(capture.shots, lights.positions(), power * lights.rgb())
+        self.views = Views(*(torch.from_numpy(array).float() for array in views))
         self.sizes = [shot.size for shot in capture.shots]
         self.dark = capture.photographs.dark  #: Have photographs no lights of their own?
-        self.fitted = torch.arange(len(cameras)) if fitted is None else torch.from_numpy(fitted)
+        self.fitted = torch.arange(len(capture.shots)) if fitted is None else torch.from_numpy(fitted)
         self.lamps = LightTensors.of(lamp_lights(capture.scene) if lamps else [])  #: that are unknown
 
         self.center = torch.from_numpy(np.asarray(center)).float()
         #: the unit of length of unknowns: median distance from the cameras to the object [scene units]
-        self.distance = float(np.median(np.linalg.norm(to_world[:, :, 3] - center, axis=1)))
+        self.distance = float(np.median(np.linalg.norm(views.cameras[:, :, 3] - center, axis=1)))
         self.finite = torch.from_numpy(lights.is_finite())[:, None]
         of_world = self.views.cameras[:, :, :3]
         in_camera = torch.einsum("pji,pj->pi", of_world, self.views.places - self.views.cameras[:, :, 3])
@@ -90,7 +76,7 @@ class Rig:
         self.flash = in_camera if rigid else None
         self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  #: components of the lights' offset
 
-        kinds = np.column_stack([intrinsics[:, :2].round(3), distortion.round(6)])
+        kinds = np.column_stack([views.intrinsics[:, :2].round(3), views.distortion.round(6)])
         lens = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
         place = np.unique(relative.round(6), axis=0, return_inverse=True)[1].ravel()
@@ -115,25 +101,22 @@ class Rig:
     def estimate(self) -> Estimate:
         """Cameras and lights as the capture says."""
         none = torch.zeros(())
-        return Estimate(self.views.cameras, self.views.intrinsics, self.views.falloff, self.views.distortion, none,
-                        none, none, none, self.response)  # fmt: skip
+        return Estimate(self.views, none, none, none, none, self.response)
 
-    def views_of(self, estimate: Estimate, bent: bool) -> Views:
-        """Cameras and lights of an estimate. `bent`: some lens has distortion, or an unknown one."""
+    def views_of(self, estimate: Estimate) -> Views:
+        """Cameras and lights of an estimate."""
+        now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
             in_camera = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
-            places = estimate.cameras[:, :, 3] + (estimate.cameras[:, :, :3] @ in_camera)[..., 0]
+            places = now.cameras[:, :, 3] + (now.cameras[:, :, :3] @ in_camera)[..., 0]
         else:
             lights = LightTensors(self.views.places, self.finite, self.views.strengths)
             places = lights.moved(offset, self.distance).places
-        distortion = estimate.distortion
-        if bent:  # within the range in which each ray has one pixel
-            now = estimate.intrinsics.detach()
-            least, most = distortion_range(now[:, :2], now[:, 2:], torch.tensor(self.sizes))
-            distortion = distortion.clamp(INSIDE * least, INSIDE * most)
-        strengths = self.views.strengths * estimate.log_power.exp()
-        return Views(estimate.cameras, estimate.intrinsics, places, strengths, estimate.falloff, distortion)
+        lens = now.intrinsics.detach()
+        least, most = distortion_range(lens[:, :2], lens[:, 2:], torch.tensor(self.sizes))
+        distortion = now.distortion.clamp(INSIDE * least, INSIDE * most)  # so that each ray has one pixel
+        return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 
     def lamps_of(self, estimate: Estimate) -> LightTensors:
         """The scene's own lamps of an estimate."""

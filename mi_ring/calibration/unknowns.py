@@ -96,7 +96,7 @@ class Turn(Unknown):
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         turned = rig.views.cameras[:, :, :3] @ rotations(value)
-        return replace(now, cameras=torch.cat([turned, now.cameras[:, :, 3:]], 2))
+        return now.seen(cameras=torch.cat([turned, now.views.cameras[:, :, 3:]], 2))
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
         angle, spread = (float(np.degrees(1.0) * np.linalg.norm(part)) for part in (value, std))
@@ -111,7 +111,7 @@ class Move(Unknown):
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         along = rig.views.cameras[:, :, :3] @ (value * rig.distance)[..., None]
         moved = rig.views.cameras[:, :, 3:] + along
-        return replace(now, cameras=torch.cat([now.cameras[:, :, :3], moved], 2))
+        return now.seen(cameras=torch.cat([now.views.cameras[:, :, :3], moved], 2))
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
         way, spread = (float(rig.distance * np.linalg.norm(part)) for part in (value, std))
@@ -122,8 +122,8 @@ class Focal(Unknown):
     """Logarithm of a factor of each lens's focal length."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        focal = now.intrinsics[:, :2] * value.exp()[rig.lens, None]
-        return replace(now, intrinsics=torch.cat([focal, now.intrinsics[:, 2:]], 1))
+        focal, centre = now.views.intrinsics.split(2, 1)
+        return now.seen(intrinsics=torch.cat([focal * value.exp()[rig.lens, None], centre], 1))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         before, after = (np.array([camera.focal.mean() for camera in cameras]) for cameras in lens_cameras(found))
@@ -134,8 +134,8 @@ class Principal(Unknown):
     """Shift of each lens's principal point [focal lengths]."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        shift = value[rig.lens] * now.intrinsics[:, :2]
-        return replace(now, intrinsics=torch.cat([now.intrinsics[:, :2], now.intrinsics[:, 2:] + shift], 1))
+        focal, centre = now.views.intrinsics.split(2, 1)
+        return now.seen(intrinsics=torch.cat([focal, centre + value[rig.lens] * focal], 1))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         before, after = lens_cameras(found)
@@ -147,7 +147,7 @@ class Distortion(Unknown):
     """First radial distortion of each lens, added to the known one."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return replace(now, distortion=now.distortion + value[rig.lens])
+        return now.seen(distortion=now.views.distortion + value[rig.lens])
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         before, after = ([camera.distortion for camera in cameras] for cameras in lens_cameras(found))
@@ -199,7 +199,7 @@ class Falloff(Unknown):
     """Exponent of the cosine about the flash's axis, added to the known one."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return replace(now, falloff=now.falloff + value)
+        return now.seen(falloff=now.views.falloff + value)
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         return "exponent of the flash's cone", *found.means(lambda shot: shot.falloff), std

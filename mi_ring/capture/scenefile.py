@@ -4,6 +4,7 @@ import math
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,13 @@ Element = ElementTree.Element
 #: Properties of plugins, Mitsuba's and ours, that name a file. The value of another property may look like a name.
 FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 
-#: What a fit may refine of a photograph, beside its light: names in a scene file. `DEFAULTS` are not written.
-DEFAULTS = {"gamma": 1.0, "contrast": 1.0, "falloff": 0.0, "vignetting": 0.0, "distortion": 0.0}
-REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *DEFAULTS}
+#: Numbers of a photograph that a scene file only has where they are not the default: where a `Shot` has them.
+OPTIONAL = {
+    "gamma": ("response.gamma", 1.0), "contrast": ("response.contrast", 1.0), "falloff": ("falloff", 0.0),
+    "vignetting": ("response.vignetting", 0.0), "distortion": ("camera.distortion", 0.0),
+}  # fmt: skip
+#: What a fit may refine of a photograph, beside its light: names in a scene file.
+REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
@@ -39,8 +44,9 @@ def photograph_element(shot: Shot) -> Element:
     fields = dict(zip(("fx", "fy", "cx", "cy"), (*camera.focal, *camera.centre)))
     if shot.saturation != 1:
         fields["saturation"] = shot.saturation
-    given = response.gamma, response.contrast, shot.falloff, response.vignetting, camera.distortion
-    fields |= {field: value for field, value in zip(DEFAULTS, given) if value != DEFAULTS[field]}
+    for field, (where, default) in OPTIONAL.items():
+        if (value := attrgetter(where)(shot)) != default:
+            fields[field] = value
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
     if response.gain != (1, 1, 1):

@@ -111,8 +111,7 @@ class CovarianceGroup:
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
-        views = [tensor.to(self.problem.device) for tensor in calibration(self.scale)]
-        return prediction.calibrated(replace(photographs, room=room), views)
+        return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     @property
     def calibration(self) -> Calibration:

@@ -70,12 +70,13 @@ class Renderer:
         self.surface.set_faces(batch.faces)
         views = problem.capture.photographs.select(batch.photographs, batch.size, batch.scale)
         views = replace(views, before=batch.share.part.start)
-        refined = [t.to(problem.device) for t in calibration(batch.scale)] if calibration else []
+        refined = None
         if calibration:
+            refined = calibration(batch.scale).to(problem.device)
             views = calibration.refined_photographs(views, refined)
         linear, coverage = prediction.render(
             self.surface, views, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
-            shadows=config.shadows and problem.capture.shadows, calibration=refined,
+            shadows=config.shadows and problem.capture.shadows, views=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
         )  # fmt: skip
         other = self.other_light(problem, model, batch, views, coverage)

@@ -13,7 +13,6 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
-from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.visibility import MaskedCamera, Visibility
 from mi_ring.system.optional import need
@@ -62,11 +61,11 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
     """At the pixel centres of a photograph: hit (P,), distance (P,), normal (P, 3), and is it a face's back (P,)?"""
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
-    to_world, focal, centre, distortion = photograph.camera(mi.UInt32(0))
+    camera = photograph.camera(mi.UInt32(0))
     width, height = photograph.size
     pixel = dr.arange(mi.UInt32, width * height)
-    where = (mi.Point2f(pixel % width, pixel // width) + 0.5 - centre) * mi.Point2f(1 / np.array(focal))
-    rays = mi.Ray3f(*camera_ray(to_world, mi.Point2f(1), mi.Point2f(0), distortion, where))
+    where = (mi.Point2f(pixel % width, pixel // width) + 0.5 - camera.centre) * mi.Point2f(1 / np.array(camera.focal))
+    rays = mi.Ray3f(*camera._replace(focal=mi.Point2f(1), centre=mi.Point2f(0)).ray(where))
     si = scene.ray_intersect(rays)
     back = si.is_valid() & (dr.dot(mi.Vector3f(si.n), rays.d) > 0)
     return np.array(si.is_valid()), np.array(si.t), np.array(si.sh_frame.n).T, np.array(back)

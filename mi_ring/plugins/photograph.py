@@ -7,7 +7,7 @@ import numpy as np
 from mi_ring.errors import SceneError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
-from mi_ring.rendering.pinhole import camera_ray
+from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.scene.lights import LAMP_CLASSES, light_of
 from mi_ring.scene.shot import Files, Response, Shot
 
@@ -161,8 +161,7 @@ class Photograph(mi.Sensor):
         Photograph.current = self
         film = self.film()
         pixel = sample2 * mi.ScalarVector2f(film.crop_size()) + mi.ScalarVector2f(film.crop_offset())
-        lens = self.focal, self.centre, self.distortion
-        origin, direction = camera_ray(self.to_world.matrix, *lens, pixel)
+        origin, direction = Pinhole(self.to_world.matrix, self.focal, self.centre, self.distortion).ray(pixel)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         return mi.Ray3f(origin, direction, SHUTTER, wavelengths), weight
 

@@ -5,7 +5,6 @@ import mitsuba as mi
 
 from mi_ring.rendering.direct_light import next_2d, trace
 from mi_ring.rendering.edge_curves import SHADOW_OFFSET, EdgeSamples, ray_offset
-from mi_ring.rendering.pinhole import camera_ray, project, project_tangent
 from mi_ring.scene.lights import position_of
 
 EDGE_ROUNDINGS = 16  #: the least distance to rays beside an edge, in rounding errors of a pixel coordinate
@@ -36,13 +35,13 @@ def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
 def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window):
     """`boundary_terms` of one curve; None if nothing moves it."""
     camera = photographs.camera(curve.view)
-    where, depth = project(*camera, curve.point)
+    where, depth = camera.project(curve.point)
     if not dr.grad_enabled(where):
         return None
     with dr.suspend_grad():
         q = dr.detach(where)
         active = curve.active & (depth > 0) & dr.all((q > window[0]) & (q < window[1]))
-        along = project_tangent(camera[0], camera[1], camera[3], curve.point, curve.tangent)
+        along = camera.project_tangent(curve.point, curve.tangent)
         across = mi.Vector2f(-along.y, along.x)
         active &= dr.isfinite(dr.squared_norm(across)) & (dr.squared_norm(across) > 0)
         offset = max(curve.offset, EDGE_ROUNDINGS * 2.0**-24 * max(photographs.size))
@@ -53,7 +52,7 @@ def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window)
         sign, pair = mi.Float(lane % 2) * 2 - 1, lane // 2
         view = dr.gather(mi.UInt32, curve.view, pair)
         pixel = dr.gather(mi.Point2f, q, pair) + sign * dr.gather(mi.Vector2f, shift, pair)
-        ray = mi.Ray3f(*camera_ray(*photographs.camera(view), pixel))
+        ray = mi.Ray3f(*photographs.camera(view).ray(pixel))
         # Rays of inactive samples may not be finite: OptiX must not trace them.
         traced = dr.gather(mi.Bool, active, pair)
         # The same random numbers on both sides: only the edge must make a difference.

@@ -32,7 +32,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
             random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.first_lane(spp))
-            pose = photographs.camera(view)[0]
+            pose = photographs.camera(view).to_world
             bsdfs = bsdfs_with_lobes(scene) if harmonics else []
             unoccluded = reflected_harmonics(bsdfs, si, pose, harmonics, si.is_valid()) if harmonics else []
             radiance, escaped, blocked = trace_paths(scene, si, view, photographs, bounces, random, table, bsdfs)

@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.rendering.photograph_lights import Lights, flash_falloff
-from mi_ring.rendering.pinhole import camera_ray
+from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, reflected_harmonics
+from mi_ring.rendering.views import Views
 from mi_ring.scene.shot import Shot
 
 LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
@@ -23,14 +24,11 @@ class Photographs:
     A `view` is a number among the selected photographs, one per lane.
     """
 
-    cameras: object  #: Float, 12 per photograph: the upper three rows of to_world
-    intrinsics: object  #: Float, 4 per photograph: fx, fy, cx, cy [px]
-    lights: Lights
+    views: Views  #: buffers of all photographs
+    finite: object  #: Bool, one per photograph: is its light a point light? Else it is distant
     index: object  #: UInt32: the selected photographs in their order
     size: tuple[int, int]  #: (width, height) [px] of every selected photograph
     colocated: bool  #: is every light at its camera's centre? Then the camera sees no shadows
-    falloff: object = None  #: Float, one per photograph: exponent of the flash's cone; None if it is 0 for all
-    distortion: object = None  #: Float, one per photograph: as `Camera.distortion`; None if it is 0 for all
     #: Light of the room, (BASIS, 3) in `mi_ring.rendering.spherical_harmonics`; None if there is none.
     room: np.ndarray | None = None
     dark: bool = False  #: are all lights of the photographs black?
@@ -42,81 +40,71 @@ class Photographs:
 
         Raises SceneError for lights that cannot be rendered.
         """
-        matrices = np.stack([shot.camera.to_world[:3] for shot in shots])
-        intrinsics = np.stack([np.concatenate([shot.camera.focal, shot.camera.centre]) for shot in shots])
         lights = Lights.of(shots)
-        falloff = np.array([shot.falloff for shot in shots], np.float32)
-        bent = np.array([shot.camera.distortion for shot in shots], np.float32)
+        views = Views.of(shots, lights.positions(), lights.rgb())
+        eyes = views.cameras[:, :, 3]
         # Equal but for the rounding of float32.
-        off = np.abs(lights.positions() - matrices[:, :, 3]).max(1) > 1e-6 * np.abs(matrices[:, :, 3]).max()
+        off = np.abs(views.places - eyes).max(1) > 1e-6 * np.abs(eyes).max()
         return cls(
-            mi.Float(matrices.astype(np.float32).ravel()), mi.Float(intrinsics.astype(np.float32).ravel()), lights,
-            dr.arange(mi.UInt32, len(shots)), shots[0].size, not (off | ~lights.is_finite()).any(),
-            mi.Float(falloff) if falloff.any() else None, mi.Float(bent) if bent.any() else None, room,
-            dark=not lights.rgb().any(),
+            views.buffers(), lights.finite, dr.arange(mi.UInt32, len(shots)), shots[0].size,
+            not (off | ~lights.is_finite()).any(), room, dark=not lights.rgb().any(),
         )  # fmt: skip
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
         """One photograph, its camera and its light attached to the parameters of its sensor."""
         m = sensor.to_world.matrix
-        return replace(
-            cls.of([sensor.shot]),
-            cameras=dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
-            intrinsics=dr.concat([*sensor.focal, *sensor.centre]),
-            lights=Lights.attached(sensor.light),
-            falloff=mi.Float(sensor.falloff),
-            distortion=mi.Float(sensor.distortion),
-        )
+        light = Lights.attached(sensor.light)
+        views = Views(
+            dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
+            dr.concat([*sensor.focal, *sensor.centre]), light.places, light.strengths, mi.Float(sensor.falloff),
+            mi.Float(sensor.distortion),
+        )  # fmt: skip
+        return replace(cls.of([sensor.shot]), views=views)
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
         """Photographs `index`, all of `size` (width, height), rendered `scale` times smaller."""
         width, height = size
+        views = self.views._replace(intrinsics=self.views.intrinsics / dr.opaque(mi.Float, scale))
         return replace(
-            self, intrinsics=self.intrinsics / dr.opaque(mi.Float, scale),
-            index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale),
-        )  # fmt: skip
+            self, views=views, index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale)
+        )
 
-    def with_calibration(self, cameras, intrinsics, places, strengths, falloff=None, distortion=None) -> "Photographs":
-        """The photographs with other buffers of cameras and lights. No light counts as colocated with its camera.
+    def with_views(self, views: Views) -> "Photographs":
+        """The photographs with other buffers of cameras and lights. No light counts as colocated with its camera."""
+        return replace(self, views=views, colocated=False)
 
-        `falloff` and `distortion` stay as they are if none are given.
-        """
-        return replace(
-            self, cameras=cameras, intrinsics=intrinsics, colocated=False,
-            lights=replace(self.lights, places=places, strengths=strengths),
-            falloff=self.falloff if falloff is None else falloff,
-            distortion=self.distortion if distortion is None else distortion,
-        )  # fmt: skip
+    @property
+    def lights(self) -> Lights:
+        """The lights of all photographs."""
+        return Lights(self.views.places, self.finite, self.views.strengths)
 
     def in_units(self, unit: float) -> "Photographs":
         """The same pictures in a world whose unit of length is `unit` scene units."""
         if unit == 1:
             return self
-        entry, finite = dr.arange(mi.UInt32, dr.width(self.cameras)), self.lights.finite
-        length = dr.select(entry % 4 == 3, 1 / unit, 1)
-        near = dr.gather(mi.Bool, finite, dr.arange(mi.UInt32, 3 * dr.width(finite)) // 3)
+        views = self.views
+        length = dr.select(dr.arange(mi.UInt32, dr.width(views.cameras)) % 4 == 3, 1 / unit, 1)
+        near = dr.gather(mi.Bool, self.finite, dr.arange(mi.UInt32, 3 * dr.width(self.finite)) // 3)
         scale = dr.select(near, 1 / unit, 1)
-        places, strengths = self.lights.places * scale, self.lights.strengths * scale * scale  # scale² may be inf
-        lights = replace(self.lights, places=places, strengths=strengths)
-        return replace(self, cameras=self.cameras * length, lights=lights)
+        places, strengths = views.places * scale, views.strengths * scale * scale  # scale² may be inf
+        return replace(self, views=views._replace(cameras=views.cameras * length, places=places, strengths=strengths))
 
     def __len__(self) -> int:
         return dr.width(self.index)
 
-    def camera(self, view):
-        """(to_world, focal, centre, distortion) of photograph `view`, as `camera_ray` takes them."""
+    def camera(self, view) -> Pinhole:
+        """The camera of photograph `view`."""
         k = dr.gather(mi.UInt32, self.index, view)
-        rows = [dr.gather(mi.Vector4f, self.cameras, 3 * k + row) for row in range(3)]
-        f = dr.gather(mi.Vector4f, self.intrinsics, k)
+        rows = [dr.gather(mi.Vector4f, self.views.cameras, 3 * k + row) for row in range(3)]
+        f = dr.gather(mi.Vector4f, self.views.intrinsics, k)
         to_world = mi.Matrix4f(*[list(row) for row in rows], [0, 0, 0, 1])
-        distortion = None if self.distortion is None else dr.gather(mi.Float, self.distortion, k)
-        return to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion
+        distortion = None if self.views.distortion is None else dr.gather(mi.Float, self.views.distortion, k)
+        return Pinhole(to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion)
 
     def eye(self, view):
         """The camera of photograph `view` as an eye of `Edges`."""
-        to_world, *_ = self.camera(view)
-        return mi.Vector3f(to_world[0, 3], to_world[1, 3], to_world[2, 3]), mi.Bool(True)
+        return mi.Vector3f(self.camera(view).position), mi.Bool(True)
 
     def source(self, view):
         """The light of photograph `view` as an eye of `Edges`."""
@@ -126,9 +114,9 @@ class Photographs:
         """(DirectionSample3f, radiance · d⁻²) of the light of photograph `view` at surface interactions `si`."""
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
-        if self.falloff is not None:
-            finite = dr.gather(mi.Bool, self.lights.finite, k)
-            share = flash_falloff(ds.d, self.camera(view)[0], dr.gather(mi.Float, self.falloff, k))
+        if self.views.falloff is not None:
+            finite = dr.gather(mi.Bool, self.finite, k)
+            share = flash_falloff(ds.d, self.camera(view).to_world, dr.gather(mi.Float, self.views.falloff, k))
             radiance *= dr.select(finite, share, 1)
         return ds, radiance
 
@@ -157,7 +145,7 @@ class Photographs:
 
         def radiance(si):
             buffer = mi.Float(self.room[which].astype(np.float32).ravel())
-            values = reflected_harmonics(bsdfs_with_lobes(scene), si, self.camera(view)[0], which)
+            values = reflected_harmonics(bsdfs_with_lobes(scene), si, self.camera(view).to_world, which)
             return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))
 
         return radiance
@@ -214,7 +202,7 @@ def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int,
     stratum = local % spp
     x = column + (mi.Float(stratum % columns) + jitter_x) / columns
     y = row + (mi.Float(stratum // columns) + jitter_y) / (spp // columns)
-    return mi.Ray3f(*camera_ray(*photographs.camera(view), mi.Point2f(x, y))), view
+    return mi.Ray3f(*photographs.camera(view).ray(mi.Point2f(x, y))), view
 
 
 def center_rays(photographs: Photographs, pixels: tuple[int, int] | None = None):
@@ -222,4 +210,4 @@ def center_rays(photographs: Photographs, pixels: tuple[int, int] | None = None)
     first, last = pixels or (0, photographs.pixels)
     pixel = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
     view, column, row = pixel_position(photographs, pixel)
-    return mi.Ray3f(*camera_ray(*photographs.camera(view), mi.Point2f(column + 0.5, row + 0.5))), view
+    return mi.Ray3f(*photographs.camera(view).ray(mi.Point2f(column + 0.5, row + 0.5))), view

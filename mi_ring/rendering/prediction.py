@@ -14,6 +14,7 @@ from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_maps, render_photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
+from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
 
 NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
@@ -21,29 +22,28 @@ NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float3
 
 def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
-    seed: int = 0, shadows: bool = True, calibration: Sequence[Tensor] = (), lamps: Sequence[Tensor] = (),
+    seed: int = 0, shadows: bool = True, views: Views | None = None, lamps: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Predicted photographs of the surface, each under its own light, differentiable.
 
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
-    samples. `calibration`: other cameras and lights of all P photographs, as `Photographs.with_calibration` takes them:
-    (P, 3, 4), (P, 4) [px of these sizes], (P, 3), (P, 3), and optionally falloff and distortion (P,) each. `lamps`:
-    other places and strengths (L, 3) of the scene's L lamps, as `Surface.relight` takes them.
+    samples. `views`: other cameras and lights of all P photographs, as tensors. `lamps`: other places and strengths
+    (L, 3) of the scene's L lamps, as `Surface.relight` takes them.
 
     Returns linear radiance (N, H, W, 3) and coverage (N, H, W) in [0, 1]. Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage. There can be one backward
     pass, before the surface is written again; else it raises RuntimeError. Raises ValueError like `Surface.parameters`.
     """
     parameters = surface.parameters(vertices, attributes)
-    moving = any(tensor.requires_grad for tensor in (vertices, *calibration, *lamps))
+    others = [*(views or ()), *lamps]
+    moving = any(tensor.requires_grad for tensor in (vertices, *others))
 
     def program(arrays: list[mi.Float]) -> list[mi.Float]:
         surface.write_arrays(dict(zip(parameters, arrays)))
-        others = arrays[len(parameters) :]
         if lamps:
-            surface.relight(*others[len(calibration) :])
-        moved = photographs.with_calibration(*others[: len(calibration)]) if calibration else photographs
+            surface.relight(*arrays[-len(lamps) :])
+        moved = photographs.with_views(Views(*arrays[len(parameters) :][: len(views)])) if views else photographs
         if moving:  # gradients with respect to the material alone need no edges
             surface.edges = Edges.of(surface.scene, surface.edges)
         edges = surface.edges if moving else None
@@ -52,7 +52,7 @@ def render(
     if parameters[POSITIONS].requires_grad:
         points, faces = parameters[POSITIONS].detach(), surface.faces
         parameters[POSITIONS].register_hook(lambda gradient: finite_gradient(gradient, points, faces))
-    channels = differentiable(program, [*parameters.values(), *calibration, *lamps], surface)
+    channels = differentiable(program, [*parameters.values(), *others], surface)
     *rgb, coverage = (channel.reshape(photographs.shape) for channel in channels)
     return torch.stack(rgb, dim=-1), coverage.clone()
 
@@ -74,9 +74,9 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
     return torch.where(degenerate[:, None], gradient.nan_to_num(0, 0, 0), gradient)
 
 
-def calibrated(photographs: Photographs, calibration: Sequence[Tensor]) -> Photographs:
-    """Photographs with other cameras and lights, as `render` takes them, without gradients."""
-    return photographs.with_calibration(*map(to_drjit, calibration))
+def with_views(photographs: Photographs, views: Views) -> Photographs:
+    """Photographs with other cameras and lights, as tensors, without gradients."""
+    return photographs.with_views(Views(*map(to_drjit, views)))
 
 
 def draw(

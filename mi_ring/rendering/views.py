@@ -1,0 +1,47 @@
+"""Cameras and lights of many photographs as arrays: what a fit refines and what the renderer reads."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import torch
+
+from mi_ring.geometry.camera import Camera
+from mi_ring.scene.shot import Shot
+
+
+class Views(NamedTuple):
+    """Cameras and lights of P photographs: arrays of numpy or torch, or buffers: the same, flat, in Dr.Jit."""
+
+    cameras: Any  #: (P, 3, 4) camera-to-world
+    intrinsics: Any  #: (P, 4) fx, fy, cx, cy [px]
+    places: Any  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
+    strengths: Any  #: (P, 3) intensities, of distant lights irradiances
+    falloff: Any  #: (P,) exponents of the flashes' cones; as a buffer None if all are 0
+    distortion: Any  #: (P,) first radial distortions of the lenses; as a buffer None if all are 0
+
+    @classmethod
+    def of(cls, shots: Sequence[Shot], places: np.ndarray, strengths: np.ndarray) -> "Views":
+        """The cameras of these photographs with these lights, as numpy arrays."""
+        cameras = [shot.camera for shot in shots]
+        return cls(
+            np.stack([camera.to_world[:3] for camera in cameras]),
+            np.array([[*camera.focal, *camera.centre] for camera in cameras]), places, strengths,
+            np.array([shot.falloff for shot in shots]), np.array([camera.distortion for camera in cameras]),
+        )  # fmt: skip
+
+    def to(self, device: torch.device) -> "Views":
+        """Tensors on another device."""
+        return Views(*(tensor.to(device) for tensor in self))
+
+    def buffers(self) -> "Views":
+        """Numpy arrays as buffers."""
+        buffers = {name: mi.Float(array.astype(np.float32).ravel()) for name, array in self._asdict().items()}
+        return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
+
+    def camera(self, k: int, size: tuple[int, int]) -> Camera:
+        """The camera of photograph `k`, `size` (width, height) [px]. For numpy arrays only."""
+        lens = self.intrinsics[k]
+        pose = np.vstack([self.cameras[k], [0, 0, 0, 1]])
+        return Camera(pose, lens[:2], lens[2:], size, float(self.distortion[k]))
