@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.reduction import WIDTH
 from mi_ring.errors import InputError
 from mi_ring.output.inspection import inspect
 from mi_ring.system import command, files
@@ -39,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command. Returns its exit status: 1 if there is something to mend."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
-    capture = load_capture(config.scene, masks=config.masks)
+    capture = load_capture(config.scene, masks=config.masks, width=WIDTH)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")
     if out.resolve() in {file.resolve() for shot in capture.shots for file in shot.files if file}:

@@ -12,6 +12,7 @@ from typing import Any
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture, require_scene
+from mi_ring.capture.reduction import WIDTH
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, parse_options
 from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
@@ -42,7 +43,7 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
     folder = config.folder
     processes.agreed(lambda: None if processes.rank == 0 else same_variant(config.variant))
     keep_memory()
-    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks))
+    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks, width=WIDTH))
     if capture.shape.ring is not None:
         print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:

@@ -56,6 +56,8 @@ class Rig:
         views = Views.of(capture.shots, lights.positions(), power * lights.rgb())
         self.views = Views(*(torch.from_numpy(array).float() for array in views))
         self.sizes = [shot.size for shot in capture.shots]
+        frames = [shot.frame for shot in capture.shots]
+        self.frames = torch.from_numpy(np.stack(frames)).float()  #: (P, 2, 2) corners of the whole photographs [px]
         self.dark = capture.photographs.dark  #: Have photographs no lights of their own?
         self.fitted = torch.arange(len(capture.shots)) if fitted is None else torch.from_numpy(fitted)
         self.lamps = LightTensors.of(lamp_lights(capture.scene) if lamps else [])  #: that are unknown
@@ -114,7 +116,8 @@ class Rig:
             lights = LightTensors(self.views.places, self.finite, self.views.strengths)
             places = lights.moved(offset, self.distance).places
         lens = now.intrinsics.detach()
-        least, most = distortion_range(lens[:, :2], lens[:, 2:], torch.tensor(self.sizes))
+        low, high = self.frames.unbind(1)
+        least, most = distortion_range(lens[:, :2], lens[:, 2:] - low, high - low)
         distortion = now.distortion.clamp(INSIDE * least, INSIDE * most)  # so that each ray has one pixel
         return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 

@@ -326,4 +326,4 @@ def centred(value: Tensor, rig: Rig) -> Tensor:
 def lens_cameras(found: Found) -> Iterable[list]:
     """Before and after the fit: of each lens the camera of its first photograph."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
-    return ([side.shots[k].camera for k in first] for side in (found.before, found.after))
+    return ([side.shots[k].whole.camera for k in first] for side in (found.before, found.after))

@@ -260,7 +260,9 @@ class Capture:
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
         """The masks with their cameras, small, one for all photographs that share both; at most so many, evenly."""
         return [
-            small_silhouette(Silhouette(self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k]))
+            small_silhouette(Silhouette(
+                self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k],
+                self.shots[k].frame if self.shots[k].window else None))
             for k in self._outlined(most)
         ]
 

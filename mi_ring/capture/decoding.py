@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,14 +15,28 @@ from mi_ring.scene.shot import Encoding, Shot
 Read = TypeVar("Read")
 
 
+class LinearImage(NamedTuple):
+    """A photograph that is decoded already."""
+
+    rgb: np.ndarray  #: (H, W, 3) linear radiance, float16 or float32
+    clipped: np.ndarray  #: (H, W, 3) bool
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of both."""
+        return self.rgb.nbytes + self.clipped.nbytes
+
+
 def decode(
-    image: np.ndarray, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
+    image: np.ndarray | LinearImage, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance (float32) of encoded pixels, and where they are clipped (bool); both of `image`'s shape.
 
     `linear`: are the pixels linear, not sRGB? A pixel is clipped from `saturation` on. `gamma` and `contrast` are those
-    of a `Response`, which is undone.
+    of a `Response`, which is undone. Of a `LinearImage` nothing is to be undone.
     """
+    if isinstance(image, LinearImage):
+        return image.rgb.astype(np.float32), image.clipped
     if image.dtype == np.float32:
         value = image
     else:
@@ -119,8 +133,10 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
     return ((radiance if linear else linear_to_srgb(radiance)) * full + 0.5).astype(pixels.dtype)
 
 
-def is_linear(encoding: Encoding, pixels: np.ndarray) -> bool:
+def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
     """Are encoded pixels linear radiance? If the encoding is `auto`, those of 8 bits are not and all others are."""
+    if isinstance(pixels, LinearImage):
+        return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 

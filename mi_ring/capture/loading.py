@@ -1,5 +1,6 @@
 """Reads scene files, and refuses at once what a fit could not use."""
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from mi_ring.capture.brightness_masks import with_masks_by_brightness
 from mi_ring.capture.capture import Capture, require_variant, views_of
 from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.pixels import Pixels, Reader
+from mi_ring.capture.reduction import reduced
 from mi_ring.errors import InputError, SceneError, require_file
 from mi_ring.images import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
@@ -25,15 +27,20 @@ from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system.progress import progress
 
-MANY = 2**31  #: pixels of all photographs, about a minute of decoding; of more only the headers are read at first
+MANY = 2**28  #: pixels of all photographs that are decoded at first; of more only the headers are read
 
 
-def load_capture(path: str | Path, images: bool = True, masks: str = "given") -> Capture:
+def load_capture(
+    path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True
+) -> Capture:
     """Read a scene file of photographs. Raises InputError, one line, for anything that a fit could not use.
 
     Without `images` only cameras and lights are read: enough to render. `masks`: "given" takes those of the scene;
     "auto" does, too, and if there are none finds them by brightness, where the room was dark; "none" ignores those of
     the scene and finds them by brightness.
+
+    `width`: photographs are made at most so wide [px], and cropped to the object if `crop`, as `reduced` does: enough
+    for a fit. By default they stay as they are.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
@@ -63,14 +70,19 @@ def load_capture(path: str | Path, images: bool = True, masks: str = "given") ->
     pixels = Pixels(partial(read_photograph, shot, path) for shot in shots)
     given = masks_of(shots, "mask", path) if masks != "none" else Pixels([None] * len(shots))
     valid = masks_of(shots, "valid", path)
-    many = sum(width * height for width, height in (shot.size for shot in shots)) > MANY
-    for k, shot in enumerate(progress(shots, "reading", unit="photograph", disable=None)):
-        if many and k:  # decoded later, when they are needed; the first one shows at once what is wrong with all
-            require_headers(shot, path, masks)
-        else:
-            pixels[k], given[k], valid[k]
     capture = replace(capture, images=pixels, masks=given, valid=valid)
-    return with_masks_by_brightness(capture) if masks != "given" and not any(given.given) else capture
+    by_brightness = masks != "given" and not any(given.given)
+    many = sum(math.prod(shot.size) for shot in shots) > MANY
+    if many:  # the first one shows at once what is wrong with all
+        for shot in shots:
+            require_headers(shot, path, masks)
+        read_photograph(shots[0], path), given[0], valid[0]
+    if width and (small := reduced(capture, width, by_brightness, crop)) is not capture:
+        return small
+    if not many:
+        for k in progress(range(len(shots)), "reading", unit="photograph", disable=None):
+            pixels[k], given[k], valid[k]
+    return with_masks_by_brightness(capture) if by_brightness else capture
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.decoding import decode, is_linear, shade
+from mi_ring.capture.decoding import LinearImage, decode, is_linear, shade
 from mi_ring.images import box_filter
 from mi_ring.scene.shot import Shot
 
 #: Pixels of all photographs in an `ObservationCache`. A pixel takes up to 200 bytes: what is kept fragments the memory.
-REMEMBERED_PIXELS = 2**23
+REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
@@ -44,7 +44,7 @@ class Observation(NamedTuple):
 
 
 def observed(
-    shot: Shot, image: np.ndarray, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
+    shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
     """One photograph by its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 #: Bytes of decoded files that one `Pixels` keeps. What does not fit is read again each time.
-KEPT = 2**30
+KEPT = 2**28
 
 Reader = Callable[[], np.ndarray]
 

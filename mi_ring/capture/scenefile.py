@@ -33,7 +33,8 @@ REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """A photograph as XML. Its files are named as the shot has them: make them relative to the scene file before."""
+    """A whole photograph as XML. Its files are named as the shot has them: make them relative to the scene before."""
+    shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
         if file:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.reduction import reduced
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, room_frames, with_lighting
@@ -20,7 +21,7 @@ from mi_ring.system.machine import device
 class Problem:
     """A capture with the lights that a fit assumes, and the settings of the fit."""
 
-    given: Capture  #: the capture as it was handed in
+    given: Capture  #: the capture as it was handed in, with photographs of any size
     capture: Capture  #: lit by `lighting`
     seen: Capture  #: of it the photographs that are fitted
     scene: mi.Scene  #: to render, without an environment that is among the room's harmonics
@@ -36,11 +37,12 @@ class Problem:
     @classmethod
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
         """Raises InputError if no photographs are left to fit, or if the object is black in them."""
+        given, capture = capture, reduced(capture)
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
         as_lit, scene, environment = environment_as_harmonics(with_lighting(capture, lighting))
         seen = as_lit.part(fitted) if len(held_out) else as_lit
-        return cls(capture, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
+        return cls(given, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
                    current(), device())  # fmt: skip
 
     @property

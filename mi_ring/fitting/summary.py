@@ -47,7 +47,7 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
             values[name] = centred(calibration.value(name), rig).double().numpy(force=True)
     photographs: dict[str, dict[str, Any]] = {}
     for k in problem.fitted:
-        before, after = (side.shots[k].camera.project(corners)[0] for side in (capture, refined))
+        before, after = (side.shots[k].whole.camera.project(corners)[0] for side in (capture, refined))
         own: dict[str, Any] = {"moved_px": float(np.linalg.norm(after - before, axis=1).mean())}
         std: dict[str, Any] = {}
         for name, unknown in single.items():

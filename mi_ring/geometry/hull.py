@@ -30,6 +30,7 @@ class Silhouette(NamedTuple):
     camera: Camera
     name: str  #: for messages
     valid: np.ndarray | None = None  #: (H, W) uint8: the mask is unknown where this is 127 or less. None: nowhere
+    frame: np.ndarray | None = None  #: (2, 2) corners of the photograph if the mask is a part [px]; no object beyond
 
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
@@ -44,7 +45,8 @@ def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouet
     """A silhouette reduced to at most this `width` [px]."""
     mask, scale = shrink_mask(silhouette.mask, width)
     valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
-    return silhouette._replace(mask=mask, camera=silhouette.camera.shrunk(scale), valid=valid)
+    frame = None if silhouette.frame is None else silhouette.frame / scale
+    return silhouette._replace(mask=mask, camera=silhouette.camera.shrunk(scale), valid=valid, frame=frame)
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -91,7 +93,7 @@ class Hull:
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
-        for (mask, camera, _, valid), distance in zip(self.silhouettes, self.distances):
+        for (mask, camera, _, valid, frame), distance in zip(self.silhouettes, self.distances):
             matrix, focal, centre = (torch.tensor(a, dtype=torch.float32) for a in camera[:3])
             local = (points - matrix[:3, 3]) @ matrix[:3, :3]
             z, across = local[:, 2], local[:, :2] / local[:, 2:]
@@ -100,12 +102,15 @@ class Hull:
                 across = across * torch.where(visible, factor, torch.nan)
             size = torch.tensor(mask.shape[::-1])
             place = (centre - focal * across) / size  # in [0, 1]
-            seen = (z > 0) & ((place - 0.5).abs() <= 0.5).all(1)
+            low, high = (0, 1) if frame is None else (torch.from_numpy(frame).to(place) / size).unbind()
+            seen = (z > 0) & ((place >= low) & (place <= high)).all(1)
             if valid is not None:
                 row, column = (place * size).nan_to_num(-1).long().flip(1).T
                 row, column = row.clamp(0, mask.shape[0] - 1), column.clamp(0, mask.shape[1] - 1)
                 seen &= torch.from_numpy(valid > 127)[row, column]
-            inside = F.grid_sample(distance[None, None], 2 * place[None, None] - 1, align_corners=False)[0, 0, 0]
+            where, padding = 2 * place[None, None] - 1, "zeros" if frame is None else "border"
+            sampled = F.grid_sample(distance[None, None], where, padding_mode=padding, align_corners=False)
+            inside = sampled[0, 0, 0]
             deep = torch.where(seen, inside * z / focal.mean(), torch.inf)
             for low in lowest:  # insert into the sorted rows; the larger value goes on to the next row
                 deep, low[:] = torch.maximum(low, deep), torch.minimum(low, deep)

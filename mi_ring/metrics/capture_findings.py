@@ -80,7 +80,7 @@ def measure(
         to_camera = shot.camera.position - center
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
         rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(shot.size) // MAX_WIDTH))[:4])
-        image = rgb.max(-1)
+        image, part = rgb.max(-1), shot.window.share if shot.window else 1.0
         inside = mask > 0.5 if masked else image > 0.02 * image.max()
         outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
         level = float(np.quantile(image[inside], 0.9)) if inside.any() else 0.0  # of lit parts, not of shadows
@@ -89,7 +89,7 @@ def measure(
             name=name, distance=float(np.linalg.norm(to_camera) / radius),
             light=float(away / radius) if lit[k] else None,
             angle=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) if lit[k] else None,
-            object=float(inside.mean()) if masked else None,
+            object=float(inside.mean()) * part if masked else None,
             clipped=float(np.any(saturated, -1)[inside].mean()) if inside.any() else 0.0,
             dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
             background=None if around is None else around / max(level, 1e-9),
@@ -151,7 +151,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # masks of bright parts only need not agree
         strays = [row for row in rows if row.agreement is not None and row.agreement < CONFORMS]
-        if not strays and capture.hull and max(shot.size[0] for shot in capture.shots) <= MAX_WIDTH:
+        if not strays and capture.hull and max(shot.whole.size[0] for shot in capture.shots) <= MAX_WIDTH:
             found += filter(None, [half_pixel(capture.hull)])
         for row in strays:
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.reduction import whole_mask
 from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
@@ -181,7 +182,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
             path.parent.mkdir(parents=True, exist_ok=True)
         mask = capture.masks[k]
         assert mask is not None
-        write_image(mask[..., None], path)
+        write_image(whole_mask(mask, capture.shots[k].window)[..., None], path)
         names[k] = relative_to(folder.parent, path)
     return names
 

@@ -26,6 +26,25 @@ class Files(NamedTuple):
 NO_FILES = Files()
 
 
+class Window(NamedTuple):
+    """The part of a photograph that is looked at, and the size to which it is reduced."""
+
+    corner: tuple[int, int]  #: first column and row [px of the photograph]
+    extent: tuple[int, int]  #: width and height [px of the photograph]
+    size: tuple[int, int]  #: width and height after the reduction [px]
+    whole: tuple[int, int]  #: width and height of the photograph [px]
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(2,) pixels of the photograph along a reduced pixel, across and down."""
+        return np.divide(self.extent, self.size)
+
+    @property
+    def share(self) -> float:
+        """Share of the photograph in the window."""
+        return float(np.prod(self.extent) / np.prod(self.whole))
+
+
 @dataclass(frozen=True)
 class Response:
     """How a camera records radiance. By default the file holds the radiance itself.
@@ -59,6 +78,31 @@ class Shot:
     encoding: Encoding = "auto"  #: of the photograph's file
     saturation: float = 1.0  #: encoded value from which a pixel is clipped (1 = full scale)
     calibrated: bool = False  #: are camera and light exact? Then a fit does not refine them by default
+    window: Window | None = None  #: the part of its files that it shows, with the camera of that part; None: all
+
+    def through(self, window: Window) -> "Shot":
+        """The part of the photograph in a window."""
+        camera = self.camera
+        camera = camera._replace(focal=camera.focal / window.scale, size=window.size,
+                                 centre=(camera.centre - window.corner) / window.scale)  # fmt: skip
+        return replace(self, camera=camera, window=window)
+
+    @property
+    def whole(self) -> "Shot":
+        """The whole photograph: the inverse of `through`."""
+        if self.window is None:
+            return self
+        camera, scale = self.camera, self.window.scale
+        camera = camera._replace(focal=camera.focal * scale, size=self.window.whole,
+                                 centre=camera.centre * scale + self.window.corner)  # fmt: skip
+        return replace(self, camera=camera, window=None)
+
+    @property
+    def frame(self) -> np.ndarray:
+        """(2, 2) the whole photograph's first and last corner in the pixels of this part."""
+        if self.window is None:
+            return np.array([(0, 0), self.size])
+        return (np.array([(0, 0), self.window.whole]) - self.window.corner) / self.window.scale
 
     @property
     def size(self) -> tuple[int, int]:

@@ -23,7 +23,8 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 EXR_THREADS = 2  #: with fewer, Mitsuba waits forever when it reads or writes an EXR
 _exr_lock = threading.Lock()  # held by who changes the number of threads for an EXR
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+LARGE_ARRAY = 2**25  #: bytes from which freed arrays go back to the system; the most that mallopt allows
 
 
 def device() -> torch.device:
@@ -90,9 +91,9 @@ def cores() -> int:
     return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
 
 
-def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[Result]:
-    """`map` in threads, one per core; for functions that release Python's global lock."""
-    with ThreadPoolExecutor(cores()) as pool:
+def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
+    """`map` in threads, one per core and at most `most`; for functions that release Python's global lock."""
+    with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
 
 
@@ -208,9 +209,9 @@ def glibc(name: str) -> Callable[..., int]:
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed memory for the rest of the process: new pages from the system are slow."""
+    """Let glibc keep the memory of freed arrays, but of large ones: new pages from the system are slow."""
     mallopt = glibc("mallopt")
-    mallopt(M_MMAP_MAX, 0)
+    mallopt(M_MMAP_THRESHOLD, LARGE_ARRAY)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
