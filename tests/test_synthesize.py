@@ -410,12 +410,12 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--second", "principled roughness=low"], "^--second: .*: roughness is a string, must be a number or a colour"),
     (["--material", "roughplastic alpha=true"], "^--material: .*: alpha is a boolean, must be a number$"),
     (["--material", "diffuse reflectance=-1,2,3"], r"^--material: diffuse reflectance=-1,2,3: Invalid RGB"),
-    (["--exposure", "2", "--clipped", "0.1"], "^--clipped: is what the exposure is chosen by"),
+    (["--exposure", "2", "--clipped", "0.1"], "^--clipped: determines the exposure"),
     (["--material", "diffuse 0.5"], "found '0.5'; each parameter must be NAME=VALUE"),
     (["--material", "principled base_color=vertex_color"], "the mesh's file has no colours"),
     (["--material", "none.xml"], "none.xml: --material: no such file"),
     (["--material", "none.npz:gold"], "none.npz: --material: no such file"),
-    (["--material", "bitmap"], "--material: bitmap: has parts that are no numbers and colours; give a file .xml"),
+    (["--material", "bitmap"], "--material: bitmap: needs nested parts, which only an .xml can give; give a file .xml"),
     (["--second", "perspective"], "--second: perspective: is no BSDF"),
     (["--second", "diffuse", "--pattern", "dots"], "dots: --pattern: no such file; give stripes, checks or"),
     (["--environment", "none.exr"], "none.exr: --environment: no such file"),
@@ -424,7 +424,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--pairs", "--room", "0.1", "--wrong-room"], "--pairs: need a room"),
     (["--lamps", "2"], "--lamps: is 2, which is for --light lamp"),
     (["--light", "lamp", "--lamps", "9"], "--lamps: is 9, must be 1 to 8"),
-    (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable, beside which"),
+    (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable; an --environment"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

@@ -1,4 +1,4 @@
-"""The table of all formats, by their names in `mi_ring.convert`."""
+"""All formats, by their names in `mi_ring.convert`, and the detection of a folder's format."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,12 +26,12 @@ FORMATS = {
 
 
 def detect(folder: Path) -> Source | None:
-    """The importer of the cameras in a folder of photographs, or else in the folder above it; None without cameras.
+    """The importer of the cameras in a folder of photographs, otherwise in its parent folder; None without cameras.
 
-    The first match counts: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's XML,
-    RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, then cameras.sfm, sfm.json,
-    sfm_data.json and other `*.sfm` with poses. Files of one kind are tried by name. The photographs are those in
-    `folder` if there are any; transforms.json names its own. The importer's `scene` does not exist yet.
+    The first match is taken, in this order: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's
+    XML, RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, cameras.sfm, sfm.json,
+    sfm_data.json, other `*.sfm` with poses. Files of one kind are sorted by name. The photographs are those in `folder`
+    if there are any, except that transforms.json names its own.
     """
     images = folder if list_images(folder) else None
     places = (folder, folder.absolute().parent)
@@ -39,7 +39,7 @@ def detect(folder: Path) -> Source | None:
 
 
 def detect_in(place: Path, images: Path | None) -> Source | None:
-    """As `detect`, for the cameras in one folder `place` and photographs in the folder `images`."""
+    """As `detect`, with the cameras in the folder `place` and the photographs in the folder `images`."""
     scenes = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
 
     def has_pose(path: Path) -> bool:
@@ -67,7 +67,7 @@ def detect_in(place: Path, images: Path | None) -> Source | None:
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Does a file pass a check? Not if reading it raises InputError."""
+    """Does a file pass a check? It does not if reading it raises InputError."""
     try:
         return bool(check(path))
     except InputError:

@@ -22,7 +22,7 @@ class Iron(Source):
         cameras = load_json(path)
         if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
             raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
-        for key in sorted(cameras):  # the keys end in .png, the files perhaps not
+        for key in sorted(cameras):  # the keys end in .png, but the files may have another suffix
             image = with_suffix(path.parent / "image" / splitext(key)[0], f"{path}: {key}")
             K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
             to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)

@@ -61,7 +61,7 @@ class Transforms(Source):
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """The lens of one frame of transforms.json. `given`: the fields of the frame, completed by those of the file."""
+    """The lens of a frame of transforms.json. `given`: the fields of the file, replaced by those of the frame."""
 
     def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)

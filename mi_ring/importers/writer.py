@@ -22,7 +22,7 @@ from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
-    """Collects the files of a scene in a temporary folder; `finish` moves them to their places."""
+    """Collects the files of a scene in a temporary folder. `finish` moves them to their places."""
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
@@ -48,26 +48,26 @@ class Writer:
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """The path as the scene file names it."""
+        """The path relative to the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
         """Move all files to their places, then write the scene file.
 
-        Raises InputError if a place holds a different file, which may be a source. Equal files are fine: a run that was
-        interrupted here has left them.
+        Raises InputError if another file is in such a place, because it may be a source. An equal file is from an
+        interrupted run.
         """
         for file in self.files:
             place = self.folder / file
             if place.exists() and not filecmp.cmp(self.staging / file, place, shallow=False):
-                raise InputError(f"{place}: exists already and is another; remove it, or write elsewhere")
+                raise InputError(f"{place}: exists already, with other content; remove it, or write elsewhere")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove the temporary folder, and new folders that stayed empty."""
+        """Remove the temporary folder, and new folders that are empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
         for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
@@ -75,7 +75,7 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write the files of a frame that change, or all of them to `copy`. Other files stay where they are."""
+    """Write the changed files of a frame, or with `copy` all of its files. Returns the files for the scene file."""
     straight = frame.lens.is_pinhole
 
     def place(folder: str, path: Path, pixels: np.ndarray | None) -> Path:

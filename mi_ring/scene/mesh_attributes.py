@@ -10,10 +10,10 @@ from mi_ring.errors import SceneError
 
 
 class Members(mi.TraversalCallback):
-    """Keeps the named members of an object that it traverses; `mi.traverse` itself only keeps numbers.
+    """The named members of an object. `mi.traverse` keeps only numbers.
 
-    Not a local class: Python frees those late, together with the objects that they have seen. As long as a BSDF lives,
-    Dr.Jit compiles it into the kernels of all scenes.
+    This is no local class: Python frees those late, with the objects that they have seen, and Dr.Jit compiles every
+    BSDF in memory into the kernels of all scenes.
     """
 
     def __init__(self, parent):
