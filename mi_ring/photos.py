@@ -18,29 +18,13 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
+from mi_ring.photogrammetry import folder, workflow
 from mi_ring.photogrammetry.capture_files import crop_windows, write_posed_picture, write_table
 from mi_ring.photogrammetry.flash_light import FlashCalibration
-from mi_ring.photogrammetry.folder import (
-    TRANSPARENT,
-    camera_names,
-    find_pictures,
-    up_directions,
-    without_exposure,
-    without_flash,
-)
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
 from mi_ring.photogrammetry.object_masks import SegmentationInput, SegmentedObject, find_object, require_half
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
-from mi_ring.photogrammetry.workflow import (
-    find_cameras,
-    find_sheet,
-    flash_from_sheet,
-    make_upright,
-    posed_pictures,
-    require_parallax,
-    require_same_photographs,
-)
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
 from mi_ring.system.files import locked, read_json, write_file
@@ -158,36 +142,36 @@ def require_apart(config: PhotosConfig) -> None:
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
     written = [out / name for name in ("images", "masks", "valid", "work")]
-    for field, folder in given.items():
-        place = folder.resolve()
+    for field, path in given.items():
+        place = path.resolve()
         if place == out or any(place.is_relative_to(taken) for taken in written):
-            raise InputError(f"{folder}: {field}: is where the capture is written; give another DIR than {config.out}")
+            raise InputError(f"{path}: {field}: is where the capture is written; give another DIR than {config.out}")
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
     """Make the capture. Stages with results in work/ are not repeated."""
-    pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
-    if dark := without_flash(pictures):
+    pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
+    if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
         pictures = [picture for picture in pictures if picture.path.name not in dark]
-    if len(cameras := camera_names(pictures)) > 1:
+    if len(cameras := folder.camera_names(pictures)) > 1:
         kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
         print(f"Cameras: several models, by EXIF data ({kinds}); photographs of one size are assumed to share a lens, "
               "and all to have the flash in one place beside it; better give photographs of one camera")  # fmt: skip
     if isinstance(config.masks, Path):  # check it before the long work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
-    elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
+    elif config.masks == "alpha" and not any(p.path.suffix.lower() in folder.TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
     for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
-    require_same_photographs(pictures, work)
-    sheet = find_sheet(pictures, config.square_mm, work, progress)
+    workflow.require_same_photographs(pictures, work)
+    sheet = workflow.find_sheet(pictures, config.square_mm, work, progress)
     if config.box and not sheet:
         raise InputError(f"--box: is in the frame of the sheet of `mi-ring board`, which {config.folder} does not show")
-    sparse, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
+    sparse, plane = workflow.find_cameras(pictures, sheet, config.turntable, work, progress), None
     print(cameras_report(sparse))
-    require_parallax(sparse, config.folder)
+    workflow.require_parallax(sparse, config.folder)
     if sheet:
         moved = align(sheet.detections, sparse.cameras)
         sparse = sparse.moved(moved.scale, moved.rotation, moved.shift)
@@ -205,17 +189,17 @@ def make(config: PhotosConfig, scene: Path) -> None:
         sparse = replace(sparse, cameras={n: camera for n, camera in sparse.cameras.items() if n in found.masks})
     has_up = True
     if not sheet:
-        sparse, plane, has_up = make_upright(sparse, found.center, plane, up_directions(pictures))
+        sparse, plane, has_up = workflow.make_upright(sparse, found.center, plane, folder.up_directions(pictures))
         found = found._replace(center=np.zeros(3))
     offset = np.array(config.flash_offset)
-    flash = flash_from_sheet(pictures, sparse, found, offset, sheet) if sheet else None
+    flash = workflow.flash_from_sheet(pictures, sparse, found, offset, sheet) if sheet else None
     if flash:
         print(flash_report(flash, sparse, found))
     if not flash and not offset.any() and len({picture.camera_orientation for picture in pictures}) > 1:
         print("Flash: assumed at the lens, but the camera was held upright and sideways; if the flash is elsewhere, "
               "give its position by --flash-offset")  # fmt: skip
-    taken = posed_pictures(pictures, sparse, found, offset, flash)
-    if silent := without_exposure([posed.picture for posed in taken if not posed.measured]):
+    taken = workflow.posed_pictures(pictures, sparse, found, offset, flash)
+    if silent := folder.without_exposure([posed.picture for posed in taken if not posed.measured]):
         print(f"Exposure: assumed to be the median one where EXIF data have none: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     # The Fresnel term depends on the reflectance, which is known only if the flash's power is.

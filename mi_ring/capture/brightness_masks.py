@@ -53,7 +53,7 @@ def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Connected components of a mask (H, W) bool: labels (H, W), 0 outside, and the number of pixels per label."""
+    """Connected components of a mask (...) bool: labels (...), 0 outside, and the size of each; 0 for label 0."""
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0

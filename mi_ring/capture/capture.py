@@ -299,7 +299,11 @@ class Capture:
         """Centre (3,) and radius of the normalising sphere [scene units], from the XML, the masks or the cameras."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
-            middle, ball = sphere_of_masks(self.hull) if self.hull else sphere_of_cameras(self)
+            if self.hull:
+                middle, ball = self.hull.ball()
+                ball *= 1.3  # a fit starts from this sphere, and shrinking is faster than growing limbs
+            else:
+                middle, ball = sphere_of_cameras(self)
             center, radius = middle if center is None else center, ball if radius is None else radius
         return center, radius
 
@@ -312,15 +316,6 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
             small[reader] = shrink_mask(valid[k], MAX_WIDTH)
     found = [small[reader] for reader in valid.readers]
     return [MaskedCamera(shot.camera.shrunk(scale), mask) for shot, (mask, scale) in zip(shots, found, strict=True)]
-
-
-def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:
-    """Centre of a visual hull, and 1.3 times the radius of the ball with its volume [scene units].
-
-    A fit starts from this sphere. It is a little too large, because shrinking is faster than growing limbs.
-    """
-    center, radius = hull.ball()
-    return center, 1.3 * radius
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:

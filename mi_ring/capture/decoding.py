@@ -1,8 +1,6 @@
 """Reads the image files of a capture, and decodes their pixels to linear radiance."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -11,8 +9,6 @@ from mi_ring.foreign import reading
 from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
 from mi_ring.scene.shot import Encoding, Shot
-
-Read = TypeVar("Read")
 
 
 def decode(
@@ -53,36 +49,27 @@ def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
     """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    Raises InputError if the file is missing, no image, or not as large as the film of the photograph.
+    Raises InputError as `require_header` does, and if the pixels are damaged, infinite, NaN or too large.
     """
-    pixels = read_by(read_image, path, field, shot, scene)
-    require_size(pixels.shape[1::-1], path, field, shot)
+    require_header(path, field, shot, scene)
+    what = f'photograph "{shot.name}", {field}'
+    with reading(f"{path}: {what}", "an image"):
+        pixels = read_image(path)
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
-        what = f'photograph "{shot.name}", {field}'
         raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
-    """Raise InputError as `read_pixels` does, but only read the file's header."""
-    require_size(read_by(image_size, path, field, shot, scene), path, field, shot)
-
-
-def read_by(read: Callable[[Path], Read], path: Path, field: str, shot: Shot, scene: Path) -> Read:
-    """The result of `read(path)`. Raises InputError if the file is missing or no image."""
+    """Raise InputError if a file is missing, no image, or not as large as the film of its photograph."""
     what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
         raise InputError(f"{scene}: {what}: no such file: {path}")
     with reading(f"{path}: {what}", "an image"):
-        return read(path)
-
-
-def require_size(size: tuple[int, ...], path: Path, field: str, shot: Shot) -> None:
-    """Raise InputError unless the size (width, height) is that of the photograph's film."""
+        size = image_size(path)
     if size != shot.size:
-        found, expected = ("{} x {}".format(*size) for size in (size, shot.size))
-        what = f'photograph "{shot.name}", {field}'
-        raise InputError(f"{path}: {what}: is {found} pixels, the film says {expected}")
+        found, expected = ("{} x {}".format(*pixels) for pixels in (size, shot.size))
+        raise InputError(f"{path}: {what}: is {found} pixels, but the film says {expected}")
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:

@@ -36,11 +36,12 @@ class Observation(NamedTuple):
     @classmethod
     def joined(cls, several: Sequence["Observation"]) -> "Observation":
         """Several observations of one size as one."""
-        rgb, clipped, mask, masked, valid = zip(*several)
+        *parts, valid = zip(*several)
+        rgb, clipped, mask, masked = map(torch.cat, parts)
         if all(v is None for v in valid):
-            return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), None)
-        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
-        return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), torch.cat(shown))
+            return cls(rgb, clipped, mask, masked, None)
+        shown = [torch.ones_like(o.mask, dtype=torch.bool) if o.valid is None else o.valid for o in several]
+        return cls(rgb, clipped, mask, masked, torch.cat(shown))
 
 
 def observed(
@@ -73,19 +74,15 @@ class ObservationCache:
     """Keeps observations of single photographs at their last scale, up to `REMEMBERED_PIXELS`; none at scale 1."""
 
     def __init__(self) -> None:
-        self.kept: dict[int, tuple[int, Observation]] = {}  # (scale, photograph) by index
-        self.pixels = 0  # of all that are kept
+        self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
         """The observation of photograph `k` at a scale; `observe` makes it if it is not kept."""
-        if k in self.kept:
-            before, result = self.kept[k]
-            if before == scale:
-                return result
-            self.pixels -= self.kept.pop(k)[1].mask.numel()
+        if k in self.kept and self.kept[k][0] == scale:
+            return self.kept[k][1]
+        self.kept.pop(k, None)
         result = observe()
-        pixels = result.mask.numel()
-        if scale > 1 and self.pixels + pixels <= REMEMBERED_PIXELS:
+        pixels = sum(other.mask.numel() for _, other in self.kept.values())
+        if scale > 1 and pixels + result.mask.numel() <= REMEMBERED_PIXELS:
             self.kept[k] = scale, result
-            self.pixels += pixels
         return result

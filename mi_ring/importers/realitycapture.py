@@ -51,8 +51,7 @@ class RealityCapture(Photogrammetry):
     def from_csv(self) -> Iterator[tuple[str, Frame]]:
         """The photographs in the rows of a CSV file."""
         columns, rows = read_csv(self.src)
-        missing = [name for name in ("name", *POSE, "f") if name not in columns]
-        if missing:
+        if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
                              "camera parameters")  # fmt: skip
         seen = set()

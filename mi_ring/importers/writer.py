@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Hashable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ class Writer:
         scene.parent.mkdir(parents=True, exist_ok=True)
         self.staging = Path(tempfile.mkdtemp(prefix=f".{scene.stem}.", dir=scene.parent))
         self.files: list[Path] = []
-        self.shared: dict = {}  #: files that several photographs share, by folder and key
+        self.shared: dict = {}  #: relative paths of files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
         """Write a file by `write(path)`. Returns its final path."""
@@ -76,21 +77,17 @@ class Writer:
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
     """Write the changed files of a frame, or with `copy` all of its files. Returns the files for the scene file."""
-    straight = frame.lens.is_pinhole
+    straight, pixels = frame.lens.is_pinhole, frame.pixels
 
-    def place(folder: str, path: Path, pixels: np.ndarray | None) -> Path:
-        if pixels is not None:
-            return writer.image(f"{folder}/{name}", pixels)
-        if copy:
-            return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
-        return path
-
-    def place_once(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
+    def place(folder: str, key: Hashable, path: Path, changed: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
-            writer.shared[folder, key] = place(folder, path, pixels())
-        return writer.relative(writer.shared[folder, key])
+            if (pixels := changed()) is not None:
+                path = writer.image(f"{folder}/{name}", pixels)
+            elif copy:
+                path = writer.write(f"{folder}/{name}{path.suffix}", partial(shutil.copyfile, path))
+            writer.shared[folder, key] = writer.relative(path)
+        return writer.shared[folder, key]
 
-    pixels = frame.pixels
     if pixels is None and (not straight or encoding == "linear"):
         pixels = pixels_of(frame.image)
         if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
@@ -103,8 +100,8 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         srgb = not is_linear(encoding, pixels)
         pixels, shown = undistort(pixels, frame.lens, srgb, frame.saturation)
         if not shown.all():
-            valid = place_once("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
-    image = writer.relative(place("images", frame.image, pixels))
+            valid = place("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
+    image = place("images", name, frame.image, lambda: pixels)
     file = frame.mask
     if file is None or file == frame.image:
         return Files(image, image if file else None, valid)
@@ -117,4 +114,4 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]
 
-    return Files(image, place_once("masks", (file, frame.lens), file, mask), valid)
+    return Files(image, place("masks", (file, frame.lens), file, mask), valid)

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from mi_ring.capture.brightness_masks import pieces
 from mi_ring.capture.grabcut import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
 from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
@@ -117,12 +117,10 @@ class VoxelGrid:
             shown += inside
             yes += within
         chosen = (yes >= agreement * shown) & (shown >= MIN_VISIBLE * len(self.views)) & self.allowed
-        pieces, _ = ndimage.label(chosen.reshape([RESOLUTION] * 3))
-        sizes = np.bincount(pieces.ravel())
-        sizes[0] = 0
+        labels, sizes = pieces(chosen.reshape([RESOLUTION] * 3))
         if sizes.max() < MIN_VOXELS:
             return None
-        return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
+        return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), labels == sizes.argmax())
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
@@ -190,6 +188,6 @@ def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """(H, W) uint8: 1 on pieces of the guess beside the mask that touch it, such as a rod that holds the object."""
-    pieces, _ = ndimage.label((guess > 0) & (mask == 0))
-    touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
-    return np.isin(pieces, touching[touching > 0]).astype(np.uint8)
+    labels, _ = pieces((guess > 0) & (mask == 0))
+    touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])
+    return np.isin(labels, touching[touching > 0]).astype(np.uint8)

@@ -227,11 +227,11 @@ def posed_pictures(
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
     assumed = np.full(3, np.pi * found.radiance / ASSUMED_ALBEDO * sparse.distance(found.center) ** 2)
+    falloff, gamma = (flash.falloff, flash.gamma) if flash else (0.0, 1.0)
     result, placed = [], [picture for picture in pictures if picture.name in sparse.cameras]
     for picture, exposure in zip(placed, relative_exposures(placed)):
         name, (lens, pose) = picture.name, sparse.cameras[picture.name]
         intensity = known.get(name, exposure * (flash.power if flash else assumed))
         light = Light("point", pose[:3, :3] @ offsets[name] + pose[:3, 3], intensity)
-        posed = PosedPicture(picture, lens, pose, found.masks.get(name), light, measured=name in known)
-        result.append(replace(posed, falloff=flash.falloff, gamma=flash.gamma) if flash else posed)
+        result.append(PosedPicture(picture, lens, pose, found.masks.get(name), light, name in known, falloff, gamma))
     return result

@@ -265,7 +265,7 @@ def digest(file: Path) -> str:
 
 def settings_of(config: SynthesizeConfig) -> dict:
     """The options that affect a capture, and hashes of their files, as JSON values."""
-    values = asdict(replace(config, out=Path())) | {"digests": {}}
+    values = asdict(config) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
         text = str(getattr(config, name)).partition(".npz:")[0]
