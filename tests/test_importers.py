@@ -394,9 +394,9 @@ def test_there_is_no_table_and_there_are_no_sidecars(tmp_path):
     (lambda a: a[:2], "has 3 photographs, poses_bounds.npy 2 poses"),
     (lambda a: a * np.nan, "NaN"),
     (lambda a: np.array(["a"] * 17)[None], "poses_bounds.npy: "),
-    (lambda a: np.where(a == 70, 0, a), "no scale"),
+    (lambda a: np.where(a == 70, 0, a), "not proportional"),
     (lambda a: np.where(a == H, 40, a), "is 62 x 52 pixels, not proportional to the 62 x 40 of pose 0"),
-    (lambda a: np.vstack([a[:1] * 0, a[1:]]), "no scale"),
+    (lambda a: np.vstack([a[:1] * 0, a[1:]]), "not proportional"),
 ])  # fmt: skip
 def test_mistakes_in_poses_bounds(tmp_path, edit, pattern):
     refused(["llff", llff(tmp_path, edit)], pattern, tmp_path)

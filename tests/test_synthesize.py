@@ -27,7 +27,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of, scene_of
 from mi_ring.scene.shot import Shot
 from mi_ring.synthesis import light_sources
-from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
+from mi_ring.synthesis.degradation import encode, exposures, miscalibrated, with_noise
 from mi_ring.synthesis.materials import COLOURS, load_material, parse_plugin
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object
 from mi_ring.synthesis.options import SynthesizeConfig
@@ -304,16 +304,16 @@ def test_the_sheet_is_printed_true_to_scale(lump, tmp_path):
 
 def test_noise_is_that_of_counted_electrons():
     random = np.random.default_rng(1)
-    found = noisy(np.full((200, 300, 3), 0.25), 2000, 12, random)
+    found = with_noise(np.full((200, 300, 3), 0.25), 2000, 12, random)
     np.testing.assert_allclose(found.mean(), 0.25, rtol=1e-3)
     np.testing.assert_allclose(found.std(), np.sqrt(0.25 * 2000 + 12**2) / 2000, rtol=0.02)
-    np.testing.assert_allclose(noisy(np.zeros((200, 300, 3)), 0, 30, random).std(), 0.003, rtol=0.02)
+    np.testing.assert_allclose(with_noise(np.zeros((200, 300, 3)), 0, 30, random).std(), 0.003, rtol=0.02)
 
 
 @pytest.mark.parametrize("kind, linear, step", [("exr", True, 5e-4), ("png16", True, 8e-6), ("png8", False, 5e-3)])
 def test_files_hold_what_was_seen(kind, linear, step):
     seen = np.random.default_rng(2).uniform(0, 1, (5, 7, 3))
-    pixels = encoded(seen, kind)
+    pixels = encode(seen, kind)
     found, _ = decode(pixels.astype(np.float32) if kind == "exr" else pixels, linear, 1.0)
     np.testing.assert_allclose(found, seen, atol=step)
 

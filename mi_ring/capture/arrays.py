@@ -47,7 +47,7 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """The shots by the arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
+    """The `Shot` of each image, by the arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
     count = len(images)
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:

@@ -261,7 +261,7 @@ class Capture:
         ]
 
     def _outlined(self, most: int | None) -> list[int]:
-        """Indices of the photographs of `silhouettes`."""
+        """Indices of the photographs that `silhouettes` uses."""
         once: dict[tuple, int] = {}
         for k, (mask, shot) in enumerate(zip(self.masks.readers, self.shots)):
             if mask is not None:

@@ -10,7 +10,7 @@ def disk(radius: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
-def grown(coverage: np.ndarray, share: float) -> np.ndarray:
+def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
     """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of its area; a negative share erodes it."""
     radius = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
     return cv2.dilate(coverage, radius) if share > 0 else cv2.erode(coverage, radius)
@@ -23,9 +23,9 @@ def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band:
     decides in a band: `band` inside the outline, and 1.5 times as far outside [square root of the mask's area].
     """
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[grown(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
+    seed[dilate_by_share(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
     seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[grown(coverage, -band) > 0] = cv2.GC_FGD
+    seed[dilate_by_share(coverage, -band) > 0] = cv2.GC_FGD
     seed[background] = cv2.GC_BGD
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
         return coverage & ~background

@@ -66,7 +66,7 @@ class Lens:
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
-def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
+def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
     """The lens of a calibration matrix (3, 3).
 
     `shift` [px] is added to the principal point: 0.5 if the tool puts the first pixel's centre at 0. Raises InputError,
@@ -81,7 +81,7 @@ def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what:
     return Lens("PINHOLE", (size[0], size[1]), (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
 
 
-def brown(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
+def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
     """A lens with OpenCV's distortion: radial k1, k2, k3 and tangential p1, p2; `intrinsics`: fx, fy, cx, cy [px]."""
     if not any((*k, *p)):
         return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))

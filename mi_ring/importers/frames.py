@@ -56,7 +56,7 @@ def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
 
 @dataclass(frozen=True)
 class Source:
-    """What all formats have in common."""
+    """Base of all importers: the options of all formats."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
     """Data of the other tool: a file or a folder."""

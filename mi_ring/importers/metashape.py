@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import moved_pose
-from mi_ring.importers.camera_models import Lens, brown
+from mi_ring.importers.camera_models import Lens, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_xml, matrix
@@ -111,4 +111,4 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
         raise InputError(f"{what}: type: is {kind!r}; must be frame or fisheye")
     if k4:
         raise InputError(f"{what}: k4: is {k4}; only a fisheye may have one; optimize the cameras without k4")
-    return brown((width, height), intrinsics, (k1, k2, k3), (p2, p1))  # OpenCV's p1 and p2 are swapped
+    return opencv_lens((width, height), intrinsics, (k1, k2, k3), (p2, p1))  # OpenCV's p1 and p2 are swapped

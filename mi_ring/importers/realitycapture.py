@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import Lens, brown, camera_to_world
+from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, list_images, load_lines, load_xml, matrix
@@ -131,4 +131,4 @@ def film_lens(image: Path, focal: float, centre: list[float], terms: list[float]
         raise InputError(f"{what}: k4: is {k4}; must be 0; align with the distortion model Brown3 or Brown3 with "
                          "tangential2")  # fmt: skip
     intrinsics = (*[focal * longer / 36] * 2, *(side / 2 + longer * u for side, u in zip(size, centre)))
-    return brown(size, intrinsics, (k1, k2, k3), (t2, t1))  # OpenCV's p1 and p2 are swapped
+    return opencv_lens(size, intrinsics, (k1, k2, k3), (t2, t1))  # OpenCV's p1 and p2 are swapped

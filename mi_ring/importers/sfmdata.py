@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError, is_file
-from mi_ring.importers.camera_models import Lens, brown, camera_to_world
+from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_json, matrix
@@ -88,7 +88,7 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """The list `name` in the file as a dictionary by each entry's `key`; empty if there is no such list."""
+        """The entries of the list `name` in the file, by their field `key`; empty if there is no such list."""
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
@@ -176,4 +176,4 @@ def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: st
     if kind.startswith("fisheye"):
         return Lens("OPENCV_FISHEYE", (size[0], size[1]), (*intrinsics, *terms))
     terms += [0.0] * (5 - count)
-    return brown(size, intrinsics, terms[:3], terms[3:])
+    return opencv_lens(size, intrinsics, terms[:3], terms[3:])

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mi_ring.capture.grabcut import grown
+from mi_ring.capture.grabcut import dilate_by_share
 from mi_ring.capture.scenefile import Element, photograph_element, table_element
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.camera_models import Lens
@@ -102,7 +102,7 @@ def write_table(
         if posed.mask is None:  # the object may be anywhere
             return view, np.ones(view.valid.shape, np.uint8), light
         mask = cv2.resize((posed.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
-        return view, grown(mask, MARGIN), light
+        return view, dilate_by_share(mask, MARGIN), light
 
     views, hidden, lights = zip(*in_threads(observe, pictures))
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))

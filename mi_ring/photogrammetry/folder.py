@@ -103,7 +103,7 @@ class Picture:
             return Image.Exif()
 
     def exif_field(self, tag: int) -> Any:
-        """A field of the Exif part of the data; None if there is none."""
+        """The value of a tag in the Exif part of EXIF data; None if it is missing."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @cached_property

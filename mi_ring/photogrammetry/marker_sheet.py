@@ -229,18 +229,18 @@ def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
         plane = cv2.getPerspectiveTransform(unit, four)
         if (row + column) % 2:
             # In oblique views two opposite rims are so narrow that they mix with black: take the brighter pair.
-            rims = np.median(sampled(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
+            rims = np.median(sample_colours(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
             samples.append((first + [0.5, 0.5] @ sides, rims[rims.sum(1).argmax()], False))
         for place, outermost in zip(MARGINS, (column == 0, column == COLUMNS - 3, row == 0)):
             if outermost:
-                colour = np.median(sampled(linear, place + PATCH, plane), 0)  # NaN if a part is outside the picture
+                colour = np.median(sample_colours(linear, place + PATCH, plane), 0)  # NaN if partly outside
                 samples.append((first + place @ sides, colour, True))
     samples = [sample for sample in samples if sample[1].max() < CLIPPED]
     where, colours, in_margin = zip(*samples) if samples else ((), (), ())
     return PaperSamples(np.reshape(where, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(in_margin, bool))
 
 
-def sampled(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+def sample_colours(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Colours (n, 3) of a photograph (H, W, 3) at points (n, 2), mapped to pixels by the homography `plane` (3, 3).
 
     NaN outside the photograph.

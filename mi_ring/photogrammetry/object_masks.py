@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mi_ring.capture.grabcut import grown
+from mi_ring.capture.grabcut import dilate_by_share
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, write_image
@@ -53,7 +53,7 @@ class SegmentationInput(NamedTuple):
     sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """A text that changes with the source of the masks and with the files in a folder of masks."""
+        """The source of the masks; for a folder of masks a hash of its files' names, sizes and times."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
@@ -216,7 +216,7 @@ def refine_object(
         near = TexelGrid(known.plane, grid.center, grid.half_size, TEXELS)
         far = TexelGrid(known.plane, grid.center, WIDE * whole.half_size, TEXELS)
         parts = (views, near, silhouettes), (whole.views, far, [found.silhouette(view) for view in whole.views])
-        tables = [TableAppearance(own, texels, progress, [grown(s, settings.band) for s in hidden])
+        tables = [TableAppearance(own, texels, progress, [dilate_by_share(s, settings.band) for s in hidden])
                   for own, texels, hidden in parts]  # fmt: skip
         backgrounds = bare_table(views, silhouettes, tables, progress) or tables[0].pattern_masks()
     else:  # parts under grazing light are as dark as the room: do not let a few masks remove them

@@ -45,7 +45,7 @@ Views = Sequence[ReducedView]
 Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 inside
 
 
-def straighten(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
     """Reduce an image (H, W, …) uint8 by area means and undistort it: the pixels (h, w, …) of a window."""
     height, width = (side // window.scale for side in image.shape[:2])
     whole = image[: height * window.scale, : width * window.scale]
@@ -59,8 +59,8 @@ def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Wi
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
-    valid = straighten(np.ones(rgb.shape[:2], np.uint8), lens, window, cv2.INTER_NEAREST)
-    return ReducedView(picture.name, straighten(rgb, lens, window), valid > 0, camera)
+    valid = undistort_view(np.ones(rgb.shape[:2], np.uint8), lens, window, cv2.INTER_NEAREST)
+    return ReducedView(picture.name, undistort_view(rgb, lens, window), valid > 0, camera)
 
 
 def read_windows(
@@ -79,7 +79,7 @@ def read_windows(
 
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
     """Undistort a photograph's mask (H, W) uint8 and reduce its longer side to at most `longest` px: (h, w), 0 or 1."""
-    return (straighten(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
+    return (undistort_view(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:

@@ -45,7 +45,7 @@ class SparseModel:
     source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """A text that changes with the cameras."""
+        """A hash of the cameras."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
@@ -199,7 +199,7 @@ def model_points(model: Any) -> np.ndarray:
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
     """The reasons why photographs that are not `placed` have no camera, by name."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
-    detail = {p.name: detail_of(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
+    detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
         with pycolmap.Database.open(folder / "database.db") as opened:
             features = opened.num_keypoints_for_image(opened.read_image_with_name(file).image_id)
@@ -212,8 +212,8 @@ def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: 
     return reasons
 
 
-def detail_of(file: Path) -> float:
-    """Variance of a picture's Laplacian, after a blur that removes most noise."""
+def sharpness(file: Path) -> float:
+    """Sharpness of an image: the variance of its Laplacian, after a blur against noise."""
     grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 from trimesh.geometry import align_vectors
 from trimesh.points import plane_fit
 
-from mi_ring.capture.grabcut import disk, grown
+from mi_ring.capture.grabcut import dilate_by_share, disk
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.flash_light import FlashCalibration, irradiance
 from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
@@ -223,14 +223,14 @@ def bare_table(
         result, wrong, inside = [], 0, 0
         for view, silhouette, difference in zip(views, silhouettes, differences):
             size, known = np.sqrt(max(1, int(silhouette.sum()))), view.valid & np.isfinite(difference).all(-1)
-            around = known & (grown(silhouette, NEAR) == 0)
+            around = known & (dilate_by_share(silhouette, NEAR) == 0)
             usual = np.quantile(np.abs(difference[around]), QUANTILE, 0) if around.any() else 0
             limits = np.clip(usual, LOWEST, HIGHEST)
             darker = difference[..., 0] if shadows else np.abs(difference[..., 0])
             same = known & (darker < limits[0]) & (np.abs(difference[..., 1:]) < limits[1:]).all(-1)
             smooth = cv2.medianBlur(same.astype(np.uint8), 5)
             result.append(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, disk(SPECK * size)))
-            core = known & (grown(silhouette, -INSIDE) > 0)
+            core = known & (dilate_by_share(silhouette, -INSIDE) > 0)
             wrong, inside = wrong + (result[-1][core] > 0).sum(), inside + core.sum()
         if wrong <= CONFUSED * inside:
             return result
@@ -260,7 +260,7 @@ def nan_median(stack: np.ndarray) -> np.ndarray:
 
 
 def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Robustly fit a basis (N, 6) to the channels' mean of a difference (N, 3) of log radiance: coefficients (6,)."""
+    """Robust least-squares coefficients (6,) of a `basis` (N, 6) for the mean channel of a `difference` (N, 3)."""
     mean = difference.mean(1)
     known = np.isfinite(mean)
     if not known.any():

@@ -43,21 +43,21 @@ def lamps_of(scene) -> list:
 
 
 def lamp_lights(scene) -> list[Light]:
-    """The `lamps_of` a scene as `Light`."""
+    """The lamps of a scene as numbers."""
     return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """A scene with these lamps instead of its `lamps_of`."""
+    """A scene with these lamps instead of its own."""
     before = lamps_of(scene)
     others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
     return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
 
 
 def move_lamps(scene, places, strengths) -> None:
-    """Set positions or directions and strengths of the `lamps_of` a scene: Floats with 3 numbers per lamp.
+    """Set the positions or directions, and the strengths, of a scene's lamps: attached Floats with 3 numbers per lamp.
 
-    The lamps must be made by `with_lamps`. The Floats may be attached.
+    The lamps must be made by `with_lamps`.
     """
     for k, lamp in enumerate(lamps_of(scene)):
         move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))

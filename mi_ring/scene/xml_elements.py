@@ -17,7 +17,7 @@ def require_parts(root: ElementTree.Element) -> None:
 
 
 def load_element(element: ElementTree.Element) -> mi.Object:
-    """An element as an object of Mitsuba. Raises RuntimeError if Mitsuba refuses it."""
+    """Load an element as a Mitsuba object. Raises RuntimeError if Mitsuba refuses it."""
     require_parts(element)
     whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
     whole.extend(element)

@@ -16,7 +16,7 @@ NOISE_LIMIT = 16.0  #: radiance is clipped to this before noise is added [full s
 HALF_LIMIT = 6e4  #: radiance is clipped to this before it is written as half floats
 
 
-def noisy(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
+def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
     """Linear values with shot noise of `electrons` at full scale (0: none), and `read` noise [electrons]."""
     full = electrons or 10_000.0  # unit of read noise if there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
@@ -25,7 +25,7 @@ def noisy(linear: np.ndarray, electrons: float, read: float, random: np.random.G
     return (value + random.normal(0, read, value.shape)) / full
 
 
-def encoded(linear: np.ndarray, kind: Format) -> np.ndarray:
+def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
     """Encoded pixels (H, W, 3): linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
     if kind == "exr":
         return np.clip(linear, 0, HALF_LIMIT).astype(np.float16)

@@ -34,7 +34,7 @@ def lights_of(
         away = random.normal(size=3)
         places = [distance * away / np.linalg.norm(away)] * len(cameras)
     else:
-        places = [near(camera.position, np.radians(spread), random) for camera in cameras]
+        places = [rotate_randomly(camera.position, np.radians(spread), random) for camera in cameras]
     if kind == "distant":
         return [Light("directional", -place / np.linalg.norm(place), np.ones(3)) for place in places]
     intensity = np.full(3, np.median([place @ place for place in places] or [0]))
@@ -54,7 +54,7 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
     return lights
 
 
-def near(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
+def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
     """`position` (3,), rotated about the origin by a random angle up to `spread` [rad] in a random direction."""
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)

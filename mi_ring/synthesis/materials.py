@@ -78,13 +78,13 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
         else:
             found = mi.load_dict(parse_plugin(text, field, coloured))
     except RuntimeError as error:
-        raise InputError(f"{field}: {text}: {explained(str(error))}") from error
+        raise InputError(f"{field}: {text}: {explain(str(error))}") from error
     if not isinstance(found, mi.BSDF):
         raise InputError(f"{field}: {text}: is no BSDF; give {FORMS}")
     return found
 
 
-def explained(message: str) -> str:
+def explain(message: str) -> str:
     """A message of Mitsuba about a plugin or its parameters, rewritten for users of the command."""
     if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"

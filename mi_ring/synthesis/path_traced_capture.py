@@ -26,7 +26,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis import light_sources
-from mi_ring.synthesis.degradation import HALF_LIMIT, encoded, exposures, miscalibrated, noisy
+from mi_ring.synthesis.degradation import HALF_LIMIT, encode, exposures, miscalibrated, with_noise
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object, shape_of, table_elements
 from mi_ring.synthesis.options import SynthesizeConfig
@@ -195,9 +195,9 @@ def write_capture(config: SynthesizeConfig) -> None:
                     pictures[place] *= studio.gains[int(photograph.name)]
                     if config.electrons or config.read:
                         random = studio.random(purpose, int(photograph.name))
-                        pictures[place] = noisy(pictures[place], config.electrons, config.read, random)
+                        pictures[place] = with_noise(pictures[place], config.electrons, config.read, random)
         for place, linear in pictures.items():
-            write_image(encoded(linear, config.format), folder / place / photograph.file)
+            write_image(encode(linear, config.format), folder / place / photograph.file)
     write_scenes(studio, seen, novel, exposure)
 
 
