@@ -362,8 +362,8 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
 
     out = tmp_path / "out/scene.xml"
     case("FORMAT: is nerf; must be one of diligent-mv", "nerf", good, out)
-    case("--views: 9: not in", "diligent-mv", diligent, out, "--views", 9)
-    case("--lights: 0: not in", "diligent-mv", diligent, out, "--lights", 0)
+    case("--views: 9: is not in", "diligent-mv", diligent, out, "--views", 9)
+    case("--lights: 0: is not in", "diligent-mv", diligent, out, "--lights", 0)
     case("Calib_Results.mat: MATLAB file: no such file", "diligent-mv", colmap, out)
     case("transforms_train.json", "transforms", colmap, out)
     case("neither images.bin nor images.txt", "colmap", good, out)

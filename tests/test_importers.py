@@ -432,7 +432,7 @@ def test_there_are_two_par_txt(tmp_path):
     ({"pixelRatio": 0}, "pixelRatio: are 23.5 and 0; must be above 0"),
     ({"width": 10**300, "type": "radial3"}, "must be 1 to 1000000"),
     ({"principalPoint": None}, "principalPoint: is"),
-    ({"intrinsicId": 6}, r"views\[0\]: intrinsics '5': there are none"),
+    ({"intrinsicId": 6}, r"views\[0\]: intrinsics '5': is missing"),
 ])  # fmt: skip
 def test_mistakes_in_meshrooms_intrinsics(tmp_path, own, pattern):
     refused(["sfmdata", alicevision(tmp_path, own=own)], pattern, tmp_path)

@@ -55,9 +55,8 @@ class SfmData(Photogrammetry):
             pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
             pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
             key = str(view.get("intrinsicId"))
-            if key not in intrinsics:
-                raise InputError(f"{what}: intrinsics {key!r}: there are none")
-            lens = alicevision_lens(intrinsics[key], version, f"{self.src}: intrinsic {key!r}")
+            intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
+            lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
@@ -81,10 +80,9 @@ class SfmData(Photogrammetry):
             R = matrix(pose.get("rotation"), (3, 3), f"{what}: extrinsics.rotation")
             center = matrix(pose.get("center"), (3,), f"{what}: extrinsics.center")
             key = str(view.get("id_intrinsic"))
-            if key not in intrinsics:
-                raise InputError(f"{what}: intrinsics {key!r}: there are none")
-            kind = types.get(type_number(intrinsics[key]["value"], self.src))
-            lens = openmvg_lens(pointed_to(intrinsics[key], what), kind, f"{self.src}: intrinsic {key!r}")
+            intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
+            kind = types.get(type_number(intrinsic["value"], self.src))
+            lens = openmvg_lens(pointed_to(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
