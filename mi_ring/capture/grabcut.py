@@ -12,8 +12,8 @@ def disk(radius: float) -> np.ndarray:
 
 def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
     """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of its area; a negative share erodes it."""
-    radius = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
-    return cv2.dilate(coverage, radius) if share > 0 else cv2.erode(coverage, radius)
+    kernel = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
+    return cv2.dilate(coverage, kernel) if share > 0 else cv2.erode(coverage, kernel)
 
 
 def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:

@@ -135,7 +135,7 @@ def bright_mask(view: ReducedView) -> np.ndarray:
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Which masks are no outliers: they miss no more of the common silhouette (H, W) than most masks do."""
+    """Whether each mask is complete: it misses about as little of the common silhouette (H, W) as the other masks."""
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
         for view, mask, silhouette in zip(views, masks, silhouettes)

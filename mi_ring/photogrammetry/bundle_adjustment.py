@@ -125,7 +125,7 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """`SparseModel.cameras` of a model."""
+    """Lens and camera-to-world pose (4, 4) of each photograph with a pose, by its name."""
     cameras = {}
     for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params

@@ -63,7 +63,7 @@ class Picture:
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """The result of `read` on the opened file. LibRaw opens raw files, Pillow others; it turns HEIF upright."""
+        """`read(file)` of the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
         raw = self.suffix in RAW
         with (
             reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
