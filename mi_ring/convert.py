@@ -1,4 +1,4 @@
-"""Bring photographs in from other tools: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
+"""Import photographs with cameras from other tools: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, Union
@@ -12,7 +12,7 @@ from mi_ring.system import command
 
 DESCRIPTION = """Write a scene file for photographs in the format of another tool.
 
-Lens distortion is undone; units and frame stay as they are. mi_ring.convert FORMAT --help tells more."""
+Lens distortion is removed. Units and frame do not change. For the options see mi_ring.convert FORMAT --help."""
 Formats: Any = Union[  # noqa: UP007
     tuple(Annotated[source, tyro.conf.subcommand(name)] for name, source in FORMATS.items())
 ]

@@ -43,7 +43,7 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
     folder = config.folder
     processes.agreed(lambda: None if processes.rank == 0 else same_variant(config.variant))
     keep_memory()
-    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks, width=WIDTH))
+    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks, width=max(WIDTH, *config.widths)))
     if capture.shape.ring is not None:
         print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
     if capture.threshold is not None:

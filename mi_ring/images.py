@@ -1,4 +1,4 @@
-"""Pictures as arrays: sRGB, box filter, Gaussian blur, image files of any bit depth."""
+"""Images as arrays: sRGB, box filter, Gaussian blur, and image files of any bit depth."""
 
 import contextlib
 import io
@@ -22,14 +22,15 @@ from torch.nn import functional as F
 from mi_ring.foreign import require_plausible_size
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import exr_threads
+from mi_ring.system.optional import need
 
-#: Suffixes of photographs, lower case: formats that every program reads, and formats that need a package.
+#: Suffixes of photographs, in lower case: common formats, and formats whose package may be missing.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FORMATS = "JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP"  #: formats in which Pillow may open a file
-EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader allocates one even for a picture of one row
+EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
-# A phone's photographs have more pixels than Pillow allows; `require_plausible_size` compares with the file's size.
+# Photographs of phones exceed Pillow's limit. `require_plausible_size` checks the size instead.
 Image.MAX_IMAGE_PIXELS = None
 
 Pictures = TypeVar("Pictures", np.ndarray, Tensor)
@@ -47,12 +48,12 @@ def linear_to_srgb(v: np.ndarray) -> np.ndarray:
 
 
 def contrasted(linear: Pictures, contrast: Any) -> Pictures:
-    """Linear values after an S-curve like that of film; values of 1 and above do not change.
+    """Apply an S-curve, like that of film, to linear values. Values of 1 and above do not change.
 
-    It maps an sRGB value v to vᶜ / (vᶜ + (1 − v)ᶜ), c = `contrast`. The inverse has the contrast 1 / c.
+    It maps an sRGB value v to vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`. The inverse is the curve with 1 / c.
     """
     where: Any = torch.where if isinstance(linear, Tensor) else np.where
-    x = linear.clip(1e-6, 1 - 1e-6)  # where the powers have finite derivatives
+    x = linear.clip(1e-6, 1 - 1e-6)  # so that the powers have finite derivatives
     v = where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     a, b = v**contrast, (1 - v) ** contrast
     v = a / (a + b)
@@ -61,19 +62,19 @@ def contrasted(linear: Pictures, contrast: Any) -> Pictures:
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:
-    """Values in [0, 1], others clipped, to uint8."""
+    """Values, clipped to [0, 1], as uint8 from 0 to 255."""
     return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def box_filter(image: Tensor, scale: int) -> Tensor:
-    """The means over blocks: (H, W, C) → (H // scale, W // scale, C)."""
+    """Means over blocks of `scale` × `scale` pixels: (H, W, C) → (H // scale, W // scale, C)."""
     if scale == 1:
         return image
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
 
 
 class BoundedFile(io.BufferedReader):
-    """A file whose `read` allocates no more bytes than are left in it, whatever a damaged header requests."""
+    """A file whose `read` allocates at most the bytes that are left, even if a damaged header requests more."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         left = max(0, os.fstat(self.fileno()).st_size - self.tell())
@@ -84,10 +85,13 @@ class BoundedFile(io.BufferedReader):
 def open_image(path: Path) -> Iterator[Image.Image]:
     """An image file opened by Pillow.
 
-    Raises ValueError if it is no image or declares an implausible size, and other errors if it is damaged.
+    Raises ValueError if it is no image or declares an implausible size, InputError if it is HEIF and pillow_heif is not
+    installed, and other errors if it is damaged.
     """
+    if path.suffix.lower() in HEIF:
+        need("pillow_heif", f"{path}").register_heif_opener()
     Image.init()
-    formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF if its package is installed
+    formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF and AVIF may be missing
     with BoundedFile(io.FileIO(path)) as file:
         try:
             image = Image.open(file, formats=formats)
@@ -113,7 +117,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def exr_size(path: Path) -> tuple[int, int, int]:
     """Width [px], height [px] and number of channels that the header of an OpenEXR file declares.
 
-    By "OpenEXR File Layout" an attribute is its name and its type, each ending in a zero byte, its size and its value.
+    The header is a list of attributes ("OpenEXR File Layout"): name and type, which end in a zero byte, size, value.
     """
     found: dict[bytes, bytes] = {}
     with path.open("rb") as file:
@@ -133,7 +137,7 @@ def exr_size(path: Path) -> tuple[int, int, int]:
                 file.seek(size, os.SEEK_CUR)
     left, top, right, bottom = struct.unpack("<4i", found[b"dataWindow"])
     channels, place = 0, 0
-    while found[b"channels"][place]:  # of a channel: its name, a zero byte, 16 bytes
+    while found[b"channels"][place]:  # a channel is its name, a zero byte and 16 more bytes
         channels, place = channels + 1, found[b"channels"].index(b"\0", place) + 17
     if min(right - left, bottom - top, channels - 1) < 0:
         raise ValueError("declares no pixels")
@@ -154,18 +158,18 @@ def read_image(path: Path) -> np.ndarray:
             require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
             for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
                 if count > path.stat().st_size:  # the reader would request each of them
-                    raise ValueError(f"declares {count:,} {what}, and is shorter")
+                    raise ValueError(f"declares {count:,} {what}, but is shorter")
         pixels = np.array(imageio.imread(path, page=0))
     elif suffix == ".exr":
         width, height, channels = exr_size(path)
         require_plausible_size(path, 4 * width * max(height, EXR_CHUNK) * channels)
         with exr_threads():
             pixels = np.array(mi.Bitmap(str(path)), copy=True)
-    elif suffix in (".jpg", ".jpeg"):  # Mitsuba reads truncated files, and their rest as grey
+    elif suffix in (".jpg", ".jpeg"):  # Mitsuba accepts truncated files and fills them with grey
         with open_image(path) as image:
             pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
     else:
-        with open_image(path):  # Pillow checks it; Mitsuba reads it: other readers reduce 16 bits to 8
+        with open_image(path):  # Pillow checks it, but reduces 16 bits to 8; Mitsuba does not
             pixels = np.array(mi.Bitmap(str(path)), copy=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
@@ -173,11 +177,11 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of images (..., H, W) by `sigma` > 0 [px]; outside they are zero."""
+    """Gaussian blur of images (..., H, W) by `sigma` > 0 [px]. Pixels outside count as zero."""
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
-    def kernel(n: int) -> Tensor:  # as a matrix: two products take a tenth of the time of two convolutions
+    def kernel(n: int) -> Tensor:  # as a matrix, because a product takes a tenth of the time of a convolution
         distance = (torch.arange(n)[:, None] - torch.arange(n)).to(images)
         return torch.where(distance.abs() <= radius, torch.exp(-0.5 * (distance / sigma) ** 2) / total, 0)
 
@@ -185,7 +189,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def write_image(pixels: np.ndarray, path: Path) -> None:
-    """Write an image (H, W, C) as PNG, JPEG or EXR, by the file's suffix, by `write_file`."""
+    """Write an image (H, W, C) by `write_file`. The suffix says the format: .png, .exr, otherwise JPEG."""
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
@@ -195,7 +199,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """The content of a file with this picture; `kind` and `options` are those of Pillow's `save`."""
+    """An image encoded as the content of a file. `kind` and `options` are those of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -18,29 +18,13 @@ from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
+from mi_ring.photogrammetry import folder, workflow
 from mi_ring.photogrammetry.capture_files import crop_windows, write_posed_picture, write_table
 from mi_ring.photogrammetry.flash_light import FlashCalibration
-from mi_ring.photogrammetry.folder import (
-    TRANSPARENT,
-    camera_names,
-    find_pictures,
-    up_directions,
-    without_exposure,
-    without_flash,
-)
 from mi_ring.photogrammetry.marker_sheet import SQUARE, align
 from mi_ring.photogrammetry.object_masks import SegmentationInput, SegmentedObject, find_object, require_half
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
-from mi_ring.photogrammetry.workflow import (
-    find_cameras,
-    find_sheet,
-    flash_from_sheet,
-    make_upright,
-    posed_pictures,
-    require_parallax,
-    require_same_photographs,
-)
 from mi_ring.rendering.spherical_harmonics import PER_FRAME
 from mi_ring.system import command
 from mi_ring.system.files import locked, read_json, write_file
@@ -54,36 +38,36 @@ METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
 
 @dataclass(frozen=True)
 class PhotosConfig:
-    """Find the cameras of photographs, masks of the object and its place, and write a capture to fit.
+    """Find cameras and masks of photographs of an object, and write a capture to fit.
 
-    The photographs show one object from all around. It does not move. A flash beside the lens lights it in a dim room.
-    They are JPEG, HEIC, PNG, TIFF or raw files. With a sheet of `mi-ring board` under the object, the capture is in
-    millimetres and upright. After an interruption the same command continues.
+    The photographs show one object, which does not move, from all around. A flash beside the lens lights it in a dim
+    room. They are JPEG, HEIC, PNG, TIFF or raw files. With a sheet of `mi-ring board` under the object, the capture is
+    in millimetres and upright. After an interruption the same command continues.
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the photographs."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
-    """Folder to write. It gets scene.xml and the files that this names.
-    work/ in it keeps what has been found so far; an interrupted command continues from there."""
+    """Folder to write: scene.xml, its files, and work/ with intermediate results.
+    If the command is interrupted, it continues from work/."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: right, down and forward.
-    With a sheet the unit is mm, and the sheet refines it.
+    With a sheet the unit is mm, and the sheet refines the position.
     Without a sheet the unit is the median distance from the cameras to the object.
-    It is for photographs as most of them are held; for those held otherwise it turns with the camera."""
+    It is for the orientation of most photographs, upright or sideways; for the others it turns with the camera."""
     turntable: bool = False
-    """Use it if the object turned, with the sheet under it, while camera and flash stood still."""
+    """Give it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
     """Where the masks come from.
-    auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
-    rembg: found by the package rembg, which must be installed.
+    auto: from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
+    rembg: from the package rembg, which must be installed.
     Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Box around the object in the frame of the sheet [mm], as XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
-    Use it to cut off what touches the object in the photographs but is not part of it."""
+    """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
+    Give it if the masks contain something else that touches the object in the photographs."""
     square_mm: float = SQUARE
-    """Length of one square of the printed sheet [mm].
-    Measure several squares with a ruler if the printer does not print at 100 %."""
+    """Side of a square of the printed sheet [mm].
+    Give it if the printer does not print at 100 %; measure several squares with a ruler."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
@@ -96,12 +80,12 @@ class PhotosConfig:
             need("rembg", "--masks rembg")
 
     def words(self) -> list[str]:
-        """The options as strings, by which the same command is recognised."""
+        """The options as strings, to recognise the same command."""
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
 def cameras_report(sparse: SparseModel) -> str:
-    """The line about cameras, and one for each photograph without."""
+    """A line about the cameras, and a line per photograph without a camera."""
     count, failed = len(sparse.cameras), sparse.failed
     how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
     how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
@@ -112,7 +96,7 @@ def cameras_report(sparse: SparseModel) -> str:
 
 
 def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
-    """The line about masks, and one for each photograph without; `source`: as `PhotosConfig.masks`."""
+    """A line about the masks, and a line per photograph without a mask. `source`: `PhotosConfig.masks`."""
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
@@ -122,7 +106,7 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
 
 
 def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
-    """The line about the flash and the light of the room."""
+    """A line about the flash, the room's light and the camera's response."""
     x, y, z = flash.offset
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
@@ -140,14 +124,14 @@ def main(arguments: Sequence[str]) -> None:
     require_apart(config)
     if scene.exists() and (sheet.exists() or read_json(config.out / OPTIONS) != config.words()):
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
-                         f"valid/ and table.png beside it, to make it anew from {config.out}/work")  # fmt: skip
+                         f"valid/ and table.png beside it, to make it again from {config.out}/work")  # fmt: skip
     try:
         with command.resumable(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene))
     except KeyboardInterrupt as stop:
-        # At once: native threads cannot be stopped. The files that they write are complete or absent.
+        # Exit at once, because native threads cannot be stopped. Their files are complete or absent.
         os._exit(command.exit_status(stop))
     inspection.save(sheet, "DIR")
     print(f"{inspection.text}\nContact sheet: {sheet}\nNow: mi-ring fit {scene}")
@@ -158,36 +142,36 @@ def require_apart(config: PhotosConfig) -> None:
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
     written = [out / name for name in ("images", "masks", "valid", "work")]
-    for field, folder in given.items():
-        place = folder.resolve()
+    for field, path in given.items():
+        place = path.resolve()
         if place == out or any(place.is_relative_to(taken) for taken in written):
-            raise InputError(f"{folder}: {field}: is where the capture is written; give another DIR than {config.out}")
+            raise InputError(f"{path}: {field}: is where the capture is written; give another DIR than {config.out}")
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture; steps that are complete in work/ are not repeated."""
-    pictures = find_pictures(config.folder, upright=detect(config.folder) is None)
-    if dark := without_flash(pictures):
+    """Make the capture. Stages with results in work/ are not repeated."""
+    pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
+    if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")
         pictures = [picture for picture in pictures if picture.path.name not in dark]
-    if len(cameras := camera_names(pictures)) > 1:
+    if len(cameras := folder.camera_names(pictures)) > 1:
         kinds = ", ".join(f"{count} by {model}" for model, count in cameras.items())
-        print(f"Cameras: of several models, by EXIF data ({kinds}), but all of one size are taken to share a lens, and "
-              "all to have their flash in one place beside it; better give photographs of one")  # fmt: skip
-    if isinstance(config.masks, Path):  # before the long work
+        print(f"Cameras: several models, by EXIF data ({kinds}); photographs of one size are assumed to share a lens, "
+              "and all to have the flash in one place beside it; better give photographs of one camera")  # fmt: skip
+    if isinstance(config.masks, Path):  # check it before the long work
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
-    elif config.masks == "alpha" and not any(p.path.suffix.lower() in TRANSPARENT for p in pictures):
+    elif config.masks == "alpha" and not any(p.path.suffix.lower() in folder.TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
     for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"
-    require_same_photographs(pictures, work)
-    sheet = find_sheet(pictures, config.square_mm, work, progress)
+    workflow.require_same_photographs(pictures, work)
+    sheet = workflow.find_sheet(pictures, config.square_mm, work, progress)
     if config.box and not sheet:
         raise InputError(f"--box: is in the frame of the sheet of `mi-ring board`, which {config.folder} does not show")
-    sparse, plane = find_cameras(pictures, sheet, config.turntable, work, progress), None
+    sparse, plane = workflow.find_cameras(pictures, sheet, config.turntable, work, progress), None
     print(cameras_report(sparse))
-    require_parallax(sparse, config.folder)
+    workflow.require_parallax(sparse, config.folder)
     if sheet:
         moved = align(sheet.detections, sparse.cameras)
         sparse = sparse.moved(moved.scale, moved.rotation, moved.shift)
@@ -200,23 +184,23 @@ def make(config: PhotosConfig, scene: Path) -> None:
     plane = found.plane
     print(masks_report(found, sparse, config.masks))
     if not plane:
-        print("Table: none found; if the object stands on one, see in the contact sheet that it is not in the masks")
-    if config.masks == "auto":  # what shows a table and no mask would be taken for the object
+        print("Table: none found; if there is one, check in the contact sheet that the masks do not contain it")
+    if config.masks == "auto":  # without a mask, a fit would take the table for the object
         sparse = replace(sparse, cameras={n: camera for n, camera in sparse.cameras.items() if n in found.masks})
     has_up = True
     if not sheet:
-        sparse, plane, has_up = make_upright(sparse, found.center, plane, up_directions(pictures))
+        sparse, plane, has_up = workflow.make_upright(sparse, found.center, plane, folder.up_directions(pictures))
         found = found._replace(center=np.zeros(3))
     offset = np.array(config.flash_offset)
-    flash = flash_from_sheet(pictures, sparse, found, offset, sheet) if sheet else None
+    flash = workflow.flash_from_sheet(pictures, sparse, found, offset, sheet) if sheet else None
     if flash:
         print(flash_report(flash, sparse, found))
     if not flash and not offset.any() and len({picture.camera_orientation for picture in pictures}) > 1:
-        print("Flash: taken to be at the lens, but photographs were taken upright and on their side; unless it is, say "
-              "about where it is: --flash-offset")  # fmt: skip
-    taken = posed_pictures(pictures, sparse, found, offset, flash)
-    if silent := without_exposure([posed.picture for posed in taken if not posed.measured]):
-        print(f"Exposure: taken to be the usual one where EXIF data do not tell it: {', '.join(silent)}")
+        print("Flash: assumed at the lens, but the camera was held upright and sideways; if the flash is elsewhere, "
+              "give its position by --flash-offset")  # fmt: skip
+    taken = workflow.posed_pictures(pictures, sparse, found, offset, flash)
+    if silent := folder.without_exposure([posed.picture for posed in taken if not posed.measured]):
+        print(f"Exposure: assumed to be the median one where EXIF data have none: {', '.join(silent)}")
     ground, up = plane and plane.offset * plane.normal, np.array([0.0, 0.0, 1.0]) if has_up else None
     # The Fresnel term depends on the reflectance, which is known only if the flash's power is.
     root = scene_element(ground=ground, up=up, metres=METRES if sheet else None, fresnel=flash is not None)

@@ -1,4 +1,4 @@
-"""Path trace a capture of any mesh, with its truth: `python -m mi_ring.synthesize MESH OUT`."""
+"""Path trace a capture of a mesh, with its ground truth: `python -m mi_ring.synthesize MESH OUT`."""
 
 from collections.abc import Sequence
 

@@ -106,7 +106,7 @@ WRONG = {
     "no images": ({"images": [], "cameras": []}, "images: is empty"),
     "a float64 image": ({"images": [IMAGE / 255]}, r"images\[0\]: is float64 of shape \(5, 7, 3\)"),
     "a grey image": ({"images": [IMAGE[..., 0]]}, r"images\[0\]: is uint8 of shape \(5, 7\); must be \(H, W, 3\)"),
-    "a flat image": ({"images": [IMAGE[:, :1].repeat(60, 0)]}, r"images\[0\]: is 1 x 300 pixels; sides of more than"),
+    "a flat image": ({"images": [IMAGE[:, :1].repeat(60, 0)]}, r"images\[0\]: is 1 x 300 pixels; the sides must be"),
     "a nan": ({"images": [np.full((5, 7, 3), np.nan, np.float32)]}, r"images\[0\]: contains pixels that are NaN"),
     "8 linear bits": ({"encoding": "linear"}, r"images\[0\]: is uint8, which is sRGB"),
     "an encoding": ({"encoding": "gamma"}, "encoding: is 'gamma'"),

@@ -206,7 +206,7 @@ def test_photographs_of_the_source_are_never_overwritten(tmp_path, scene):
     top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25, "k1": -0.2}
     source = transforms(tmp_path / "pot", top, [{"file_path": "images/a.png"}], lambda k: noise(np.uint8))
     before = (source / "images/a.png").read_bytes()
-    with pytest.raises(InputError, match=r"images/a.png: exists already and is another; remove it"):
+    with pytest.raises(InputError, match=r"images/a.png: exists already, with other content; remove it"):
         convert.main(["transforms", str(source), str(tmp_path / scene)])
     assert (source / "images/a.png").read_bytes() == before
     assert sorted(p.name for p in source.iterdir()) == ["images", "transforms.json"]
@@ -363,8 +363,8 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
 
     out = tmp_path / "out/scene.xml"
     case("FORMAT: is nerf; must be one of diligent-mv", "nerf", good, out)
-    case("--views: 9: not in", "diligent-mv", diligent, out, "--views", 9)
-    case("--lights: 0: not in", "diligent-mv", diligent, out, "--lights", 0)
+    case("--views: 9: is not in", "diligent-mv", diligent, out, "--views", 9)
+    case("--lights: 0: is not in", "diligent-mv", diligent, out, "--lights", 0)
     case("Calib_Results.mat: MATLAB file: no such file", "diligent-mv", colmap, out)
     case("transforms_train.json", "transforms", colmap, out)
     case("neither images.bin nor images.txt", "colmap", good, out)
@@ -393,7 +393,7 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
     (lambda d: d.update(camera_angle_x="wide"), "camera_angle_x: is wide; must be a number"),
     (lambda d: d.update(camera_angle_x=0), "camera_angle_x: is 0.0; must be between 0 and pi"),
     (lambda d: d.update(fl_x=-3.0), "focal lengths"),
-    (lambda d: d.update(w=99, h=52), "is 62 x 52 pixels, its camera 99 x 52"),
+    (lambda d: d.update(w=99, h=52), "is 62 x 52 pixels, but its camera 99 x 52"),
     (lambda d: d.update(k4=0.1), r"frames\[0\].k4"),
     (lambda d: d.update(camera_model="FOV"), "camera_model: is FOV"),
     (lambda d: d["frames"][1].update(pl_pos=[1, 2]), r"frames\[1\].pl_pos: is of shape \(2,\); must be 3 numbers"),
@@ -456,7 +456,7 @@ def test_wrong_counts_of_photographs_and_masks(tmp_path):
     (lambda d: d["1.png"].pop("W2C"), "1.png.W2C: is missing"),
     (lambda d: d["1.png"]["W2C"].__setitem__(0, "x"), "1.png.W2C"),
     (lambda d: d["1.png"]["W2C"].__setitem__(3, float("inf")), "1.png"),
-    (lambda d: d["1.png"].update(img_size=[9, 9]), "1.exr: photograph: is 62 x 52 pixels, its camera 9 x 9"),
+    (lambda d: d["1.png"].update(img_size=[9, 9]), "1.exr: photograph: is 62 x 52 pixels, but its camera 9 x 9"),
     (lambda d: d["1.png"].update(img_size="large"), "1.png.img_size"),
     (lambda d: d["1.png"].update(K=[0] * 16), "1.png.K"),
     (lambda d: d.update({"7.png": d["1.png"]}), "7.png: no such file"),

@@ -389,7 +389,7 @@ def test_compressed_tiffs(compression, tmp_path):
 def test_a_photograph_must_not_be_called_like_the_surface(tmp_path):
     for name in ("a", "b", "c", "d", "e", "f", "g", "object"):
         Image.fromarray(np.full((6, 8, 3), ord(name[0]), np.uint8)).save(tmp_path / f"{name}.png")
-    with pytest.raises(InputError, match=r"object.png: FOLDER: .*; rename the file"):
+    with pytest.raises(InputError, match=r"object.png: FOLDER: .*; rename it"):
         find_pictures(tmp_path)
 
 

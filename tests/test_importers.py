@@ -329,9 +329,9 @@ def refused(arguments, pattern, folder):
     ("<f>70.0</f>", "<f>-70</f>", "focal lengths above 0"),
     ("<f>70.0</f>", "<f>70</f><k4>0.1</k4>", "k4: is 0.1"),
     ("<f>70.0</f>", "<f>70</f><p3>0.1</p3>", "p3: is 0.1"),
-    ("<f>70.0</f>", "<f>70</f><b2>0.5</b2>", "b2: is 0.5, pixels are sheared"),
+    ("<f>70.0</f>", "<f>70</f><b2>0.5</b2>", "b2: is 0.5, a skew"),
     (f'width="{W}"', f'width="{10**400}"', "must be 1 to 1000000|infinite"),
-    (f'width="{W}"', 'width="61"', "photograph: is 62 x 52 pixels, its camera 61 x 52"),
+    (f'width="{W}"', 'width="61"', "photograph: is 62 x 52 pixels, but its camera 61 x 52"),
     ('type="frame"', 'type="spherical"', "type: is 'spherical'; must be frame or fisheye"),
     ("calibration", "calibrations", "calibration: is missing"),
     ("<scale>2.5", "<scale>0", "scale: is 0.0; must be above 0"),
@@ -394,9 +394,9 @@ def test_there_is_no_table_and_there_are_no_sidecars(tmp_path):
     (lambda a: a[:2], "has 3 photographs, poses_bounds.npy 2 poses"),
     (lambda a: a * np.nan, "NaN"),
     (lambda a: np.array(["a"] * 17)[None], "poses_bounds.npy: "),
-    (lambda a: np.where(a == 70, 0, a), "no scale"),
-    (lambda a: np.where(a == H, 40, a), "is 62 x 52 pixels, which is no scale of the 62 x 40 of pose 0"),
-    (lambda a: np.vstack([a[:1] * 0, a[1:]]), "no scale"),
+    (lambda a: np.where(a == 70, 0, a), "not proportional"),
+    (lambda a: np.where(a == H, 40, a), "is 62 x 52 pixels, not proportional to the 62 x 40 of pose 0"),
+    (lambda a: np.vstack([a[:1] * 0, a[1:]]), "not proportional"),
 ])  # fmt: skip
 def test_mistakes_in_poses_bounds(tmp_path, edit, pattern):
     refused(["llff", llff(tmp_path, edit)], pattern, tmp_path)
@@ -408,7 +408,7 @@ def test_mistakes_in_poses_bounds(tmp_path, edit, pattern):
     (lambda text: text.replace("b.png", "d.png"), "no photograph 'd.png'"),
     (lambda text: text.replace("70.0", "x", 1), "a.JPG: K, R, t: is"),
     (lambda text: text.replace(" 70.0", "", 1), r"a.JPG: K, R, t: is of shape \(20,\); must be 21"),
-    (lambda text: text.replace("70.0 0.0", "70.0 9.0"), "pixels are sheared"),
+    (lambda text: text.replace("70.0 0.0", "70.0 9.0"), "has skew"),
     (lambda text: "\udcff" + text, "cannot be read as text"),
 ])  # fmt: skip
 def test_mistakes_in_par_txt(tmp_path, edit, pattern):
@@ -432,7 +432,7 @@ def test_there_are_two_par_txt(tmp_path):
     ({"pixelRatio": 0}, "pixelRatio: are 23.5 and 0; must be above 0"),
     ({"width": 10**300, "type": "radial3"}, "must be 1 to 1000000"),
     ({"principalPoint": None}, "principalPoint: is"),
-    ({"intrinsicId": 6}, r"views\[0\]: intrinsics '5': there are none"),
+    ({"intrinsicId": 6}, r"views\[0\]: intrinsics '5': is missing"),
 ])  # fmt: skip
 def test_mistakes_in_meshrooms_intrinsics(tmp_path, own, pattern):
     refused(["sfmdata", alicevision(tmp_path, own=own)], pattern, tmp_path)

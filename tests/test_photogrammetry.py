@@ -12,7 +12,7 @@ from helpers.ellipsoid_pictures import AXES, CENTER, LENS, hit_ellipsoid, in_a_d
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.grabcut import disk, grown, overlap
+from mi_ring.capture.grabcut import dilate_by_share, disk, overlap
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window
@@ -159,7 +159,7 @@ def test_the_bare_table_is_known_but_for_an_object_that_looks_like_it():
         true.append(mask)
     plane = table_plane.Plane(np.array([0, 0, 1.0]), CENTER[2] - AXES[2])
     covered = [mask.astype(np.uint8) for mask in true]
-    hidden = [grown(mask, 0.1) for mask in covered]
+    hidden = [dilate_by_share(mask, 0.1) for mask in covered]
     grounds = table_plane.TexelGrid(plane, CENTER, 3.0), table_plane.TexelGrid(plane, CENTER, 8.0)
 
     def known(pictures):
@@ -555,5 +555,5 @@ def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_p
     for name, picture in (("sharp", sharp), ("blurred", cv2.blur(sharp, (31, 3)))):
         noisy = picture + random.normal(0, 3, sharp.shape)
         cv2.imwrite(str(tmp_path / f"{name}.png"), noisy.clip(0, 255).astype(np.uint8))
-    sharp, blurred = (structure_from_motion.detail_of(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
+    sharp, blurred = (structure_from_motion.sharpness(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
     assert blurred < structure_from_motion.BLURRED * sharp

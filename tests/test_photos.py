@@ -245,7 +245,7 @@ def test_damaged_photographs_are_named_together(tmp_path):
     for k in (2, 5):
         file = tmp_path / f"{k}.jpg"
         file.write_bytes(file.read_bytes()[:1500])
-    with pytest.raises(InputError, match=r"2.jpg: cannot be read .*; 2 photographs cannot .*: 2.jpg, 5.jpg; mend"):
+    with pytest.raises(InputError, match=r"2.jpg: cannot be read .*; 2 photographs cannot .*: 2.jpg, 5.jpg; repair"):
         find_sheet(find_pictures(tmp_path), 1.0, tmp_path, progress)
     assert not (tmp_path / "sheet.json").exists()
 

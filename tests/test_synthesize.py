@@ -27,7 +27,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of, scene_of
 from mi_ring.scene.shot import Shot
 from mi_ring.synthesis import light_sources
-from mi_ring.synthesis.degradation import encoded, exposures, miscalibrated, noisy
+from mi_ring.synthesis.degradation import encode, exposures, miscalibrated, with_noise
 from mi_ring.synthesis.materials import COLOURS, load_material, parse_plugin
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object
 from mi_ring.synthesis.options import SynthesizeConfig
@@ -176,13 +176,13 @@ def test_a_mesh_is_known_by_what_it_holds(lump, matt, tmp_path, capsys):
     synthesize.main([str(other), str(matt), *options])
     assert (matt / "images/000.exr").stat().st_mtime_ns == before
     other.write_text(other.read_text() + "# another\n")
-    with pytest.raises(InputError, match=r"made with other options \(digests\)"):
+    with pytest.raises(InputError, match=r"with other options \(digests\)"):
         synthesize.main([str(other), str(matt), *options])
 
 
 def test_what_no_pixel_shows_alone_needs_an_exposure(lump, tmp_path):
     options = ["--views", "2", "--size", "32", "32", "--novel", "0", "--distance", "900"]
-    with pytest.raises(InputError, match="no pixel shows it alone, .* give --exposure"):
+    with pytest.raises(InputError, match="no pixel shows only the object, .* give --exposure"):
         synthesize.main([str(lump), str(tmp_path / "far"), *options])
 
 
@@ -212,11 +212,11 @@ def test_an_interrupted_capture_goes_on(matt, lump, tmp_path):
     pictures = (np.array(mi.Bitmap(str(path)), np.float32) for path in (tmp_path / "before.exr", missing))
     np.testing.assert_allclose(*pictures, rtol=2e-3, atol=1e-4)
     assert kept.stat().st_mtime_ns == time and (matt / "scene.xml").is_file()
-    with pytest.raises(mi_ring.InputError, match=r"made with other options \(fov, seed\)"):
+    with pytest.raises(mi_ring.InputError, match=r"with other options \(fov, seed\)"):
         synthesize.main([str(lump), str(matt), *SMALL, *options, "--fov", "50", "--seed", "3"])
     (tmp_path / "other").mkdir()
     (tmp_path / "other/file").touch()
-    with pytest.raises(mi_ring.InputError, match="OUT: is there already"):
+    with pytest.raises(mi_ring.InputError, match="OUT: exists already"):
         synthesize.main([str(lump), str(tmp_path / "other")])
 
 
@@ -304,16 +304,16 @@ def test_the_sheet_is_printed_true_to_scale(lump, tmp_path):
 
 def test_noise_is_that_of_counted_electrons():
     random = np.random.default_rng(1)
-    found = noisy(np.full((200, 300, 3), 0.25), 2000, 12, random)
+    found = with_noise(np.full((200, 300, 3), 0.25), 2000, 12, random)
     np.testing.assert_allclose(found.mean(), 0.25, rtol=1e-3)
     np.testing.assert_allclose(found.std(), np.sqrt(0.25 * 2000 + 12**2) / 2000, rtol=0.02)
-    np.testing.assert_allclose(noisy(np.zeros((200, 300, 3)), 0, 30, random).std(), 0.003, rtol=0.02)
+    np.testing.assert_allclose(with_noise(np.zeros((200, 300, 3)), 0, 30, random).std(), 0.003, rtol=0.02)
 
 
 @pytest.mark.parametrize("kind, linear, step", [("exr", True, 5e-4), ("png16", True, 8e-6), ("png8", False, 5e-3)])
 def test_files_hold_what_was_seen(kind, linear, step):
     seen = np.random.default_rng(2).uniform(0, 1, (5, 7, 3))
-    pixels = encoded(seen, kind)
+    pixels = encode(seen, kind)
     found, _ = decode(pixels.astype(np.float32) if kind == "exr" else pixels, linear, 1.0)
     np.testing.assert_allclose(found, seen, atol=step)
 
@@ -410,12 +410,12 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--second", "principled roughness=low"], "^--second: .*: roughness is a string, must be a number or a colour"),
     (["--material", "roughplastic alpha=true"], "^--material: .*: alpha is a boolean, must be a number$"),
     (["--material", "diffuse reflectance=-1,2,3"], r"^--material: diffuse reflectance=-1,2,3: Invalid RGB"),
-    (["--exposure", "2", "--clipped", "0.1"], "^--clipped: is what the exposure is chosen by"),
+    (["--exposure", "2", "--clipped", "0.1"], "^--clipped: determines the exposure"),
     (["--material", "diffuse 0.5"], "found '0.5'; each parameter must be NAME=VALUE"),
     (["--material", "principled base_color=vertex_color"], "the mesh's file has no colours"),
     (["--material", "none.xml"], "none.xml: --material: no such file"),
     (["--material", "none.npz:gold"], "none.npz: --material: no such file"),
-    (["--material", "bitmap"], "--material: bitmap: has parts that are no numbers and colours; give a file .xml"),
+    (["--material", "bitmap"], "--material: bitmap: needs nested parts, which only an .xml can give; give a file .xml"),
     (["--second", "perspective"], "--second: perspective: is no BSDF"),
     (["--second", "diffuse", "--pattern", "dots"], "dots: --pattern: no such file; give stripes, checks or"),
     (["--environment", "none.exr"], "none.exr: --environment: no such file"),
@@ -424,7 +424,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--pairs", "--room", "0.1", "--wrong-room"], "--pairs: need a room"),
     (["--lamps", "2"], "--lamps: is 2, which is for --light lamp"),
     (["--light", "lamp", "--lamps", "9"], "--lamps: is 9, must be 1 to 8"),
-    (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable, beside which"),
+    (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable; an --environment"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

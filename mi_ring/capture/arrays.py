@@ -1,4 +1,4 @@
-"""Photographs in arrays: what is checked of them, and the files that they become."""
+"""Checks the arguments of `Capture.from_arrays`, and writes them as files."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -21,14 +21,14 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Encoding, Files, Shot
 from mi_ring.system.files import writing
 
-FLATTEST = 8  #: longer side of a photograph by its shorter one
-NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]*")  #: of a photograph: its files are called so
+FLATTEST = 8  #: largest ratio of a photograph's sides
+NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]*")  #: of a photograph, which is also the name of its files
 
 Item = TypeVar("Item")
 
 
 def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
-    """Photographs (H, W, 3). Raises InputError if there are none, or if one is no photograph."""
+    """The photographs (H, W, 3), checked. Raises InputError if there are none or one is invalid."""
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
     found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
@@ -38,7 +38,7 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
 
 
 def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
-    """Masks of these images, 255 inside. Raises InputError, which begins with `what`, if one is no mask."""
+    """The masks of these images, 255 inside. Raises InputError, which begins with `what`, if one is invalid."""
     several = zip(one_each(masks, len(images), what), images)
     return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
 
@@ -47,7 +47,7 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """What `Capture.from_arrays` says of these photographs. Raises InputError, which names the argument."""
+    """The `Shot` of each image, by the arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
     count = len(images)
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:
@@ -61,7 +61,7 @@ def shots_of(
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
-    """One item for each photograph; None for all if there are no items. Raises InputError for another number."""
+    """The items as a list; None for each photograph if `items` is None. Raises InputError unless there are `count`."""
     found: list[Item | None] = [None] * count if items is None else list(items)
     if len(found) != count:
         raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
@@ -69,13 +69,13 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 
 
 def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
-    """A photograph (H, W, 3). Raises InputError, which begins with `what`, if it is none."""
+    """A photograph (H, W, 3), checked. Raises InputError, which begins with `what`, if it is invalid."""
     array = np.asarray(image)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
                          "float32")  # fmt: skip
     if FLATTEST * min(array.shape[:2]) < max(array.shape[:2]):
-        raise InputError(f"{what}: is {sides(array)} pixels; sides of more than {FLATTEST} : 1 cannot be made smaller")
+        raise InputError(f"{what}: is {sides(array)} pixels; the sides must be at most {FLATTEST} : 1")
     if array.dtype == np.float32 and not (np.abs(array) <= LARGEST).all():
         raise InputError(f"{what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     if array.dtype == np.uint8 and is_linear(encoding, array):
@@ -84,7 +84,7 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
 
 def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
-    """A mask (H, W) uint8 of an image, 255 inside. Raises InputError, which begins with `what`, if it is none."""
+    """The mask (H, W) uint8 of an image, 255 inside. Raises InputError, which begins with `what`, if it is invalid."""
     if mask is None:
         return None
     array = np.asarray(mask)
@@ -97,7 +97,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 
 def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
-    """The camera of an image, in float32. Raises InputError, which begins with `what`, if it is none."""
+    """The camera of an image, in float32. Raises InputError, which begins with `what`, if it is invalid."""
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
     to_world, focal, centre, distortion = (
@@ -118,7 +118,7 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
 
 
 def light_of(light: object, what: str) -> Light | None:
-    """A light, in float32. Raises InputError, which begins with `what`, if it is none."""
+    """A light, in float32 precision. Raises InputError, which begins with `what`, if it is invalid."""
     if light is None:
         return None
     if not isinstance(light, Light) or light.kind not in ("point", "directional"):
@@ -144,7 +144,7 @@ def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
-    """Names of photographs, by default 000, 001, …. Raises InputError for names that no files can have."""
+    """The names of photographs; None: 000, 001, …. Raises InputError if one is no valid file name or occurs twice."""
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
     for k, name in enumerate(one_each(names, count, "names")):
@@ -156,7 +156,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 
 
 def room_of(room: ArrayLike) -> np.ndarray:
-    """Harmonics (n, 3) of a room's light, in the world, as (BASIS, 3). Raises InputError for another number."""
+    """Spherical harmonics (n, 3) of a room's light, with zeros up to (BASIS, 3). Raises InputError for a wrong n."""
     array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
@@ -170,7 +170,7 @@ def sides(image: np.ndarray) -> str:
 
 
 def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
-    """The files that a photograph gets beside its scene file, relative to that: float32 as EXR, all else as PNG."""
+    """The files of a photograph, relative to its scene file: float32 as EXR, everything else as PNG."""
     suffix = "exr" if image.dtype == np.float32 else "png"
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
                    for folder, there in (("masks", masked), ("valid", valid)))  # fmt: skip
@@ -181,7 +181,7 @@ def scene_xml(
     shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
     room: ArrayLike | None,
 ) -> bytes:  # fmt: skip
-    """The scene file of `Capture.from_arrays`, by these files. Raises InputError, which names the argument."""
+    """The content of the scene file for `Capture.from_arrays`. Raises InputError for an invalid argument."""
     middle = None if center is None else numbers(center, (3,), "center")
     reach = None if radius is None else float(numbers(radius, (), "radius"))
     if reach is not None and not reach > 0:
@@ -193,7 +193,7 @@ def scene_xml(
 
 
 def write_array(array: np.ndarray, file: Path) -> None:
-    """Write a photograph (H, W, 3) or a mask (H, W), and the folder of the file. Raises InputError if it cannot."""
+    """Write a photograph (H, W, 3) or a mask (H, W), and make the folder. Raises InputError if this fails."""
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
     write_image(array if array.ndim == 3 else array[..., None], file)

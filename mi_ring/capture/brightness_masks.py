@@ -1,4 +1,4 @@
-"""Masks by brightness, for photographs without masks in a dark room."""
+"""Masks by brightness, for photographs in a dark room without given masks."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,22 +14,22 @@ from mi_ring.images import box_filter
 
 
 def with_masks_by_brightness(capture: Capture) -> Capture:
-    """The capture with masks of what is brighter than the room, and their `threshold`; as it is if the room was lit.
+    """The capture with masks of pixels above `dark_threshold`; the same capture if the room was lit.
 
-    Such a mask shows the part of the object that the light reaches; the rest may be as dark as the room.
+    Such a mask contains the lit part of the object. Its shadowed part may be as dark as the room.
     """
     threshold = dark_threshold(capture)
     if threshold is None:
         return capture
     found = capture.masks.replaced({k: partial(bright, capture, k, threshold) for k in range(len(capture))})
     largest = [pieces(mask > 0)[1].max() / mask.size for mask in found]
-    few = 0.02 * np.median(largest)  # hot pixels: the light did not reach the object
+    few = 0.02 * np.median(largest)  # such a mask has hot pixels only: the light did not reach the object
     masks = found.replaced({k: None for k, share in enumerate(largest) if share <= few})
     return replace(capture, threshold=threshold, masks=masks)
 
 
 def dark_threshold(capture: Capture) -> float | None:
-    """Radiance from which a pixel is brighter than the dark room behind the object; None if the room was lit."""
+    """The radiance above which a pixel is not the dark room; None if the room was lit."""
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
@@ -38,7 +38,7 @@ def dark_threshold(capture: Capture) -> float | None:
     split = float(np.exp(threshold_otsu(np.log(np.maximum(values, floor)))))
     dark, bright = values[values <= split], values[values > split]
     border = np.concatenate([np.concatenate([i[0], i[-1], i[:, 0], i[:, -1]]) for i in some])
-    # The noise of the dark is measured where nothing bright is near.
+    # Measure the noise in the dark, away from bright pixels.
     apart = [image[scipy.ndimage.maximum_filter(image, 7) <= split] for image in some]
     if not sum(map(len, apart)) or np.median(dark) > 0.05 * np.median(bright) or (border > split).mean() > 0.2:
         return None
@@ -47,13 +47,13 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """Mask (H, W) uint8, 0 or 255: pixels above the threshold, without pieces below 1 % of the largest one's size."""
+    """Mask (H, W) uint8, 0 or 255: pixels above the threshold, in pieces of at least 1 % of the largest one."""
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The connected pieces of a mask (H, W) bool: their numbers (H, W), 0 outside, and how many pixels each has."""
+    """Connected components of a mask (...) bool: labels (...), 0 outside, and the size of each; 0 for label 0."""
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
@@ -61,12 +61,12 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """`brightness` of about 256 × 256 pixels, the means of blocks."""
+    """`brightness`, reduced by block means so that the shorter side has 256 pixels or a little more."""
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 
 
 def brightness(capture: Capture, k: int) -> np.ndarray:
-    """Radiance (H, W) of the brightest colour of each pixel."""
+    """Radiance (H, W) of the brightest channel."""
     image = capture.images[k]
     return decode(image, is_linear(capture.shots[k].encoding, image), 1.0)[0].max(-1)

@@ -30,9 +30,9 @@ from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import llvm
 from mi_ring.system.files import write_file
 
-SOME, COARSE = 50, 128  #: photographs, and pixels across each, by which brightness is estimated
-ALBEDO = 0.5  #: of an object, where nothing says how much it reflects
-LIT = 0.01  #: brightness of the background, in that of the object, from which a room is lit
+SOME, COARSE = 50, 128  #: number of photographs, and their reduced width [px], for estimates of brightness
+ALBEDO = 0.5  #: assumed for the object if lights are unknown
+LIT = 0.01  #: a room is lit if the background is brighter than this [brightness of the object]
 
 
 def require_variant(what: str | Path) -> None:
@@ -44,24 +44,24 @@ def require_variant(what: str | Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photographs with their masks, cameras and lights, and the scene that they show: all that a fit starts from.
+    """Photographs with their masks, cameras and lights, and the scene that they show: the input of a fit.
 
-    `mi_ring.load_capture` reads one from a scene file, `from_arrays` makes one without any file. It never changes;
-    `dataclasses.replace` makes another one with changed fields, for instance with other `shots`.
+    `mi_ring.load_capture` reads one from a scene file, `from_arrays` makes one from arrays. It is immutable; use
+    `dataclasses.replace` for one with changed fields, for instance other `shots`.
     """
 
-    path: Path  #: the scene file; of a capture from arrays its name
+    path: Path  #: the scene file; for a capture from arrays its name
     xml: bytes  #: content of the scene file
     scene: mi.Scene
     shape: Any  #: the `shapenet`
     shots: tuple[Shot, ...]  #: the photographs
-    room: np.ndarray | None = None  #: light of the room, as `Photographs` have it; None if it is dark
+    room: np.ndarray | None = None  #: light of the room, see `Photographs`; None if it is dark
     shadows: bool = True  #: may the object cast shadows on itself?
     images: Pixels = field(default_factory=Pixels)  #: encoded pixels (H, W, 3) uint8, uint16 or float32; see `observe`
     masks: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 background, 255 object
     valid: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 where the photograph shows nothing
-    threshold: float | None = None  #: radiance by which masks were found in the photographs; None if they were given
-    #: Visual hulls by what they are made of. All captures that are made of this one by `replace` share them.
+    threshold: float | None = None  #: radiance above which pixels are in masks by brightness; None for given masks
+    #: Cache of visual hulls, by masks and cameras. Captures that `replace` makes of this one share it.
     hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
     _observed: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
 
@@ -73,7 +73,7 @@ class Capture:
         center: ArrayLike | None = None, radius: float | None = None, room: ArrayLike | None = None,
         encoding: Encoding = "auto", saturation: float = 1.0, calibrated: bool = False, name: str = "capture",
     ) -> "Capture":  # fmt: skip
-        """A capture of photographs in arrays, without any file. The object is fitted with `cooktorrance`. ::
+        """A capture of photographs in arrays, without files. The object's BSDF is `cooktorrance`. ::
 
             camera = mi_ring.Camera(to_world, focal, centre, (width, height))
             light = mi_ring.Light("point", position, intensity)
@@ -84,20 +84,19 @@ class Capture:
         from which a pixel is clipped. Arrays are not copied.
 
         `masks`, `valid`: N arrays (H, W) of bool or of uint8 from 0 to 255, or None for a photograph without one. In a
-        mask 255 is the object; where `valid` is 0 the photograph shows nothing. Default: none.
+        mask, 255 is the object. Where `valid` is 0, a pixel is ignored. Default: none.
 
         `cameras`: N `Camera`, whose `size` is that of the image. `lights`: N `Light`, each for its own photograph; None
-        is a point light of intensity 1 at the camera. Lengths are in the units of the scene.
+        is a point light of intensity 1 at the camera. Lengths are in scene units.
 
-        `names`: N different names of photographs. Default: 000, 001, …. `center` (3,), `radius`: sphere about the
-        object [scene units]. Default: estimated from masks or cameras. `room` (n, 3): light of the room that all
-        photographs share, R, G, B of its radiance in each of the first n real spherical harmonics in the axes of the
-        world; n is 1, 4, 9, 16 or 25. `calibrated`: are cameras and lights exact? `name`: begins the messages of
-        errors, and is the title of reports.
+        `names`: N different names of photographs. Default: 000, 001, …. `center` (3,), `radius`: sphere around the
+        object [scene units]. Default: estimated from masks or cameras. `room` (n, 3): light of the room in all
+        photographs, as R, G, B of radiance in the first n real spherical harmonics, in world axes; n is 1, 4, 9, 16 or
+        25. `calibrated`: are cameras and lights exact? `name`: of the capture, for error messages and reports.
 
-        Anything else that a scene file can say of a photograph is a field of a `Shot`: `replace` the capture's `shots`.
+        Everything else that a scene file can say about a photograph is a field of `Shot`: `replace` the `shots`.
 
-        Raises InputError, which names the argument, for whatever no fit could use.
+        Raises InputError, which names the argument, for input that cannot be fitted.
         """
         require_variant(name)
         pictures = arrays.images_of(images, encoding)
@@ -116,14 +115,14 @@ class Capture:
 
     @property
     def in_memory(self) -> bool:
-        """Are its photographs no files?"""
+        """Are the photographs in memory, without files?"""
         return any(shot.files.filename is None for shot in self.shots)
 
     def save(self, path: str | Path) -> "Capture":
-        """Write a capture from arrays as the scene file `path`, its photographs and masks beside it.
+        """Write a capture from arrays as a scene file, with its photographs and masks beside it.
 
-        Returns the capture of these files. Raises InputError if they cannot be written, or if the capture has a scene
-        file already.
+        Returns the capture with these files. Raises InputError if they cannot be written, or if the capture already has
+        a scene file.
         """
         path = Path(path)
         if not self.in_memory:
@@ -143,12 +142,12 @@ class Capture:
 
     @functools.cached_property
     def photographs(self) -> Photographs:
-        """Cameras, lights and room as the renderer takes them. Raises SceneError for lights that cannot be rendered."""
+        """Cameras, lights and room for the renderer. Raises SceneError for lights that cannot be rendered."""
         return Photographs.of(self.shots, self.room)
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Indices of the photographs of each size (width, height); one launch renders photographs of one size."""
+        """Indices of the photographs by their size (width, height), because one launch renders one size."""
         sizes = [shot.size for shot in self.shots]
         return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
@@ -162,7 +161,7 @@ class Capture:
 
     @functools.cached_property
     def names(self) -> list[str]:
-        """File names of the photographs, with their folders where equal names would not tell them apart."""
+        """File names of the photographs; with folders if file names are not unique."""
         files = [Path(os.path.abspath(shot.files.filename or shot.name)) for shot in self.shots]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
@@ -174,30 +173,30 @@ class Capture:
         return [file.relative_to(common).as_posix() for file in files]
 
     def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
-        """The photographs of these indices alone."""
+        """A capture of the photographs with these indices."""
         pixels = {name: getattr(self, name).part(index) for name in ("images", "masks", "valid") if self.images}
         return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
-        """The same photographs, with cameras and lights in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+        """The capture after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,) of cameras and lights.
 
-        The rest of the scene (a room, a table, lamps) stays where it is: use it for small motions.
+        Use it for small motions: the rest of the scene (a room, a table, lamps) does not move.
         """
         return replace(self, shots=tuple(shot.moved(scale, rotation, shift) for shot in self.shots))
 
     def spread(self, most: int = 200) -> list[int]:
-        """Indices of at most so many photographs, evenly spread: enough to look at."""
+        """Indices of at most `most` photographs, evenly spaced."""
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Photographs `index` in groups of at most so many, each of one size: what one launch renders."""
+        """Groups of at most `most` photographs of `index`, each of one size, to render in one launch."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Photograph `k` alone, to be rendered `scale` times smaller."""
+        """Photograph `k`, to be rendered `scale` times smaller."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
@@ -228,10 +227,7 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """Do the photographs show more than the object, by their masks?
-
-        If so, the colours beside the object say nothing. In a black room they say that nothing is there.
-        """
+        """Is the background lit, by the masks? In a black room, black pixels show that no object is there."""
         shares = []
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
@@ -243,22 +239,22 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """The reflectance that makes a surface at `center` as bright as `exposure` under the photographs' lights.
+        """Rough reflectance of a surface at `center` (3,) whose radiance under the photographs' lights is `exposure`.
 
-        Its order of magnitude. That of `ALBEDO` where photographs have no light of their own.
+        That of `ALBEDO` if the photographs have no lights of their own.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:
-        """The mean direction (3,) that is up in the photographs; if they have none in common, up in the first."""
+        """Mean of the cameras' up directions (3,), unit length; that of the first camera if they cancel out."""
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
-        """The masks with their cameras, small, one for all photographs that share both; at most so many, evenly."""
+        """Reduced masks with their cameras, without duplicates; at most `most`, evenly spaced."""
         return [
             small_silhouette(Silhouette(
                 self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k],
@@ -267,7 +263,7 @@ class Capture:
         ]
 
     def _outlined(self, most: int | None) -> list[int]:
-        """Indices of the photographs of `silhouettes`."""
+        """Indices of the photographs that `silhouettes` uses."""
         once: dict[tuple, int] = {}
         for k, (mask, shot) in enumerate(zip(self.masks.readers, self.shots)):
             if mask is not None:
@@ -277,12 +273,12 @@ class Capture:
 
     @property
     def views(self) -> list[MaskedCamera]:
-        """What each photograph can show."""
+        """The camera of each photograph with its valid pixels."""
         return views_of(self.shots, self.valid)
 
     @property
     def hull(self) -> Hull | None:
-        """The visual hull of the masks; None without masks, or if they are seen from one side alone."""
+        """The visual hull of the masks; None without masks, or if all of them are from one side."""
         index, wrong = self._outlined(MAX_MASKS), 0.02 if self.whole else 0.25
         key = wrong, *((self.masks.readers[k], self.valid.readers[k], self.shots[k].camera.key) for k in index)
         if key not in self.hulls:
@@ -294,24 +290,28 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """Do masks show the whole object? Masks by brightness do not show what is in shadow."""
+        """Do masks contain the whole object? Masks by brightness lack its shadowed part."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """The file that photograph `k` has its mask from, for messages."""
+        """The file with the mask of photograph `k`, for messages."""
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Normalising sphere (center (3,), radius) [scene units]: from the XML, else the masks, else the cameras."""
+        """Centre (3,) and radius of the normalising sphere [scene units], from the XML, the masks or the cameras."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
-            middle, ball = sphere_of_masks(self.hull) if self.hull else sphere_of_cameras(self)
+            if self.hull:
+                middle, ball = self.hull.ball()
+                ball *= 1.3  # a fit starts from this sphere, and shrinking is faster than growing limbs
+            else:
+                middle, ball = sphere_of_cameras(self)
             center, radius = middle if center is None else center, ball if radius is None else radius
         return center, radius
 
 
 def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
-    """What photographs can show that have these masks of valid pixels, which are made small."""
+    """The cameras of photographs with their valid pixels, both reduced to at most `MAX_WIDTH`."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
@@ -320,17 +320,8 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
     return [MaskedCamera(shot.camera.shrunk(scale), mask) for shot, (mask, scale) in zip(shots, found, strict=True)]
 
 
-def sphere_of_masks(hull: Hull) -> tuple[np.ndarray, float]:
-    """Centre of the masks' visual hull and 1.3 times the radius of the ball of the same volume [scene units].
-
-    A start surface that is a little too large shrinks onto the object, which is faster than growing limbs.
-    """
-    center, radius = hull.ball()
-    return center, 1.3 * radius
-
-
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
-    """The point nearest to all optical axes, and half the radius of the ball there that every photograph holds."""
+    """The point nearest to all optical axes, and half the radius of the ball there that all photographs contain."""
     cameras = [shot.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])
     center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))

@@ -1,8 +1,7 @@
-"""Image files of a capture: their encoded pixels, and the linear radiance that these stand for."""
+"""Reads the image files of a capture, and decodes their pixels to linear radiance."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +10,6 @@ from mi_ring.foreign import reading
 from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
 from mi_ring.scene.shot import Encoding, Shot
-
-Read = TypeVar("Read")
 
 
 class LinearImage(NamedTuple):
@@ -30,10 +27,10 @@ class LinearImage(NamedTuple):
 def decode(
     image: np.ndarray | LinearImage, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (float32) of encoded pixels, and where they are clipped (bool); both of `image`'s shape.
+    """Linear radiance (float32) and clipped pixels (bool) of encoded pixels, both in the shape of `image`.
 
-    `linear`: are the pixels linear, not sRGB? A pixel is clipped from `saturation` on. `gamma` and `contrast` are those
-    of a `Response`, which is undone. Of a `LinearImage` nothing is to be undone.
+    `linear`: are the pixels linear, not sRGB? `saturation`: encoded value from which a pixel is clipped. `gamma` and
+    `contrast`: of the camera's `Response`, which is inverted. A `LinearImage` is returned as it is.
     """
     if isinstance(image, LinearImage):
         return image.rgb.astype(np.float32), image.clipped
@@ -50,7 +47,7 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Factors of radiance by lens and gain, (H, W, 3) or (3,), of a photograph `scale` times smaller; 1 if all are."""
+    """Vignetting times gain, (H, W, 3) or (3,), of a photograph `scale` times smaller; 1 if it has neither."""
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
@@ -59,70 +56,61 @@ def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
 
 
 def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
-    """The linear values that a photograph's camera records of radiance (H, W, 3), `scale` times smaller."""
+    """Linear values that a photograph's camera records for radiance (H, W, 3). It is `scale` times smaller."""
     curved = (radiance * shade(shot, scale)) ** shot.response.gamma
     return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 
 
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, C) of an image file, with all its bits: uint8, uint16 or float32.
+    """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    Raises InputError if there is no such file, if it is no image or not as large as the film of the photograph.
+    Raises InputError as `require_header` does, and if the pixels are damaged, infinite, NaN or too large.
     """
-    pixels = read_by(read_image, path, field, shot, scene)
-    require_size(pixels.shape[1::-1], path, field, shot)
+    require_header(path, field, shot, scene)
+    what = f'photograph "{shot.name}", {field}'
+    with reading(f"{path}: {what}", "an image"):
+        pixels = read_image(path)
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
-        what = f'photograph "{shot.name}", {field}'
         raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
-    """Raise InputError as `read_pixels` does, but read the header of the file alone."""
-    require_size(read_by(image_size, path, field, shot, scene), path, field, shot)
-
-
-def read_by(read: Callable[[Path], Read], path: Path, field: str, shot: Shot, scene: Path) -> Read:
-    """What `read` reads of a file. Raises InputError if there is none, or if it is no image."""
+    """Raise InputError if a file is missing, no image, or not as large as the film of its photograph."""
     what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
         raise InputError(f"{scene}: {what}: no such file: {path}")
     with reading(f"{path}: {what}", "an image"):
-        return read(path)
-
-
-def require_size(size: tuple[int, ...], path: Path, field: str, shot: Shot) -> None:
-    """Raise InputError unless a picture is as large as the film of its photograph."""
+        size = image_size(path)
     if size != shot.size:
-        found, expected = ("{} x {}".format(*size) for size in (size, shot.size))
-        what = f'photograph "{shot.name}", {field}'
-        raise InputError(f"{path}: {what}: is {found} pixels, the film says {expected}")
+        found, expected = ("{} x {}".format(*pixels) for pixels in (size, shot.size))
+        raise InputError(f"{path}: {what}: is {found} pixels, but the film says {expected}")
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph. If it has an `ambient` file, that is subtracted: they are float32."""
+    """Encoded pixels (H, W, 3) of a photograph. An `ambient` file is subtracted; the result is then float32."""
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
         return image
     if (shot.response.gamma, shot.response.contrast) != (1, 1):
-        raise InputError(f'{scene}: photograph "{shot.name}", ambient: cannot be subtracted where the camera has a '
-                         "curve; leave out gamma and contrast, or subtract it before")  # fmt: skip
+        raise InputError(f'{scene}: photograph "{shot.name}", ambient: cannot be subtracted if the camera has a curve; '
+                         "leave out gamma and contrast, or subtract it yourself")  # fmt: skip
     pictures = [image, read_colours(shot, "ambient", scene)]
     (lit, clipped), (ambient, too) = (decode(p, is_linear(shot.encoding, p), shot.saturation) for p in pictures)
     difference = lit - ambient  # noise about 0, negative values too
     if shot.encoding == "srgb":
         difference = linear_to_srgb(difference.clip(min=0))
-    # Where either is clipped nothing is known but that it is bright.
+    # If either is clipped, the difference is unknown: it counts as clipped.
     return np.where(clipped | too, np.float32(shot.saturation), difference).astype(np.float32)
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph's file; grey files have three equal colours, transparent is black."""
+    """Encoded pixels (H, W, 3) of a photograph's file. Grey is repeated; transparent pixels become black."""
     file = getattr(shot.files, field)
     pixels = read_pixels(file, field, shot, scene)
     if shot.encoding == "linear" and pixels.dtype == np.uint8:
-        raise InputError(f'{scene}: photograph "{shot.name}", encoding: is linear, but {file.name} has 8 '
-                         "bits, as sRGB has; leave it out, or give 16 bits or EXR if it is linear indeed")  # fmt: skip
+        raise InputError(f'{scene}: photograph "{shot.name}", encoding: is linear, but {file.name} has 8 bits, which '
+                         "is sRGB; leave it out, or give 16 bits or EXR if it is really linear")  # fmt: skip
     channels = pixels.shape[2]
     rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
     if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files hold colours times alpha already
@@ -134,14 +122,14 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
 
 
 def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
-    """Are encoded pixels linear radiance? If the encoding is `auto`, those of 8 bits are not and all others are."""
+    """Are encoded pixels linear radiance? With encoding `auto`, all but those of 8 bits are."""
     if isinstance(pixels, LinearImage):
         return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Mask (H, W) uint8 from the file of this `field`. If that is the photograph itself, its alpha channel."""
+    """Mask (H, W) uint8 from the file of this `field`; from the alpha channel if that is the photograph itself."""
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)
     if itself and pixels.shape[2] not in (2, 4):

@@ -1,31 +1,31 @@
-"""The object's outline in a photograph near where it must be: GrabCut ("GrabCut", Rother et al. 2004)."""
+"""Refines an approximate outline of the object in a photograph by GrabCut ("GrabCut", Rother et al. 2004)."""
 
 import cv2
 import numpy as np
 
 
 def disk(radius: float) -> np.ndarray:
-    """A structuring element."""
+    """A disk of this radius [px], at least 1, as a structuring element."""
     r = max(1, round(radius))
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
-def grown(coverage: np.ndarray, share: float) -> np.ndarray:
-    """Dilate a coverage (H, W) uint8, 0 or 1, by `share` times the square root of its area; erode it if negative."""
-    radius = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
-    return cv2.dilate(coverage, radius) if share > 0 else cv2.erode(coverage, radius)
+def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
+    """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of its area; a negative share erodes it."""
+    kernel = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
+    return cv2.dilate(coverage, kernel) if share > 0 else cv2.erode(coverage, kernel)
 
 
 def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
-    """(H, W) uint8, 1 the object, in a photograph (H, W, 3) uint8 sRGB, near its `coverage` (H, W) uint8, 0 or 1.
+    """Segment the object in a photograph (H, W, 3) uint8 sRGB: (H, W) uint8, 1 on the object.
 
-    `background` (H, W) bool: what surely is not the object. `band`: how far inside the coverage's outline, and half as
-    far again outside, is open, in units of the object's size.
+    `coverage` (H, W) uint8, 0 or 1: its approximate mask. `background` (H, W) bool: surely not the object. GrabCut
+    decides in a band: `band` inside the outline, and 1.5 times as far outside [square root of the mask's area].
     """
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
-    seed[grown(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
+    seed[dilate_by_share(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
     seed[coverage > 0] = cv2.GC_PR_FGD
-    seed[grown(coverage, -band) > 0] = cv2.GC_FGD
+    seed[dilate_by_share(coverage, -band) > 0] = cv2.GC_FGD
     seed[background] = cv2.GC_BGD
     if not {cv2.GC_FGD, cv2.GC_BGD} <= set(np.unique(seed)):
         return coverage & ~background

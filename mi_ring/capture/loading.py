@@ -1,4 +1,4 @@
-"""Reads scene files, and refuses at once what a fit could not use."""
+"""Reads scene files, and raises an InputError for anything that cannot be fitted."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -27,20 +27,18 @@ from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system.progress import progress
 
-MANY = 2**28  #: pixels of all photographs that are decoded at first; of more only the headers are read
+MANY = 2**28  #: if photographs have more pixels in total, at first only their headers are read
 
 
 def load_capture(
     path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True
 ) -> Capture:
-    """Read a scene file of photographs. Raises InputError, one line, for anything that a fit could not use.
+    """Read a scene file of photographs. Raises InputError for anything that cannot be fitted.
 
-    Without `images` only cameras and lights are read: enough to render. `masks`: "given" takes those of the scene;
-    "auto" does, too, and if there are none finds them by brightness, where the room was dark; "none" ignores those of
-    the scene and finds them by brightness.
-
-    `width`: photographs are made at most so wide [px], and cropped to the object if `crop`, as `reduced` does: enough
-    for a fit. By default they stay as they are.
+    `images`: if False, read only cameras and lights, to render. `masks`: "given": those of the scene; "auto": the same,
+    but by brightness if there are none and the room was dark; "none": by brightness, those of the scene are ignored.
+    `width`: reduce photographs to at most this width [px] and, if `crop`, to the object, by `reduced`. Default: keep
+    them as they are.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
@@ -65,8 +63,8 @@ def load_capture(
     for shot in shots:
         if FLATTEST * min(shot.size) < max(shot.size):
             size = "{} x {}".format(*shot.size)
-            raise InputError(f'{path}: photograph "{shot.name}", film: is {size} pixels; sides of more than '
-                             f"{FLATTEST} : 1 cannot be made smaller")  # fmt: skip
+            raise InputError(f'{path}: photograph "{shot.name}", film: is {size} pixels; the sides must be at most '
+                             f"{FLATTEST} : 1")  # fmt: skip
     pixels = Pixels(partial(read_photograph, shot, path) for shot in shots)
     given = masks_of(shots, "mask", path) if masks != "none" else Pixels([None] * len(shots))
     valid = masks_of(shots, "valid", path)
@@ -86,23 +84,23 @@ def load_capture(
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:
-    """Raise InputError if a file of a photograph cannot be decoded, by its header. `masks`: as for `load_capture`."""
+    """Raise InputError if the header of a photograph's file is wrong. `masks`: as for `load_capture`."""
     for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
             require_header(file, field, shot, scene)
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Check a scene file and the headers of its photographs. Raises InputError; what is wrong in pixels is not found.
+    """Check a scene file and the headers of its photographs, not their pixels. Raises InputError.
 
-    `masks`: as `load_capture` has it.
+    `masks`: as for `load_capture`.
     """
     for shot in load_capture(path, images=False).shots:
         require_headers(shot, path, masks)
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """The masks (H, W) of this field of photographs; those that share a file share its pixels."""
+    """The masks (H, W) in this field of photographs. Equal files share their pixels."""
     readers: dict[tuple, Reader] = {}
 
     def reader(shot: Shot) -> Reader | None:
@@ -114,7 +112,7 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError, which says what to give, if a path is no file, or is a photograph."""
+    """Raise InputError if a path is no file or a photograph; the message says what to give."""
     photographs = path.is_dir() or path.suffix.lower() in PLAIN + HEIF + RAW
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
@@ -124,7 +122,7 @@ def require_scene(path: Path) -> None:
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
-    """A scene file and its photographs, one or more. Raises InputError, one line, if it cannot be read."""
+    """The scene in a file and its photographs. Raises InputError if it cannot be read or has no photographs."""
     require_scene(path)
     try:
         require_xml(path)
@@ -149,7 +147,7 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 
 
 def require_xml(path: Path) -> None:
-    """Raise InputError for what Mitsuba alone can read, and for what it would silently place at the origin."""
+    """Raise InputError for invalid XML, and for a missing pose, which Mitsuba would silently place at the origin."""
     content = path.read_bytes()
     content.decode("utf-8")
     try:
@@ -160,21 +158,21 @@ def require_xml(path: Path) -> None:
     for sensor in root.iterfind(".//sensor[@type='photograph']"):
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:
-            raise InputError(f"{name}: to_world is missing; say where its camera is")
+            raise InputError(f"{name}: to_world is missing; give the pose of its camera")
         for light in sensor.findall("emitter[@type='point']"):
             if not {"position", "to_world"} & {child.get("name") for child in light}:
-                raise InputError(f"{name}: emitter: position is missing; say where its light is, or leave the emitter "
-                                 "out if that is at the camera")  # fmt: skip
+                raise InputError(f"{name}: emitter: position is missing; give it, or leave out the emitter if the "
+                                 "light is at the camera")  # fmt: skip
 
 
 def load_views(path: Path) -> list[MaskedCamera]:
-    """What each photograph of a scene file can show, by the file alone. Raises InputError if it cannot be read."""
+    """The cameras of a scene file with their valid pixels. Raises InputError if it cannot be read."""
     _, shots = open_scene(path)
     return views_of(shots, masks_of(shots, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:
-    """Recompute the vertex normals of meshes whose files have none: one thread sums them always in the same order."""
+    """Recompute the vertex normals of meshes whose files have none, so that they are the same in each process."""
     for shape in scene.shapes():
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
@@ -187,8 +185,8 @@ def recompute_normals(scene: mi.Scene) -> None:
 
 
 def reason(error: RuntimeError) -> str:
-    """The message of Mitsuba's parser, in one line."""
+    """The message of an error of Mitsuba's parser, in one line."""
     text = str(error).split("] ", 1)[-1]
-    if "Traceback" in text:  # one of our plugins refused: its message follows the name of the exception
+    if "Traceback" in text:  # of one of our plugins: the message follows the name of the exception
         text = text.split("Error: ", 1)[-1]
     return " ".join(text.split())

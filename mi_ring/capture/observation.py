@@ -1,4 +1,4 @@
-"""Photographs as a fit sees them: linear radiance, clipped pixels, masks."""
+"""The pixels of photographs for a fit: linear radiance, clipped pixels, masks."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -11,44 +11,45 @@ from mi_ring.capture.decoding import LinearImage, decode, is_linear, shade
 from mi_ring.images import box_filter
 from mi_ring.scene.shot import Shot
 
-#: Pixels of all photographs in an `ObservationCache`. A pixel takes up to 200 bytes: what is kept fragments the memory.
+#: Largest number of pixels in an `ObservationCache`, of about 20 bytes each.
 REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
-    """Photographs as a fit sees them, n of one size."""
+    """The pixels of n photographs of one size for a fit."""
 
     rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
-    clipped: Tensor  #: (n, H, W, 3) bool: the scene is at least this bright
+    clipped: Tensor  #: (n, H, W, 3) bool: the true radiance is at least this
     mask: Tensor  #: (n, H, W) the object's coverage in [0, 1]; 0 where there is no mask
     masked: Tensor  #: (n,) bool: which photographs have a mask
-    valid: Tensor | None  #: (n, H, W) bool: which pixels say something; the others are black and clipped. None: all do
+    valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """(n, H, W) bool: pixels that are wholly object by their mask, if they have one, and by a `coverage`."""
+        """(n, H, W) bool: pixels that only show the object, by the mask, if there is one, and by a `coverage`."""
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
 
     def to(self, device: torch.device) -> "Observation":
-        """The same on a device."""
+        """The same tensors on a device."""
         return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
 
     @classmethod
     def joined(cls, several: Sequence["Observation"]) -> "Observation":
-        """Several of photographs of one size as one."""
-        rgb, clipped, mask, masked, valid = zip(*several)
+        """Several observations of one size as one."""
+        *parts, valid = zip(*several)
+        rgb, clipped, mask, masked = map(torch.cat, parts)
         if all(v is None for v in valid):
-            return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), None)
-        shown = [torch.ones_like(m, dtype=torch.bool) if v is None else v for v, m in zip(valid, mask)]
-        return cls(torch.cat(rgb), torch.cat(clipped), torch.cat(mask), torch.cat(masked), torch.cat(shown))
+            return cls(rgb, clipped, mask, masked, None)
+        shown = [torch.ones_like(o.mask, dtype=torch.bool) if o.valid is None else o.valid for o in several]
+        return cls(rgb, clipped, mask, masked, torch.cat(shown))
 
 
 def observed(
     shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
-    """One photograph by its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
+    """The observation of one photograph, from its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
 
-    `mask`, `valid`: (H, W) uint8 as in its files, None where it has none.
+    `mask`, `valid`: (H, W) uint8 as in the files; None if it has none.
     """
     curve = shot.response.gamma, shot.response.contrast
     linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
@@ -58,7 +59,7 @@ def observed(
     if valid is not None:
         here = valid > 127
         linear = np.where(here[..., None], linear, 0)
-        clipped = clipped | ~here[..., None]  # nothing is known: the scene is at least this black
+        clipped = clipped | ~here[..., None]  # unknown: the radiance is at least 0
         shown = box_filter(torch.from_numpy(here).float()[..., None], scale)[None, ..., 0] == 1
     return Observation(
         box_filter(torch.from_numpy(linear), scale)[None],
@@ -70,22 +71,18 @@ def observed(
 
 
 class ObservationCache:
-    """Observations of single photographs, each at its last scale, as many as there is room for; none at scale 1."""
+    """Keeps observations of single photographs at their last scale, up to `REMEMBERED_PIXELS`; none at scale 1."""
 
     def __init__(self) -> None:
-        self.kept: dict[int, tuple[int, Observation]] = {}  # (scale, photograph) by index
-        self.pixels = 0  # of all that are kept
+        self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
-        """Photograph `k` at a scale; `observe` is called if it is not kept."""
-        if k in self.kept:
-            before, result = self.kept[k]
-            if before == scale:
-                return result
-            self.pixels -= self.kept.pop(k)[1].mask.numel()
+        """The observation of photograph `k` at a scale; `observe` makes it if it is not kept."""
+        if k in self.kept and self.kept[k][0] == scale:
+            return self.kept[k][1]
+        self.kept.pop(k, None)
         result = observe()
-        pixels = result.mask.numel()
-        if scale > 1 and self.pixels + pixels <= REMEMBERED_PIXELS:
+        pixels = sum(other.mask.numel() for _, other in self.kept.values())
+        if scale > 1 and pixels + result.mask.numel() <= REMEMBERED_PIXELS:
             self.kept[k] = scale, result
-            self.pixels += pixels
         return result

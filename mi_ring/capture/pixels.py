@@ -1,31 +1,31 @@
-"""Pixels of many files: read when they are asked for, and kept as long as there is room."""
+"""Pixels of many files, read on demand and cached."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-#: Bytes of decoded files that one `Pixels` keeps. What does not fit is read again each time.
+#: Largest cache of a `Pixels` [bytes]. Other files are read each time.
 KEPT = 2**28
 
 Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """Arrays by index, each as its reader gives it; None where there is no reader.
+    """A sequence of arrays, each read by its reader; None where there is no reader.
 
-    The same reader at several places gives one array to all of them. Its parts share what has been read so far. What
-    was read first is kept: a fit draws photographs at random, so that no other order is better.
+    Equal readers share one array, and parts share the cache. The cache keeps the arrays that are read first: a fit
+    draws photographs at random, so that no other rule is better.
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
-        """`kept`: what has been read by these readers so far."""
+        """`kept`: the cache, arrays by their readers."""
         self.readers = tuple(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """These arrays, which are in memory."""
+        """A sequence of arrays in memory."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -44,7 +44,7 @@ class Pixels(Sequence):
 
     @property
     def given(self) -> list[bool]:
-        """Which indices have an array; nothing is read."""
+        """Which indices have a reader."""
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
@@ -52,7 +52,7 @@ class Pixels(Sequence):
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
-        """The same with other readers at some indices."""
+        """The same sequence with other readers at some indices."""
         several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
         left = {*several}
         return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

@@ -24,7 +24,7 @@ from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import progress
 
 FORMAT = "1"  #: of the cache's files; another one makes them anew
-WIDTH = 1024  #: largest width of photographs for a fit [px]
+WIDTH = 512  #: to which photographs are reduced for check, and for fits that do not need more [px]
 HIGHEST = 1.5  #: largest height, in units of this width
 MARGIN = 0.06  #: around the object in a crop, as a share of its size
 WORTH_CROPPING = 0.8  #: a crop must be less wide or less high than this share of the photograph

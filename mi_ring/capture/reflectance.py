@@ -1,4 +1,4 @@
-"""Which parameters of a scene's BSDF BRDF-Net predicts: the paper's five, or those of any other Mitsuba BSDF."""
+"""Chooses the parameters of a scene's BSDF that BRDF-Net predicts: the paper's five, or those of any other BSDF."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -14,11 +14,11 @@ from mi_ring.scene.xml_elements import load_bsdf
 
 
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
-    """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the BSDF that reads them, as XML.
+    """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the XML of the BSDF that reads them.
 
-    `ranges`: lowest and highest value by the name of the parameter, as in the BSDF's own documentation; infinity where
-    there is no highest. Empty: those of the five parameters of `cooktorrance` that have no constant. Raises InputError,
-    which names the parameters that the BSDF has.
+    `ranges`: lowest and highest value by the parameter's name in the BSDF's documentation; infinity if there is no
+    highest value. Empty: the parameters of `cooktorrance` that are no constants. Raises InputError for parameters that
+    the BSDF does not have; the message names those that it has.
     """
     scene, bsdf = capture.path, capture.shape.bsdf()
     element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
@@ -27,7 +27,7 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
         if inner.tag == "ref" or inner.get("name") == "filename":
             raise InputError(f"{scene}: bsdf: <{inner.tag}> {inner.get('id') or inner.get('value')}: a fit takes BSDFs "
                              "without files and references; use constants")  # fmt: skip
-        inner.attrib.pop("id", None)  # else it would be there twice in scenes that have the BSDF by reference
+        inner.attrib.pop("id", None)  # the scene may contain it, too, if the shape refers to it
     textures = constant_values(bsdf)
     own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
     names = ", ".join([*textures, *own])
@@ -72,7 +72,7 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """The output of BRDF-Net for which the parameter is the mean of `value`; 0 if there is no highest value."""
+    """The output of BRDF-Net that gives the mean of `value`, by the inverse sigmoid; 0 if there is no highest value."""
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

@@ -1,4 +1,4 @@
-"""The XML of scene files: the one place that writes photographs, cameras and lights."""
+"""Writes and rewrites the XML of scene files: photographs, cameras, lights, the fitted object."""
 
 import math
 import os
@@ -20,20 +20,20 @@ from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
 
-#: Properties of plugins, Mitsuba's and ours, that name a file. The value of another property may look like a name.
+#: Properties of plugins that name a file. Values of other properties may look like file names.
 FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 
-#: Numbers of a photograph that a scene file only has where they are not the default: where a `Shot` has them.
+#: Optional numbers of a photograph: where a `Shot` has them, and their defaults, which are not written.
 OPTIONAL = {
     "gamma": ("response.gamma", 1.0), "contrast": ("response.contrast", 1.0), "falloff": ("falloff", 0.0),
     "vignetting": ("response.vignetting", 0.0), "distortion": ("camera.distortion", 0.0),
 }  # fmt: skip
-#: What a fit may refine of a photograph, beside its light: names in a scene file.
+#: Properties of a photograph, beside its light, that a fit may refine.
 REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """A whole photograph as XML. Its files are named as the shot has them: make them relative to the scene before."""
+    """A whole photograph as XML. The shot's file names must be relative to the scene file."""
     shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
@@ -65,11 +65,11 @@ def scene_element(
     photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
     ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
-    """A scene of photographs to be fitted: with `photometric`, and a `shapenet` with `cooktorrance`.
+    """A scene of photographs to fit, with the integrator `photometric` and a `shapenet` with `cooktorrance`.
 
-    `center` (3,), `radius`: of the normalising sphere [scene units]; `ground` (3,): a point on the table that the
-    object stands on; `up` (3,): the table's normal, or another direction that is up; `metres`: the length of a scene
-    unit. None where they are not known. `fresnel`: of `cooktorrance`.
+    `center` (3,), `radius`: of the normalising sphere [scene units]; `ground` (3,): a point on the table; `up` (3,):
+    the table's normal, or the up direction; `metres`: length of a scene unit [m]; None if unknown. `fresnel`: of
+    `cooktorrance`.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
@@ -89,7 +89,7 @@ def scene_element(
 
 
 def table_element(picture: str, square: np.ndarray) -> Element:
-    """A diffuse `table` with the picture of its albedo; `square` (4, 4): its to_world."""
+    """A diffuse `table` as XML. `picture`: file of its albedo; `square` (4, 4): its to_world."""
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)
     bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
@@ -118,9 +118,9 @@ def emitter_element(light: Light) -> Element:
 
 
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
-    """A camera as Mitsuba's `perspective`, without distortion. Points (n, 3) lie between its clipping planes.
+    """A camera without its distortion as Mitsuba's `perspective`. The clipping planes enclose the points (n, 3).
 
-    Its pixels are square: it has more or fewer rows where those of the camera are not.
+    Its pixels are square: if those of the camera are not, the number of rows is changed.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)
@@ -139,20 +139,20 @@ def perspective_element(camera: Camera, points: np.ndarray) -> Element:
 
 
 def add_pose(element: Element, to_world: np.ndarray) -> None:
-    """Give a sensor or a shape its `to_world` (4, 4)."""
+    """Add `to_world` (4, 4) to a sensor or shape."""
     transform = ElementTree.SubElement(element, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=numbers(to_world))
 
 
 def add_film(sensor: Element, width: int, height: int) -> None:
-    """Give a sensor a film of this size [px]."""
+    """Add a film of this size [px] to a sensor."""
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
 
 
 def numbers(values: ArrayLike) -> str:
-    """As XML has them."""
+    """Numbers as text for XML."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
@@ -160,11 +160,11 @@ def recalibrated_xml(
     scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
     lamps: Iterable[Light] | None = None,
 ) -> bytes:  # fmt: skip
-    """A scene file whose photographs have the cameras, lights and responses of `shots`, by name; unnamed ones in order.
+    """A scene file with the cameras, lights and responses of `shots`. Photographs without id are matched by order.
 
-    `room`: light of the room, as `mi_ring.rendering.spherical_harmonics` has it; `frames`: axes in which a `room` is
-    written even if it is black, by default those of the file's rooms; `lamps`: point lights and distant ones that light
-    all photographs, by default those of the file.
+    `room`: light of the room, see `mi_ring.rendering.spherical_harmonics`; `frames`: axes ("world", "camera") in which
+    a `room` is written even if it is black, by default those of the file's rooms; `lamps`: point and directional lights
+    of all photographs, by default those of the file.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -199,7 +199,7 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """A scene file of these photographs with other masks for some: files relative to it, by a photograph's index."""
+    """A scene file of these photographs with new `masks`: files relative to it, by the photograph's index."""
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
         if k in masks:
@@ -210,9 +210,9 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """The photographs of a scene file, each with its index in `shots`: by name; unnamed ones in order.
+    """The photographs of a scene file with their indices in `shots`, by name, or by order if they have no id.
 
-    Photographs that are not in `shots` are removed. Raises InputError if these have no names.
+    Photographs that are not in `shots` are removed from `root`. Raises InputError if ids to find them are missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}
@@ -222,17 +222,17 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
                 parent.remove(other)
         elements = root.findall(".//sensor[@type='photograph']")
     if len(elements) != len(shots):
-        raise InputError("scene file: a part of its photographs cannot be written, because they have no ids")
+        raise InputError("scene file: cannot be written with some of its photographs only, because these have no ids")
     return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """The light of a room (BASIS, 3) as XML: the part fixed in the world and the part fixed in the camera.
+    """The light of a room (BASIS, 3) as XML: the part fixed to the world and the part fixed to the camera.
 
-    A black part is left out, unless its axes are among `frames`.
+    A black part is left out, unless `frames` contains "world" or "camera", respectively.
     """
     world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
-    # Light that is the same from all sides can be written in either.
+    # Uniform light belongs to either part.
     if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
         world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[PER_FRAME:])])
     parts = {"world": world, "camera": camera}
@@ -240,7 +240,7 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """A `room` as XML: `harmonics` (PER_FRAME, 3), or fewer rows, in the axes of the world or of the camera."""
+    """A `room` as XML. `frame`: "world" or "camera"; `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes."""
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
@@ -250,7 +250,7 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:
-    """Rewrite names of files that are relative to the folder `source`: make them relative to another folder."""
+    """Rewrite file names that are relative to the folder `source`, so that they are relative to `folder`."""
     for element in root.iter("string"):
         if element.get("name") not in FILES:
             continue
@@ -260,9 +260,9 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """The scene file `path` with the fitted object and its `bsdf`, its names of files made relative to `folder`.
+    """The scene file `path` with the fitted object and its `bsdf` (XML). File names become relative to `folder`.
 
-    Raises InputError for a scene that cannot be rewritten, and for a shapenet that no fit can start from.
+    Raises InputError for a scene that cannot be rewritten, and for a shapenet that cannot be fitted.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
@@ -281,9 +281,9 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
-    """The shapenet's <bsdf>, or its <ref> to one, and the BSDF meant, in the XML of the scene file `path`.
+    """The shapenet's <bsdf> or <ref>, and the <bsdf> itself, in the XML of the scene file `path`.
 
-    Raises InputError if there is none, and where a part of the scene is in another file.
+    Raises InputError if there is none, or if a part of the scene is in another file.
     """
     for tag in ("include", "default", "path"):
         if root.find(f".//{tag}") is not None:

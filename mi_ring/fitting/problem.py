@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.reduction import reduced
+from mi_ring.capture.reduction import WIDTH, reduced
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, room_frames, with_lighting
@@ -37,7 +37,7 @@ class Problem:
     @classmethod
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
         """Raises InputError if no photographs are left to fit, or if the object is black in them."""
-        given, capture = capture, reduced(capture)
+        given, capture = capture, reduced(capture, max(WIDTH, *config.widths))
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
         as_lit, scene, environment = environment_as_harmonics(with_lighting(capture, lighting))

@@ -1,4 +1,4 @@
-"""Captures of other tools, one file a format, and the scene files that they become.
+"""Importers of other tools' captures, one file per format, and the writer of the scene files.
 
 May import: mitsuba, numpy, scipy, PIL, pycolmap, tyro; foreign, images, capture, rendering, scene, geometry, system.
 """

@@ -1,4 +1,4 @@
-"""Camera models of other tools: lenses as COLMAP describes them, and poses."""
+"""Camera models of other tools: lenses as COLMAP's models, and poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -55,33 +55,33 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Has the lens no distortion? Tested with rays: a fisheye without coefficients is no pinhole."""
+        """Has the lens no distortion? Tested with rays, because a fisheye without coefficients is no pinhole."""
         if self.model == "PINHOLE":
             return True
         rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
 
     def camera(self, pose: np.ndarray) -> Camera:
-        """The camera of the undistorted photograph; `pose` (4, 4) camera-to-world, OpenCV's axes."""
+        """The camera of the undistorted photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
-def pinhole(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
+def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
     """The lens of a calibration matrix (3, 3).
 
     `shift` [px] is added to the principal point: 0.5 if the tool puts the first pixel's centre at 0. Raises InputError,
-    about `what`, for a matrix with skew.
+    which begins with `what`, for a matrix with skew.
     """
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
     K = K / K[2, 2]
     if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
-        raise InputError(f"{what}: pixels are sheared (K[0][1] is {K[0, 1]:.4g}), which no photograph can be here; is "
-                         "the matrix transposed?")  # fmt: skip
+        raise InputError(f"{what}: has skew (K[0][1] is {K[0, 1]:.4g}), which is not supported; is the matrix "
+                         "transposed?")  # fmt: skip
     return Lens("PINHOLE", (size[0], size[1]), (K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift))
 
 
-def brown(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
+def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
     """A lens with OpenCV's distortion: radial k1, k2, k3 and tangential p1, p2; `intrinsics`: fx, fy, cx, cy [px]."""
     if not any((*k, *p)):
         return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))

@@ -13,7 +13,7 @@ from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import existing
 from mi_ring.system.optional import need
 
-#: Code that reads a model, for `require_readable`.
+#: Python code that reads a model, for `require_readable`.
 READ_MODEL = """
 import pycolmap
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL
@@ -25,7 +25,7 @@ pycolmap.Reconstruction(sys.argv[1])
 class Colmap(Photogrammetry):
     """COLMAP, text or binary. The light is beside the camera.
 
-    SRC is the folder of the model (cameras, images), or a folder that has the model in sparse/0 or sparse.
+    SRC is the folder of the model (cameras, images), or a folder with the model in sparse/0 or sparse.
     """
 
     @staticmethod

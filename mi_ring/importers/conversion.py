@@ -12,7 +12,7 @@ from mi_ring.system.progress import progress
 
 
 def write_scene(source: Source) -> list[Frame]:
-    """Write a source's scene file and changed images, all or nothing, or raise InputError. Returns the frames."""
+    """Write a source's scene file and changed images, and return the frames. After an InputError nothing is written."""
     frames = frames_of(source)
     if source.without_pose and not frames:
         raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")

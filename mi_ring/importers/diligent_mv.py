@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import camera_to_world, pinhole
+from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
 from mi_ring.importers.reading import chosen, entry, existing, image_size, load_mat, load_table
 
@@ -37,7 +37,7 @@ class DiligentMV(Source):
             t = entry(calibration, f"Tc_{view}", (3, 1), file)
             pose = camera_to_world(entry(calibration, f"Rc_{view}", (3, 3), file), t[:, 0])
             mask = existing(folder / "mask.png", "mask")
-            camera = pinhole(K, image_size(mask), 0.5, f"{file}: KK")
+            camera = pinhole_lens(K, image_size(mask), 0.5, f"{file}: KK")
             directions = load_table(folder / "light_directions.txt", 3)
             intensities = load_table(folder / "light_intensities.txt", 3)
             if len(directions) != len(intensities):

@@ -1,6 +1,7 @@
-"""The table of all formats, by their names in `mi_ring.convert`."""
+"""All formats, by their names in `mi_ring.convert`, and the detection of a folder's format."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +27,14 @@ FORMATS = {
 
 
 def detect(folder: Path) -> Source | None:
-    """The importer of the cameras in a folder of photographs, or else in the folder above it; None without cameras.
+    """The importer of the cameras in a folder of photographs, otherwise in its parent folder; None without cameras.
 
-    The first match counts: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's XML,
-    RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, then cameras.sfm, sfm.json,
-    sfm_data.json and other `*.sfm` with poses. Files of one kind are tried by name. The photographs are those in
-    `folder` if there are any; transforms.json names its own. The importer's `scene` does not exist yet.
+    The first match is taken, in this order: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's
+    XML, RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, cameras.sfm, sfm.json,
+    sfm_data.json, other `*.sfm` with poses. Files of one kind are sorted by name. The photographs are those in `folder`
+    if there are any, except that transforms.json names its own.
     """
     images = folder if list_images(folder) else None
-    places = (folder, folder.absolute().parent)
-    return next((source for place in places if (source := detect_in(place, images))), None)
-
-
-def detect_in(place: Path, images: Path | None) -> Source | None:
-    """As `detect`, for the cameras in one folder `place` and photographs in the folder `images`."""
-    scenes = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
 
     def has_pose(path: Path) -> bool:
         return "Rotation" in xmp_fields(load_xml(path))
@@ -48,26 +42,27 @@ def detect_in(place: Path, images: Path | None) -> Source | None:
     def has_poses(path: Path) -> bool:
         return isinstance(top := load_json(path), dict) and bool(top.get("poses") or top.get("extrinsics"))
 
-    candidates: list[tuple[type[Source], list[Path], Callable[[Path], Any]]] = [
-        (Colmap, [place], Colmap.model),
-        (Transforms, [place / "transforms.json"], Path.is_file),
-        (Metashape, sorted(place.glob("*.xml")), lambda path: find_chunk(load_xml(path)) is not None),
-        (RealityCapture, [place], lambda path: any(accepts(has_pose, file) for file in path.glob("*.xmp"))),
-        (RealityCapture, sorted(place.glob("*.csv")), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
-        (Llff, [place], lambda path: (path / "poses_bounds.npy").is_file()),
-        (Middlebury, sorted(place.glob("*_par.txt")), Path.exists),
-        (SfmData, [*scenes, *sorted(place.glob("*.sfm"))], has_poses),
-    ]
-    for importer, paths, check in candidates:
-        for path in paths:
-            if accepts(check, path):
+    for place in (folder, folder.absolute().parent):
+        scenes = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
+        candidates: list[tuple[type[Source], list[Path], Callable[[Path], Any]]] = [
+            (Colmap, [place], Colmap.model),
+            (Transforms, [place / "transforms.json"], Path.is_file),
+            (Metashape, sorted(place.glob("*.xml")), lambda path: find_chunk(load_xml(path)) is not None),
+            (RealityCapture, [place], lambda path: any(accepts(has_pose, file) for file in path.glob("*.xmp"))),
+            (RealityCapture, sorted(place.glob("*.csv")), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
+            (Llff, [place], lambda path: (path / "poses_bounds.npy").is_file()),
+            (Middlebury, sorted(place.glob("*_par.txt")), Path.exists),
+            (SfmData, [*scenes, *sorted(place.glob("*.sfm"))], has_poses),
+        ]
+        for importer, paths, check in candidates:
+            for path in filter(partial(accepts, check), paths):
                 options: dict[str, Any] = {} if importer is Transforms else {"images": images}
                 return importer(path, place / "scene.xml", **options)
     return None
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Does a file pass a check? Not if reading it raises InputError."""
+    """Does a file pass a check? It does not if reading it raises InputError."""
     try:
         return bool(check(path))
     except InputError:

@@ -1,4 +1,4 @@
-"""Frames, the output of all importers: a photograph with its camera and light each."""
+"""Frames, the output of all importers: photographs with their cameras and lights."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,12 +28,12 @@ class Frame:
     image: Path
     lens: Lens
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
-    mask: Path | None = None  #: of the photograph's size; equal to `image` if the alpha channel is the mask
+    mask: Path | None = None  #: as large as the photograph; equal to `image` if the alpha channel is the mask
     light: Light | None = None  #: None: a point light of intensity 1 at the camera
     saturation: float = 1.0  #: encoded value from which pixels are clipped (1 = full scale)
     encoding: Encoding = "auto"
     name: str = ""  #: in the scene; empty: the file's name without suffix
-    pixels: np.ndarray | None = None  #: (H, W, 3) float32, of an image that is not in a file of its own
+    pixels: np.ndarray | None = None  #: (H, W, 3) float32, if `image` is a stack of photographs
     fill_mask: bool = False  #: fill the holes in the mask
 
     @property
@@ -42,12 +42,12 @@ class Frame:
         return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """A point light of intensity `rgb`, `offset` from the camera in the camera's axes [scene units]."""
+        """A point light of intensity `rgb`. `offset`: from the camera, in the camera's axes [scene units]."""
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
 def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
-    """The file of this name, whatever the folders and the suffixes of both are; None if there is none."""
+    """The file with this name, in any folder and with any suffix; None if there is none."""
     name = PureWindowsPath(name).name
     stem = PureWindowsPath(name).stem
     found = [file for file in files if file.name == name or file.stem in (name, stem)]
@@ -56,33 +56,33 @@ def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
 
 @dataclass(frozen=True)
 class Source:
-    """What all formats have in common."""
+    """Base of all importers: the options of all formats."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
     """Data of the other tool: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
-    """Copy the photographs beside the scene file. Without it the scene refers to them where they are."""
+    """Copy the photographs beside the scene file. Without it the scene file refers to the originals."""
     encoding: Encoding = "auto"
     """How the photographs are encoded.
     auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
     Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
-    """The photographs to take; cameras of others are left out. Without it each camera must have its photograph."""
+    """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""
 
     def frames(self) -> Iterator[Frame]:
-        """The photographs that have a pose. Raises InputError for invalid data."""
+        """The photographs with a pose. Raises InputError for invalid data."""
         raise NotImplementedError
 
     @cached_property
     def without_pose(self) -> set[str]:
-        """Names of the photographs without a pose; complete after all `frames` were read."""
+        """Names of the photographs without a pose. It is complete when all `frames` have been read."""
         return set()
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """All frames of a source. Raises InputError for every failure of its reader."""
+    """All frames of a source. Any error of its reader becomes an InputError."""
     try:
         return list(source.frames())
     except InputError:
@@ -93,7 +93,7 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """As `require_cameras`; also raise InputError if there are no frames or a file's size is not that of its camera."""
+    """As `require_cameras`. Also raise InputError if there are no frames, or if sizes of file and camera differ."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)
@@ -101,7 +101,7 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
         for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
             if file and (size := image_size(file)) != frame.lens.size:
                 sizes = *size, *frame.lens.size
-                raise InputError("{}: {}: is {} x {} pixels, its camera {} x {}".format(file, kind, *sizes))
+                raise InputError("{}: {}: is {} x {} pixels, but its camera {} x {}".format(file, kind, *sizes))
 
 
 def require_cameras(frames: Sequence[Frame]) -> None:

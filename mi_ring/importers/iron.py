@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os.path import splitext
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import camera_to_world, pinhole
+from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.reading import first_file, image_size, load_json, matrix, with_suffix
 
@@ -22,10 +22,10 @@ class Iron(Source):
         cameras = load_json(path)
         if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
             raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
-        for key in sorted(cameras):  # the keys end in .png, the files perhaps not
+        for key in sorted(cameras):  # the keys end in .png, but the files may have another suffix
             image = with_suffix(path.parent / "image" / splitext(key)[0], f"{path}: {key}")
             K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
             to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)
             size = matrix(cameras[key].get("img_size", image_size(image)), (2,), f"{path}: {key}.img_size")
             pose = camera_to_world(to_camera[:3, :3], to_camera[:3, 3])
-            yield Frame(image, pinhole(K, size, 0.0, f"{path}: {key}.K"), pose)
+            yield Frame(image, pinhole_lens(K, size, 0.0, f"{path}: {key}.K"), pose)

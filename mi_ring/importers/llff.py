@@ -17,7 +17,8 @@ from mi_ring.importers.reading import existing, image_size, list_images, matrix
 class Llff(Photogrammetry):
     """LLFF, NeRF: poses_bounds.npy beside folders images, images_4, … The light is beside the camera.
 
-    SRC is the folder. The photographs are in its first such folder; sorted by name they belong to the poses in order.
+    SRC is the folder of poses_bounds.npy. The photographs are in the first folder of images; sorted by name, they have
+    the order of the poses.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
@@ -39,7 +40,7 @@ class Llff(Photogrammetry):
             height, width, focal = own[:, 4]
             size = image_size(image)
             if min(own[:, 4]) <= 0 or abs(size[0] / width * height - size[1]) > 2:  # reduced sizes are rounded
-                raise InputError(f"{image}: is {size[0]} x {size[1]} pixels, which is no scale of the {width:g} x "
+                raise InputError(f"{image}: is {size[0]} x {size[1]} pixels, not proportional to the {width:g} x "
                                  f"{height:g} of pose {k} in {path.name}")  # fmt: skip
             params = (focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
             yield image.name, Frame(image, Lens("PINHOLE", size, params), pose)

@@ -8,12 +8,12 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import moved_pose
-from mi_ring.importers.camera_models import Lens, brown
+from mi_ring.importers.camera_models import Lens, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_xml, matrix
 
-MAX_SKEW = 0.1  #: by which b2 may move any pixel [px]
+MAX_SKEW = 0.1  #: largest shift of a pixel by b2 [px]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Metashape(Photogrammetry):
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:
-    """The chunk of one of Metashape's XML files; None if it is another file."""
+    """The chunk in a Metashape XML file; None if it is another kind of file."""
     return root.find("chunk") if root.tag == "document" else None
 
 
@@ -66,7 +66,7 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """The numbers in a child, row by row, or a default. Raises InputError if they are invalid or missing."""
+    """The numbers (`shape`) in the text of a child. Raises InputError if invalid, or missing without `default`."""
     text = parent.findtext(name)
     if text is None and default is not None:
         return default
@@ -75,7 +75,7 @@ def numbers(
 
 
 def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.ndarray:
-    """A pose (4, 4) moved from the chunk's frame by its `transform`, parts of which may be missing."""
+    """A pose (4, 4), moved from the chunk's frame to the world by `transform`, whose parts may be missing."""
     rotation = numbers(transform, "rotation", (3, 3), what, np.eye(3))
     shift = numbers(transform, "translation", (3,), what, np.zeros(3))
     scale = numbers(transform, "scale", (1,), what, np.ones(1))[0]
@@ -85,7 +85,7 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """The calibration of a sensor; its formulas are in appendix D of Metashape's manual."""
+    """The lens of a sensor. The formulas are in appendix D of Metashape's manual."""
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
         calibration = sensor.find("calibration")
@@ -100,8 +100,7 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
         for name in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
     )
     if f > 0 and abs(b2) * height / 2 / f > MAX_SKEW:
-        raise InputError(f"{what}: b2: is {b2}, pixels are sheared, which no photograph can be here; optimize the "
-                         "cameras without b2")  # fmt: skip
+        raise InputError(f"{what}: b2: is {b2}, a skew, which is not supported; optimize the cameras without b2")
     if p3 or p4:
         raise InputError(f"{what}: {'p3' if p3 else 'p4'}: is {p3 or p4}; must be 0; optimize the cameras without it")
     intrinsics = (f + b1, f, width / 2 + cx, height / 2 + cy)
@@ -112,4 +111,4 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
         raise InputError(f"{what}: type: is {kind!r}; must be frame or fisheye")
     if k4:
         raise InputError(f"{what}: k4: is {k4}; only a fisheye may have one; optimize the cameras without k4")
-    return brown((width, height), intrinsics, (k1, k2, k3), (p2, p1))  # OpenCV's p1 and p2 are swapped
+    return opencv_lens((width, height), intrinsics, (k1, k2, k3), (p2, p1))  # OpenCV's p1 and p2 are swapped

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import camera_to_world, pinhole
+from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, load_lines, matrix
@@ -31,5 +31,5 @@ class Middlebury(Photogrammetry):
             values = matrix(numbers, (21,), f"{what}: K, R, t")
             K, R, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
             if image := self.photograph(name, what):
-                lens = pinhole(K, image_size(image), 0.5, what)  # pixels as in OpenCV
+                lens = pinhole_lens(K, image_size(image), 0.5, what)  # pixels as in OpenCV
                 yield image.name, Frame(image, lens, camera_to_world(R, t))

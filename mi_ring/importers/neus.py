@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import load_npy, load_npz
-from mi_ring.importers.camera_models import decompose_projection, pinhole
+from mi_ring.importers.camera_models import decompose_projection, pinhole_lens
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered_images
 
@@ -44,7 +44,7 @@ class Neus(Source):
             size = image_size(image) if pixels is None else pixels.shape[1::-1]
             what = f"{path}: world_mat_{k}"
             K, pose = decompose_projection(entry(cameras, f"world_mat_{k}", (4, 4), path)[:3], what)
-            frame = Frame(image, pinhole(K, size, 0.5, what), pose, masks.get(k), name=f"{k:03}", pixels=pixels)
+            frame = Frame(image, pinhole_lens(K, size, 0.5, what), pose, masks.get(k), name=f"{k:03}", pixels=pixels)
             if masks and not frame.mask:
                 raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
             if energies:

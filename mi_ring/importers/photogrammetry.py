@@ -21,19 +21,19 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(Source):
-    """Photographs with poses from photogrammetry. Each format implements `posed`."""
+    """Base of the photogrammetry formats. Each format implements `posed`."""
 
     images: Path | None = None
-    """Folder of the photographs. Without it: the nearest `images` beside or above SRC, else the folder of SRC."""
+    """Folder of the photographs. Without it: the nearest folder `images` beside or above SRC, or the folder of SRC."""
     masks: Path | None = None
     """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the light relative to the camera: right, down and forward [scene units]."""
     exif: bool = True
-    """Bring the photographs to one brightness by exposure time, ISO and aperture of their EXIF data."""
+    """Take different exposures into account, by exposure time, ISO and aperture in EXIF data."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs that have a pose, each with the name that its mask is named after."""
+        """The photographs with a pose, each after the name by which its mask is found."""
         raise NotImplementedError
 
     @property
@@ -49,7 +49,10 @@ class Photogrammetry(Source):
         return list_images(self.folder)
 
     def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, with any suffix; None if unwanted. Raises InputError if `folder` lacks it."""
+        """The photograph of this name, with any suffix. None if it is not in `photographs`.
+
+        Without `photographs`, raises InputError if it is not in `folder`.
+        """
         if self.photographs is not None:
             return find_by_name(name, self.photographs)
         if file := find_by_name(name, self.image_files):
@@ -78,7 +81,7 @@ class Photogrammetry(Source):
 
 
 def exif_exposure(path: Path) -> float | None:
-    """Exposure time · ISO / aperture² by EXIF; None if one is missing. Raises InputError if one is not positive."""
+    """`exposure_of` an image file. Raises InputError if it is not positive."""
     if path.suffix.lower() == ".exr":
         return None
     with reading(path, "image"), open_image(existing(path, "image")) as image:
@@ -92,7 +95,7 @@ def exif_exposure(path: Path) -> float | None:
 
 
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """As `exif_exposure`, from the Exif part of the data; None if a value is missing, NaN if one is no number."""
+    """Exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
     values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
     if not all(values):
         return None

@@ -1,4 +1,4 @@
-"""Readers of other tools' files. Raise InputError, one line, for everything that is not as expected."""
+"""Readers of other tools' files. Each raises InputError for a missing, damaged or unexpected file."""
 
 import json
 from collections.abc import Callable, Collection, Mapping
@@ -18,7 +18,7 @@ Content = TypeVar("Content")
 
 
 def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
-    """`read(path)`. Raises InputError if there is no such file or if it cannot be read as `what`."""
+    """The result of `read(path)`. Raises InputError if the file is missing or cannot be read as `what`."""
     with reading(path, what):
         return read(existing(path, what))
 
@@ -42,21 +42,21 @@ def has_alpha(path: Path) -> bool:
 
 
 def existing(path: Path, field: str) -> Path:
-    """The path. Raises InputError, about `field`, if there is no such file."""
+    """The path. Raises InputError, which names the `field`, if there is no such file."""
     if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
 
 
 def first_file(candidates: list[Path], field: str) -> Path:
-    """The first of these files that exists."""
+    """The first of these files that exists. Raises InputError, which names the `field`, if none exists."""
     if file := next(filter(is_file, candidates), None):
         return file
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def with_suffix(path: Path, field: str) -> Path:
-    """An image file whose name may lack its suffix."""
+    """The image file at `path`, or at `path` with one of `SUFFIXES` appended. Raises InputError if none exists."""
     candidates = [path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)]
     if file := next(filter(is_file, candidates), None):
         return file
@@ -64,26 +64,26 @@ def with_suffix(path: Path, field: str) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files in a folder, by name."""
+    """The image files in a folder, sorted by name."""
     return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """The image files in a folder by the number in their name, or in order if a name is no number."""
+    """The image files in a folder by number: their name, or their index if any name is no number."""
     files = list_images(folder)
     return {int(f.stem): f for f in files} if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:
-    """The wanted numbers, or all that are available, sorted. Raises InputError for a number that is not available."""
+    """The wanted numbers, sorted; all available ones if none is given. Raises InputError if one is not available."""
     for number in wanted:
         if number not in available:
-            raise InputError(f"{option}: {number}: not in {where}, which has {min(available)} to {max(available)}")
+            raise InputError(f"{option}: {number}: is not in {where}, which has {min(available)} to {max(available)}")
     return sorted(wanted or available)
 
 
 def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Finite numbers of this shape, as floats. Raises InputError, about `what`, for everything else."""
+    """Finite numbers of this shape, as floats. Raises InputError, which begins with `what`, for anything else."""
     try:
         array = np.array(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -98,12 +98,12 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
-    """An array of this shape in a .mat or .npz file."""
+    """The array `key`, of this shape, in a .mat or .npz file. Raises InputError if it is missing or wrong."""
     return matrix(arrays.get(key), shape, f"{path}: {key}")
 
 
 def load_mat(path: Path) -> dict:
-    """The variables in a MATLAB file. Another process reads it first, because damaged files crash scipy's reader."""
+    """The variables in a MATLAB file. A child process reads it first, because damaged files crash scipy's reader."""
     size = existing(path, "MATLAB file").stat().st_size
     require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
     return read_as(path, "MATLAB file", scipy.io.loadmat)
@@ -120,7 +120,7 @@ def load_xml(path: Path) -> ElementTree.Element:
 
 
 def load_lines(path: Path) -> list[str]:
-    """The lines of a text file that are not empty."""
+    """The lines of a text file without empty ones."""
     text = read_as(path, "text", lambda file: file.read_bytes().decode("utf-8-sig"))
     return [line for line in text.splitlines() if line.strip()]
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import Lens, brown, camera_to_world
+from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, list_images, load_lines, load_xml, matrix
@@ -19,7 +19,7 @@ XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")  #: columns of a table [scene units, degrees]
 TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")  #: coefficients of the distortion
 NUMBERS = {*POSE, "f", "px", "py", *TERMS}  #: columns that hold numbers
-#: Models of distortion, and how many of the coefficients each uses.
+#: Distortion models, and the number of coefficients that each uses.
 BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown4": 4, "brown3t2": 6, "brown4t2": 6}
 
 
@@ -51,8 +51,7 @@ class RealityCapture(Photogrammetry):
     def from_csv(self) -> Iterator[tuple[str, Frame]]:
         """The photographs in the rows of a CSV file."""
         columns, rows = read_csv(self.src)
-        missing = [name for name in ("name", *POSE, "f") if name not in columns]
-        if missing:
+        if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
                              "camera parameters")  # fmt: skip
         seen = set()
@@ -66,7 +65,7 @@ class RealityCapture(Photogrammetry):
                 continue
             seen.add(image)
             pose = np.eye(4)
-            # At zero angles the camera looks down with its upper side to y. The heading is clockwise, as on a compass.
+            # At zero angles the camera looks down and its top points to y. The heading is clockwise, as on a compass.
             angles = [-numbers["heading"], numbers["pitch"], numbers["roll"]]
             pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ OPENGL[:3, :3]
             pose[:3, 3] = [numbers[name] for name in POSE[:3]]
@@ -100,7 +99,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
-    """The attributes and elements of an XMP file that are in RealityCapture's namespace, by name."""
+    """The attributes and elements in RealityCapture's namespace of an XMP file, by name."""
     found: dict[str, str] = {}
     for element in root.iter():
         found |= {name: value for name, value in element.attrib.items() if name.startswith(XCR)}
@@ -110,7 +109,7 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Names of the columns, and rows, of a CSV file. Its first line may give the number of cameras."""
+    """Column names and rows of a CSV file. Its first line may be the number of cameras, which is skipped."""
     lines = [line for line in load_lines(path) if not line.startswith("#cameras")]
     try:
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines)]
@@ -122,8 +121,8 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
 def film_lens(image: Path, focal: float, centre: list[float], terms: list[float], what: str) -> Lens:
     """The lens of a photograph.
 
-    `focal`: focal length for film 36 mm wide; `centre`: principal point, from the middle of the photograph, as a share
-    of its longer side; `terms`: the coefficients `TERMS`.
+    `focal`: focal length for film 36 mm wide; `centre`: principal point relative to the middle of the photograph [its
+    longer side]; `terms`: the coefficients `TERMS`.
     """
     size = image_size(image)
     longer = max(size)
@@ -132,4 +131,4 @@ def film_lens(image: Path, focal: float, centre: list[float], terms: list[float]
         raise InputError(f"{what}: k4: is {k4}; must be 0; align with the distortion model Brown3 or Brown3 with "
                          "tangential2")  # fmt: skip
     intrinsics = (*[focal * longer / 36] * 2, *(side / 2 + longer * u for side, u in zip(size, centre)))
-    return brown(size, intrinsics, (k1, k2, k3), (t2, t1))  # OpenCV's p1 and p2 are swapped
+    return opencv_lens(size, intrinsics, (k1, k2, k3), (t2, t1))  # OpenCV's p1 and p2 are swapped

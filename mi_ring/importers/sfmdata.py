@@ -8,24 +8,24 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError, is_file
-from mi_ring.importers.camera_models import Lens, brown, camera_to_world
+from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_json, matrix
 
-#: Models of distortion, by both programs' names: how many coefficients each has. Of five, the last two are tangential.
+#: Number of coefficients of each distortion model, by both programs' names. Of five, the last two are tangential.
 MODELS = {
     "pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5, "fisheye4": 4,
     "fisheye": 4, "pinhole_radial_k1": 1, "pinhole_radial_k3": 3, "pinhole_brown_t2": 5,
 }  # fmt: skip
-COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields for the coefficients
+COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields of the coefficients
 
 
 @dataclass(frozen=True)
 class SfmData(Photogrammetry):
     """Meshroom's cameras.sfm or sfm.json, OpenMVG's sfm_data.json. The light is beside the camera.
 
-    SRC is the file. Photographs are where it says, or in --images under the same names.
+    SRC is the file. It names the photographs; if they were moved, give --images.
     """
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
@@ -51,17 +51,16 @@ class SfmData(Photogrammetry):
             transform = require_object(own.get("pose"), f"{what}: pose").get("transform")
             transform = require_object(transform, f"{what}: pose.transform")
             pose = np.eye(4)
-            # The file has the world-to-camera rotation column by column: read by rows it is camera-to-world.
+            # The file has the world-to-camera rotation by columns. Read by rows, it is the camera-to-world rotation.
             pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
             pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
             key = str(view.get("intrinsicId"))
-            if key not in intrinsics:
-                raise InputError(f"{what}: intrinsics {key!r}: there are none")
-            lens = alicevision_lens(intrinsics[key], version, f"{self.src}: intrinsic {key!r}")
+            intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
+            lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """The photographs of a scene of OpenMVG, which the library cereal writes: it names each type only once."""
+        """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
         for own in intrinsics.values():
@@ -81,21 +80,20 @@ class SfmData(Photogrammetry):
             R = matrix(pose.get("rotation"), (3, 3), f"{what}: extrinsics.rotation")
             center = matrix(pose.get("center"), (3,), f"{what}: extrinsics.center")
             key = str(view.get("id_intrinsic"))
-            if key not in intrinsics:
-                raise InputError(f"{what}: intrinsics {key!r}: there are none")
-            kind = types.get(type_number(intrinsics[key]["value"], self.src))
-            lens = openmvg_lens(pointed_to(intrinsics[key], what), kind, f"{self.src}: intrinsic {key!r}")
+            intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
+            kind = types.get(type_number(intrinsic["value"], self.src))
+            lens = openmvg_lens(pointed_to(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """A list in the file as a dictionary, by the entries' `key`; empty if there is no such list."""
+        """The entries of the list `name` in the file, by their field `key`; empty if there is no such list."""
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[tuple[str, Frame]]:
-        """The frame of a photograph, which may have been moved; nothing if the photograph is not wanted."""
+        """The frame of a photograph, which may have been moved; nothing if it is not in `photographs`."""
         path = self.src.parent / file
         own = path if is_file(path) and not self.images and self.photographs is None else self.photograph(file, what)
         if own:
@@ -103,7 +101,7 @@ class SfmData(Photogrammetry):
 
 
 def require_object(value: Any, what: str) -> dict:
-    """The value. Raises InputError if it is not an object of JSON."""
+    """The value. Raises InputError, which begins with `what`, if it is no JSON object."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
@@ -117,19 +115,19 @@ def file_name(view: dict, field: str, what: str) -> str:
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """The object behind one of cereal's pointers, with the fields of its base class."""
+    """The object in a smart pointer of cereal, with the fields of its base class."""
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
 
 
 def type_number(value: dict, path: Path) -> int:
-    """The number of a polymorphic type. Its highest bit only says that the name follows."""
+    """The number of a polymorphic type of cereal, without the highest bit, which says that a name follows."""
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
-    """A lens of AliceVision, whose pixel centres are integers. Its sfmDataIO/CHANGES.md lists what versions changed."""
+    """A lens of AliceVision, where pixel centres are integers. For the versions see its sfmDataIO/CHANGES.md."""
 
     def number(name: str, default: float | None = None) -> float:
         return float(matrix(own.get(name, default), (), f"{what}: {name}"))
@@ -156,7 +154,7 @@ def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
 
 
 def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
-    """A lens of OpenMVG, whose pixel centres are integers."""
+    """A lens of OpenMVG, where pixel centres are integers. `kind`: name of its polymorphic type."""
     focal = float(matrix(own.get("focal_length"), (), f"{what}: focal_length"))
     centre = matrix(own.get("principal_point"), (2,), f"{what}: principal_point") + 0.5
     size = matrix([own.get("width"), own.get("height")], (2,), f"{what}: width, height")
@@ -165,7 +163,10 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """A lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind`, whose coefficients may be missing."""
+    """A lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
+
+    `given`: its coefficients; 0 if they are missing.
+    """
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")
     count = MODELS[kind]
@@ -173,4 +174,4 @@ def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: st
     if kind.startswith("fisheye"):
         return Lens("OPENCV_FISHEYE", (size[0], size[1]), (*intrinsics, *terms))
     terms += [0.0] * (5 - count)
-    return brown(size, intrinsics, terms[:3], terms[3:])
+    return opencv_lens(size, intrinsics, terms[:3], terms[3:])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import Lens, brown
+from mi_ring.importers.camera_models import Lens, opencv_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source, find_by_name
 from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
 
@@ -61,7 +61,7 @@ class Transforms(Source):
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """The lens of one frame of transforms.json. `given`: the fields of the frame, completed by those of the file."""
+    """The lens of a frame of transforms.json. `given`: the fields of the file, replaced by those of the frame."""
 
     def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)
@@ -93,4 +93,4 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
         raise InputError(f"{where}.camera_model: is {model}; must be OPENCV, OPENCV_FISHEYE or PINHOLE")
     if k4:
         raise InputError(f"{where}.k4: is {k4}; OPENCV has no such term of distortion, must be 0")
-    return brown(size, (fx, fy, cx, cy), (k1, k2, k3), (p1, p2))
+    return opencv_lens(size, (fx, fy, cx, cy), (k1, k2, k3), (p1, p2))

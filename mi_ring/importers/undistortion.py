@@ -1,4 +1,4 @@
-"""Removes lens distortion from pictures."""
+"""Removes lens distortion from images."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -11,24 +11,24 @@ from mi_ring.importers.camera_models import Lens
 
 
 class Window(NamedTuple):
-    """A part of the undistorted picture, perhaps reduced."""
+    """A part of the undistorted photograph, at full size or reduced."""
 
-    left: int  #: of the first column [px of the picture]
-    top: int
-    width: int  #: after the reduction [px]
+    left: int  #: first column [px of the photograph]
+    top: int  #: first row [px of the photograph]
+    width: int  #: [px of the window]
     height: int
-    scale: int = 1  #: of the reduction: pixels of the picture along a pixel of the window
+    scale: int = 1  #: width of a pixel of the window [px of the photograph]
 
     @classmethod
     def whole(cls, lens: Lens, longest: int) -> "Window":
-        """The whole picture, reduced to `longest` pixels along at most."""
+        """The whole photograph, reduced so that its longer side has at most `longest` pixels."""
         scale = -(-max(lens.size) // longest)
         return cls(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Rows and columns (2, H, W) [px] of the window's pixels in the photograph; the first pixel's centre is 0."""
+    """Rows and columns (2, H, W) [px] in the photograph of the window's pixels; the first pixel's centre is 0."""
     (fx, fy), (cx, cy) = lens.focal, lens.centre
     left, top, width, height, scale = window
     x = (left + (np.arange(width) + 0.5) * scale - cx) / fx
@@ -40,12 +40,12 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
 def undistort(
     pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A picture (H, W, C) as a pinhole of the same size and intrinsics takes it, and does the source show it? (H, W)
+    """Undistort an image (H, W, C). Returns the pinhole image of equal intrinsics, and its valid pixels (H, W) bool.
 
-    Radiance is interpolated. Pixels that the source does not show are 0.
+    Linear radiance is interpolated. Pixels that the source does not show are 0 and not valid.
     `srgb`: are the first three channels sRGB-encoded? `saturation`: encoded value (1 = full scale) from which a pixel
-    is clipped; infinite for masks. A result with a clipped pixel in it is clipped, too: their mean would pass for
-    exact. `window`: the part to compute, of scale 1; by default all.
+    is clipped; infinite for masks. A result is clipped if any of the pixels that it interpolates is. `window`: the part
+    to compute, of scale 1; None: all.
     """
     positions = source_positions(lens, window or Window(0, 0, *lens.size))
     size = np.array(pixels.shape[:2])

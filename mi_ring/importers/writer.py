@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Hashable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
-    """Collects the files of a scene in a temporary folder; `finish` moves them to their places."""
+    """Collects the files of a scene in a temporary folder. `finish` moves them to their places."""
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
@@ -32,7 +33,7 @@ class Writer:
         scene.parent.mkdir(parents=True, exist_ok=True)
         self.staging = Path(tempfile.mkdtemp(prefix=f".{scene.stem}.", dir=scene.parent))
         self.files: list[Path] = []
-        self.shared: dict = {}  #: files that several photographs share, by folder and key
+        self.shared: dict = {}  #: relative paths of files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
         """Write a file by `write(path)`. Returns its final path."""
@@ -48,26 +49,26 @@ class Writer:
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """The path as the scene file names it."""
+        """The path relative to the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
         """Move all files to their places, then write the scene file.
 
-        Raises InputError if a place holds a different file, which may be a source. Equal files are fine: a run that was
-        interrupted here has left them.
+        Raises InputError if another file is in such a place, because it may be a source. An equal file is from an
+        interrupted run.
         """
         for file in self.files:
             place = self.folder / file
             if place.exists() and not filecmp.cmp(self.staging / file, place, shallow=False):
-                raise InputError(f"{place}: exists already and is another; remove it, or write elsewhere")
+                raise InputError(f"{place}: exists already, with other content; remove it, or write elsewhere")
         for file in self.files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self.staging / file, self.folder / file)
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove the temporary folder, and new folders that stayed empty."""
+        """Remove the temporary folder, and new folders that are empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
         for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
@@ -75,22 +76,18 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write the files of a frame that change, or all of them to `copy`. Other files stay where they are."""
-    straight = frame.lens.is_pinhole
+    """Write the changed files of a frame, or with `copy` all of its files. Returns the files for the scene file."""
+    straight, pixels = frame.lens.is_pinhole, frame.pixels
 
-    def place(folder: str, path: Path, pixels: np.ndarray | None) -> Path:
-        if pixels is not None:
-            return writer.image(f"{folder}/{name}", pixels)
-        if copy:
-            return writer.write(f"{folder}/{name}{path.suffix}", lambda file: shutil.copyfile(path, file))
-        return path
-
-    def place_once(folder: str, key: Hashable, path: Path, pixels: Callable[[], np.ndarray | None]) -> Path:
+    def place(folder: str, key: Hashable, path: Path, changed: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
-            writer.shared[folder, key] = place(folder, path, pixels())
-        return writer.relative(writer.shared[folder, key])
+            if (pixels := changed()) is not None:
+                path = writer.image(f"{folder}/{name}", pixels)
+            elif copy:
+                path = writer.write(f"{folder}/{name}{path.suffix}", partial(shutil.copyfile, path))
+            writer.shared[folder, key] = writer.relative(path)
+        return writer.shared[folder, key]
 
-    pixels = frame.pixels
     if pixels is None and (not straight or encoding == "linear"):
         pixels = pixels_of(frame.image)
         if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
@@ -103,8 +100,8 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         srgb = not is_linear(encoding, pixels)
         pixels, shown = undistort(pixels, frame.lens, srgb, frame.saturation)
         if not shown.all():
-            valid = place_once("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
-    image = writer.relative(place("images", frame.image, pixels))
+            valid = place("valid", frame.lens, Path(), lambda: np.uint8(255) * shown[..., None])
+    image = place("images", name, frame.image, lambda: pixels)
     file = frame.mask
     if file is None or file == frame.image:
         return Files(image, image if file else None, valid)
@@ -117,4 +114,4 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]
 
-    return Files(image, place_once("masks", (file, frame.lens), file, mask), valid)
+    return Files(image, place("masks", (file, frame.lens), file, mask), valid)

@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
-from mi_ring.capture.reduction import WIDTH
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
 from mi_ring.metrics.image_errors import SPP, compare_photographs
@@ -40,8 +39,8 @@ def evaluate(
     Undefined numbers are missing: the genus of an open surface, for instance.
     """
     run, mesh = Path(run), Path(mesh)
-    ring, capture = load_fit(run), load_capture(run / "scene.xml", width=WIDTH, crop=False)
-    unseen = novel and load_capture(novel, width=WIDTH, crop=False)
+    ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
+    unseen = novel and load_capture(novel, width=COMPARED, crop=False)
     truth_mesh, truth = load_true_mesh(mesh)
     guess_mesh, guess = load_true_mesh(run / "mesh.ply")
     diagonal, motion = truth_mesh.scale, {}

@@ -1,7 +1,7 @@
-"""Masks without user input: a first guess, then GrabCut in each photograph and a vote of all masks on voxels, in turn.
+"""Automatic masks: a first guess, then alternately GrabCut in each photograph and a vote of all masks on voxels.
 
-The vote keeps a voxel if most photographs that show it have it in their mask. So lamps, highlights and neighbours of
-the object drop out of single masks, and concavities are emptied that some masks fill, for instance with a shadow.
+A voxel stays if most photographs that show it have it in their mask. The vote removes lamps and highlights, which are
+in few masks. It also empties concavities that some masks fill, for instance with a shadow.
 """
 
 import itertools
@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from mi_ring.capture.brightness_masks import pieces
 from mi_ring.capture.grabcut import disk, grabcut, overlap
 from mi_ring.geometry.camera import nearest_point
 from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
@@ -26,7 +26,8 @@ MIN_AGREEMENT = 0.9  #: share of those that must have the voxel in their mask
 RESOLUTION = 96  #: voxels along an edge of the grid
 MIN_VOXELS = 30  #: of an object: a few voxels get a unanimous vote by chance
 CONVERGED = 0.995  #: overlap of the masks with those of the iteration before
-MAX_MISSING, OFFSET = 2.0, 0.01  #: an outlier misses more of the silhouette than this times the median, plus offset
+#: A mask is an outlier if the share of the silhouette that it misses is above MAX_MISSING · median + OFFSET.
+MAX_MISSING, OFFSET = 2.0, 0.01
 MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
@@ -34,13 +35,13 @@ class RefinementSettings(NamedTuple):
     """Settings of `refine_masks`."""
 
     agreement: float  #: share of the masks that must contain a voxel
-    band: float  #: width of the band around the silhouette that GrabCut decides, as a share of the object's size
-    iterations: int  #: at most
-    reject_outliers: bool = True  #: exclude masks from the vote that miss much more than the others?
+    band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
+    iterations: int  #: maximum number
+    reject_outliers: bool = True  #: leave incomplete masks out of the vote
 
 
 LOCATION = RefinementSettings(MIN_AGREEMENT, 0.04, 6, False)
-CONCAVITIES = RefinementSettings(0.96, 0.15, 2)  #: high agreement: a few photographs see through a shadowed concavity
+CONCAVITIES = RefinementSettings(0.96, 0.15, 2)  #: high agreement, because few photographs see through a concavity
 OUTLINES = RefinementSettings(0.96, 0.04, 2)
 
 
@@ -71,7 +72,7 @@ class VoxelObject:
 
 
 class VoxelGrid:
-    """A cube of voxels, `half_size` from `center` (3,) to each side, and the views that see it."""
+    """A cube of voxels around `center` (3,), with edges of 2 `half_size`, and the views that see it."""
 
     def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
@@ -87,7 +88,7 @@ class VoxelGrid:
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """A grid around the point that the cameras look at, as large as the median photograph shows."""
+        """A grid around the point that the cameras look at. It fills the median photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -96,12 +97,15 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
-        """A grid that is somewhat larger than an object."""
+        """A grid around an object, a little larger than the object."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """The largest piece of voxels in this share of the masks, or of the `voters`; None if it is too small."""
+        """The largest connected piece of the voxels that most masks contain; None if it is too small.
+
+        `agreement`: share of the masks that must contain a voxel. `voters`: which masks vote; None: all.
+        """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 
         def look(view: ReducedView, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,12 +117,10 @@ class VoxelGrid:
             shown += inside
             yes += within
         chosen = (yes >= agreement * shown) & (shown >= MIN_VISIBLE * len(self.views)) & self.allowed
-        pieces, _ = ndimage.label(chosen.reshape([RESOLUTION] * 3))
-        sizes = np.bincount(pieces.ravel())
-        sizes[0] = 0
+        labels, sizes = pieces(chosen.reshape([RESOLUTION] * 3))
         if sizes.max() < MIN_VOXELS:
             return None
-        return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), pieces == sizes.argmax())
+        return VoxelObject(self.center + self.axis[0], float(self.axis[1] - self.axis[0]), labels == sizes.argmax())
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
@@ -127,13 +129,13 @@ def empty_masks(views: Views) -> list[np.ndarray]:
 
 
 def bright_mask(view: ReducedView) -> np.ndarray:
-    """(H, W) uint8: 1 where log radiance is above Otsu's threshold, which is near the flash."""
+    """(H, W) uint8: 1 where log radiance is above Otsu's threshold: what is near the flash."""
     log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Which masks miss about as much of the common silhouette (H, W each) as the others? Lamps make them miss more."""
+    """Whether each mask is complete: it misses about as little of the common silhouette (H, W) as the other masks."""
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
         for view, mask, silhouette in zip(views, masks, silhouettes)
@@ -152,7 +154,7 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Masks outside `backgrounds`, from guesses, by votes and GrabCut in turn; None if the guesses disagree."""
+    """Refine guessed masks by the vote and GrabCut in turn; None if the guesses disagree. `backgrounds` stay out."""
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
         return grabcut(view.rgb, silhouette, ~view.valid | (background > 0), settings.band)
@@ -174,18 +176,18 @@ def refine_masks(
 
 
 def resize_mask(mask: np.ndarray, view: ReducedView) -> np.ndarray:
-    """A mask of another size, at the size of the view: (H, W) bool."""
+    """A mask (h, w) resized to the view: (H, W) bool."""
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) -> np.ndarray:
-    """(H, W) uint8: 1 where a mask and the common silhouette differ by more than a tolerance [px]: mostly shadows."""
+    """(H, W) uint8: 1 where a mask differs from the common silhouette by more than `tolerance` [px]; often a shadow."""
     wide, narrow = cv2.dilate(silhouette, disk(tolerance)), cv2.erode(silhouette, disk(tolerance))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 on pieces of the guess that touch the mask, such as a rod, which may hide the object or not."""
-    pieces, _ = ndimage.label((guess > 0) & (mask == 0))
-    touching = np.unique(pieces[cv2.dilate(mask, disk(2)) > 0])
-    return np.isin(pieces, touching[touching > 0]).astype(np.uint8)
+    """(H, W) uint8: 1 on pieces of the guess beside the mask that touch it, such as a rod that holds the object."""
+    labels, _ = pieces((guess > 0) & (mask == 0))
+    touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])
+    return np.isin(labels, touching[touching > 0]).astype(np.uint8)

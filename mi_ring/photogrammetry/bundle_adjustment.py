@@ -1,4 +1,4 @@
-"""Bundle adjustment of a model, a `pycolmap.Reconstruction`, with the corners of the printed sheet where it is seen."""
+"""Bundle adjustment of a model (`pycolmap.Reconstruction`), with the corners of the printed sheet as points."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -13,16 +13,16 @@ from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
 pycolmap = LazyPackage("pycolmap", "structure from motion")
-ROBUST = 0.5  #: residual beyond which an observation counts less [px]: highlights and shadows move with the flash
-DETERMINED = 1e-3  #: largest standard deviation of a principal point [picture's longer side]: long lenses leave it open
-CORNER_WEIGHT = 12  #: a corner of the sheet counts like so many features, because it is found more precisely
+ROBUST = 0.5  #: scale of the Cauchy loss [px]: highlights and shadows move with the flash and are outliers
+DETERMINED = 1e-3  #: largest standard deviation of a refined principal point [longer side of the photograph]
+CORNER_WEIGHT = 12  #: weight of a corner of the sheet, relative to a feature: it is found more precisely
 MAX_WORSE = 1.1  #: factor by which corners may increase the features' reprojection error
 CONVERGED = 1e-5  #: relative decrease of the error at which an adjustment ends
-ITERATIONS = 10  #: of the solver per call: pycolmap cannot be interrupted in a call
+ITERATIONS = 10  #: of the solver per call; a call of pycolmap cannot be interrupted
 
 
 def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
-    """The model after bundle adjustment. The sheet's corners take part unless the object was moved on the sheet."""
+    """The model after bundle adjustment. The sheet's corners are used unless they contradict the features."""
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
@@ -39,7 +39,7 @@ def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, prog
 
 
 def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections) -> list[int]:
-    """Add the sheet's corners to the points of a model, `CORNER_WEIGHT` times each. Returns the new points' ids."""
+    """Add each corner of the sheet to a model as `CORNER_WEIGHT` points. Returns the ids of these points."""
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
         if detection := detections.get(picture.name):
@@ -57,7 +57,7 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections)
 
 
 def robust_adjustment(model: Any) -> Iterator[None]:
-    """Adjust a model with a robust loss, and remove points that do not fit; yields before each call of the solver."""
+    """Adjust a model with a robust loss and remove outliers. Yields before each call of the solver."""
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
@@ -66,7 +66,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
-    """Options of a bundle adjustment with a robust loss, and its configuration with all of a model."""
+    """Options and configuration of a bundle adjustment of all images of a model, with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -79,7 +79,7 @@ def adjustment_problem(model: Any) -> tuple[Any, Any]:
 
 
 def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
-    """Run the solver so many times, or until it converges; yields before each call."""
+    """Call the solver until it converges, at most `calls` times. Yields before each call."""
     for _ in range(calls):
         yield
         summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -88,7 +88,7 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """The model with refined principal points, where the photographs determine them; other lenses keep theirs."""
+    """The model with refined principal points. A lens whose principal point is not well determined keeps its own."""
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -108,7 +108,7 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
 
 def is_determined(camera: Any, covariance: Any) -> bool:
-    """Is a camera's principal point accurate, by a `pycolmap.BACovariance` or None?"""
+    """Is a camera's principal point well determined? `covariance`: a `pycolmap.BACovariance`, or None if it failed."""
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
         return False
@@ -117,7 +117,7 @@ def is_determined(camera: Any, covariance: Any) -> bool:
 
 
 def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
-    """The images with a pose, their photographs, and how many times smaller than these they are."""
+    """The images with a pose, each with its photograph and the factor by which the photograph is larger."""
     by_file = {grey_file(picture): picture for picture in pictures}
     for image in [model.images[k] for k in model.reg_image_ids()]:
         camera, picture = model.cameras[image.camera_id], by_file[image.name]
@@ -125,7 +125,7 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """Lens and camera-to-world pose (4, 4) by the photograph's name, as `SparseModel` has them."""
+    """Lens and camera-to-world pose (4, 4) of each photograph with a pose, by its name."""
     cameras = {}
     for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mi_ring.capture.grabcut import grown
+from mi_ring.capture.grabcut import dilate_by_share
 from mi_ring.capture.scenefile import Element, photograph_element, table_element
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.camera_models import Lens
@@ -21,31 +21,32 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.system.machine import in_threads
 
-MARGIN = 0.06  #: around the object in a crop, as a share of its size
-#: The table's albedo: pixels along the photographs that it is taken from, half of its width in units of the cameras'
-#: distance, and texels across. Few suffice, because it lights the object only indirectly.
+MARGIN = 0.06  #: around the object in a crop [size of the object]
+#: The table's albedo lights the object only indirectly, so that low resolutions suffice: longer side of the photographs
+#: that it is estimated from [px], half of its width [distance of the cameras], and its width [texels].
 TABLE_PIXELS, TABLE_HALF_SIZE, TABLE_TEXELS = 600, 1.0, 256
-OBJECT, UNKNOWN = 255, 128  #: values of masks; 0 is the background
+OBJECT, UNKNOWN = 255, 128  #: values of masks; the background is 0
 
 
 @dataclass(frozen=True)
 class PosedPicture:
-    """A photograph with its calibration, from which it is written."""
+    """A photograph with its calibration."""
 
     picture: Picture
     lens: Lens
     pose: np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes [scene units]
-    mask: np.ndarray | None  #: (h, w) uint8 of the whole undistorted photograph, perhaps reduced
+    mask: np.ndarray | None  #: (h, w) uint8 of the whole undistorted photograph, full size or reduced
     light: Light
-    measured: bool = False  #: was the light's intensity measured with the sheet?
+    measured: bool = False  #: is the light's intensity calibrated with the sheet?
     falloff: float = 0.0  #: exponent of the flash's cone
     gamma: float = 1.0  #: exponent of the camera's response
 
 
 def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
-    """The part of each photograph around the object. `sizes`: (width, height) [px] of the photographs.
+    """The window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
 
-    Photographs of one size get crops of one size, so that they are rendered together. Without any mask nothing is cut.
+    Photographs of one size get windows of one size, so that they are rendered together. Without any mask the window is
+    the whole photograph.
     """
     bounds = [None if mask is None else mask_bounds(mask, size) for mask, size in zip(masks, sizes)]
     windows = []
@@ -60,7 +61,7 @@ def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, 
 
 
 def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> Element:
-    """Write the files of a photograph. Returns its element of the scene file."""
+    """Write a photograph's crop and masks. Returns its XML element for the scene file."""
     picture = posed.picture
     pixels = picture.pixels[..., :3]
     left, top, width, height = window[:4]
@@ -90,18 +91,18 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
 def write_table(
     writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: FlashCalibration
 ) -> list[Element]:
-    """Write the table's albedo around `center` (3,). Returns its element of the scene file; none if it is not seen."""
+    """Write the table's albedo around `center` (3,). Returns its XML element, or [] if no photograph shows it."""
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
         view = reduce_photograph(posed.picture, posed.lens, posed.pose, Window.whole(posed.lens, TABLE_PIXELS))
-        # Views of raw photographs are scaled to their white. The light must be scaled alike.
+        # Views of raw photographs are divided by their white. So must the light be.
         white = posed.picture.white if posed.picture.encoding == "linear" else 1.0
         light = posed.light._replace(rgb=posed.light.rgb / white)
         posed.picture.close()
         if posed.mask is None:  # the object may be anywhere
             return view, np.ones(view.valid.shape, np.uint8), light
         mask = cv2.resize((posed.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
-        return view, grown(mask, MARGIN), light
+        return view, dilate_by_share(mask, MARGIN), light
 
     views, hidden, lights = zip(*in_threads(observe, pictures))
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
@@ -114,7 +115,7 @@ def write_table(
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
-    """(2, 2) lowest and highest column and row of the object in a photograph of this size [px]; None if it is empty."""
+    """(2, 2) lowest and highest column and row of the object [px of the photograph]; None if the mask is empty."""
     rows, columns = np.nonzero(mask == OBJECT)
     if not len(rows):
         return None
@@ -122,18 +123,17 @@ def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
-    """How many times smaller a mask is than its photograph, whose size is (width, height) [px]."""
+    """The factor by which a photograph of `size` (width, height) [px] is larger than its mask."""
     return round(size[0] / mask.shape[1])
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """A window of a mask at the full size of its photograph, (width, height): (H, W) of `OBJECT`, `UNKNOWN` and 0."""
-    scale = reduction(mask, size)
-    x, y = ((start + np.arange(length) + 0.5) / scale - 0.5
-            for start, length in zip(window[:2], window[2:4]))  # fmt: skip
-    columns, rows = (np.ascontiguousarray(grid, np.float32) for grid in np.broadcast_arrays(x, y[:, None]))
+    """A window of a mask, enlarged to the photograph's `size` (width, height): (H, W) of `OBJECT`, `UNKNOWN` and 0."""
+    scale, (left, top, width, height) = reduction(mask, size), window[:4]
+    to_mask = np.array([[1, 0, left + (1 - scale) / 2], [0, 1, top + (1 - scale) / 2]]) / scale
     is_object, is_unknown = (
-        cv2.remap((mask == value).astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        > 0.5 for value in (OBJECT, UNKNOWN)
+        cv2.warpAffine((mask == value).astype(np.float32), to_mask, (width, height),
+                       flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE) > 0.5
+        for value in (OBJECT, UNKNOWN)
     )  # fmt: skip
     return np.where(is_object, OBJECT, np.where(is_unknown, UNKNOWN, 0))

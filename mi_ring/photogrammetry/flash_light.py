@@ -1,4 +1,4 @@
-"""Calibrates the flash and the room's light by the brightness of the printed sheet's white paper in photographs."""
+"""Calibrates the flash, the room's light and the camera's response by the brightness of the sheet's white paper."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,29 +11,29 @@ from mi_ring.photogrammetry.marker_sheet import PaperSamples
 from mi_ring.rendering.photograph_lights import MIN_FLASH_COSINE
 
 PAPER_ALBEDO = 0.8
-#: Standard deviations of the priors. Of the flash's position across and along the lens's axis, in units of the median
-#: distance from the cameras to the paper; of its cone's exponent; of the room's light, relative to the flash; of the
-#: share of light that the object reflects; of the logarithm of the exponent of the camera's response.
+#: Standard deviations of the priors: the flash's position across and along the optical axis [median distance from
+#: camera to paper], its cone's exponent, the room's light relative to the flash, the object's reflectance, and the log
+#: exponent of the camera's response.
 OFFSET, DEPTH, CONE, ROOM, REFLECTED, RESPONSE = 0.1, 0.02, 1.0, 0.1, 1.0, 0.2
-EXIF, NO_EXIF = 0.3, 1.0  #: the same of log intensity in one photograph, with and without an exposure in EXIF data
+EXIF, NO_EXIF = 0.3, 1.0  #: the same for the log intensity of one photograph, with and without an exposure in EXIF
 ERROR = 0.1  #: standard deviation of a sample's log brightness; errors within a photograph are correlated
-ROBUST = 0.02  #: log brightness error beyond which a sample counts less: it is in a shadow or in a highlight
-MIN_RADIANCE = 1e-4  #: lower radiance counts as this
-FEW = 3  #: samples of a photograph that are too few for a median
-MAX_PHOTOGRAPHS = 60  #: that are fitted together
-#: Below these the effect is taken for none: room's light relative to the flash, cone's exponent, log response exponent.
+ROBUST = 0.02  #: scale of the robust loss [log brightness]: samples in shadows and highlights are outliers
+MIN_RADIANCE = 1e-4  #: lower radiance is replaced by this
+FEW = 3  #: with so few samples of a photograph, its median is not used
+MAX_PHOTOGRAPHS = 60  #: maximum number that are fitted together
+#: Smaller effects are set to zero: room's light relative to the flash, cone's exponent, log exponent of the response.
 NO_ROOM, NO_CONE, NO_RESPONSE = 0.003, 0.05, 0.06
-OTHER_MATERIAL = 0.1  #: difference of the margin from the squares [log intensity] from which it is not paper
+OTHER_MATERIAL = 0.1  #: the margin is not paper if its log intensity differs from that of the squares by more
 
 
 class ObjectSphere(NamedTuple):
-    """A sphere in place of the object, for the light that the object reflects to the paper and keeps from it."""
+    """A sphere that stands for the object: it reflects light to the paper and blocks the room's light."""
 
     center: np.ndarray  #: (3,)
     radius: float
 
     def reflected(self, points: np.ndarray, lights: np.ndarray) -> np.ndarray:
-        """Irradiance (n,) of `points` (n, 3) of the sheet by a white sphere under `lights` (n, 3) of intensity 1."""
+        """Irradiance (n,) of `points` (n, 3) of the sheet by a white sphere, lit by `lights` (n, 3) of intensity 1."""
         up, to_light = self.center - points, lights - self.center
         distance = np.linalg.norm(to_light, axis=1)
         phase = np.arccos(np.clip(-(up * to_light).sum(1) / (np.linalg.norm(up, axis=1) * distance), -1, 1))
@@ -41,32 +41,33 @@ class ObjectSphere(NamedTuple):
         return 2 / 3 * lit * self.form_factor(points) / distance**2
 
     def form_factor(self, points: np.ndarray) -> np.ndarray:
-        """Form factors (n,) of the sphere from `points` (n, 3) of the sheet."""
+        """Form factors (n,) of the sphere, seen from `points` (n, 3) of the sheet."""
         up = self.center - points
         distance = np.linalg.norm(up, axis=1)
         return ((self.radius / distance) ** 2 * np.maximum(up[:, 2], 0) / distance).clip(max=1)
 
 
 class FlashCalibration(NamedTuple):
-    """The flash, the room's light and the camera's response. Frame: the sheet's [mm]; cameras have OpenCV's axes."""
+    """The flash, the room's light and the camera's response, in the sheet's frame [mm]. Camera axes are OpenCV's."""
 
-    offset: np.ndarray  #: (3,) of the flash from the lens, in the camera's axes as most photographs are shown [mm]
-    falloff: float  #: exponent of the cone: intensity goes with this power of the cosine about the lens's axis
+    offset: np.ndarray  #: (3,) position of the flash relative to the lens, in the axes of `turn_with_cameras` [mm]
+    falloff: float  #: exponent of the cone: intensity is proportional to cosine ^ falloff, from the optical axis
     room: np.ndarray  #: (3,) irradiance of the sheet by the room's light, for a flash of intensity 1 [1/mm²]
-    gamma: float  #: exponent of the response: colours in the file go with this power of radiance
+    gamma: float  #: exponent of the response: linear values in the file are radiance ^ gamma
     power: np.ndarray  #: (3,) the flash's intensity at the median exposure
-    intensities: dict[str, np.ndarray]  #: (3,) by the photograph's name, with its exposure and white balance
+    intensities: dict[str, np.ndarray]  #: (3,) by the photograph's name; includes its exposure and white balance
 
     @property
     def ambient(self) -> np.ndarray:
-        """(3,) radiance of the room, taken for uniform, at the median exposure."""
+        """(3,) radiance of the room at the median exposure, if it is uniform."""
         return self.room / np.pi * self.power
 
 
 def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff: float) -> np.ndarray:
-    """Irradiance (n,) of surfaces by a flash of intensity 1, at `to_light` (n, 3) from them; 0 from behind.
+    """Irradiance (n,) of n surface points by a flash of intensity 1; 0 if the light is behind the surface.
 
-    `normal` (3,): of the surfaces; `forward` (3,) or (n, 3): axis of the flash; `falloff`: exponent of its cone.
+    `to_light` (n, 3): vectors from the points to the flash; `normal` (3,): of the surface; `forward` (3,) or (n, 3):
+    axis of the flash; `falloff`: exponent of its cone.
     """
     distance = np.linalg.norm(to_light, axis=1)
     cosine = np.maximum(-(to_light * forward).sum(1) / distance, MIN_FLASH_COSINE)
@@ -74,27 +75,27 @@ def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, fa
 
 
 class Observations(NamedTuple):
-    """n samples of white paper, and the camera of each."""
+    """n samples of white paper, each with its camera."""
 
     points: np.ndarray  #: (n, 3)
     colours: np.ndarray  #: (n, 3) logarithms
-    in_margin: np.ndarray  #: (n,) bool, as `PaperSamples` has it
+    in_margin: np.ndarray  #: (n,) bool, see `PaperSamples`
     poses: np.ndarray  #: (n, 4, 4) of the cameras
     axes: np.ndarray  #: (n, 3, 3) from the axes of the flash's offset to the world's
 
 
 class FlashParameters(NamedTuple):
-    """The unknowns that all photographs share, as `FlashCalibration` has them."""
+    """The unknowns that all photographs share; see `FlashCalibration`."""
 
     offset: np.ndarray
     falloff: float
     room: np.ndarray
-    reflectance: np.ndarray  #: (3,) share of its light that the object reflects
+    reflectance: np.ndarray  #: (3,) of the object
     gamma: float
     power: np.ndarray  #: logarithms
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
-        """(n, 3) log intensities of the flash, by each sample alone."""
+        """(n, 3) log intensities of the flash, each from one sample."""
         to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
         light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
         if sphere:
@@ -107,13 +108,13 @@ def calibrate_flash(
     papers: Mapping[str, PaperSamples], poses: Mapping[str, np.ndarray], axes: Mapping[str, np.ndarray],
     exposures: Mapping[str, float], offset: np.ndarray, sphere: ObjectSphere | None = None, curved: bool = True,
 ) -> FlashCalibration | None:  # fmt: skip
-    """The flash that explains the brightness of white paper; None if no photograph shows the paper.
+    """Calibrate the flash by the brightness of white paper; None if no photograph shows the paper.
 
-    By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), from those of most photographs to its own;
-    relative `exposures`, NaN if unknown. `offset` (3,): the flash, roughly; `curved`: may the response be non-linear?
+    By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), see `turn_with_cameras`; relative `exposures`,
+    NaN if unknown. `offset` (3,): approximate position of the flash. `curved`: also estimate the camera's response.
 
-    By robust least squares of log brightness with the priors above, for the `FlashParameters` and each photograph's
-    intensity. The margin is used only if it is as bright as the squares, the response only if it is far from linear.
+    Robust least squares of log brightness, with the priors above, estimates the `FlashParameters` and each photograph's
+    intensity. The margin is used only if it is as bright as the squares. A nearly linear response is taken as linear.
     """
     names = [n for n in papers if n in poses and not papers[n].in_margin.all() and poses[n][2, 3] > 0]
     if not names:
@@ -147,9 +148,10 @@ def fit_parameters(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], offset: np.ndarray,
     sphere: ObjectSphere | None, curved: bool,
 ) -> FlashParameters:  # fmt: skip
-    """The unknowns that all photographs share, from `MAX_PHOTOGRAPHS` of them.
+    """Fit the unknowns that all photographs share to at most `MAX_PHOTOGRAPHS` photographs.
 
-    `prior` (count,) each: log exposures of the photographs and their standard deviations; else as `calibrate_flash`.
+    `prior`: log exposures (count,) of the photographs, and their standard deviations (count,). For the others see
+    `calibrate_flash`.
     """
     some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
@@ -172,7 +174,7 @@ def fit_parameters(
         return np.concatenate([error.ravel(), own, x[: len(units)]])
 
     def loss(z: np.ndarray) -> np.ndarray:
-        """Loss of squared residuals and two derivatives: ``soft_l1`` for brightness, plain squares for priors."""
+        """Loss of squared residuals, and its first two derivatives: `soft_l1` for brightness, squares for priors."""
         brightness = np.arange(len(z)) < seen.colours.size
         root = np.sqrt(1 + z)
         return np.where(brightness, [2 * (root - 1), 1 / root, -0.5 / root**3], [z, 1 + 0 * z, 0 * z])
@@ -189,7 +191,7 @@ def fit_intensities(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], parameters: FlashParameters,
     sphere: ObjectSphere | None,
 ) -> np.ndarray:  # fmt: skip
-    """(count, 3) log intensities of the flash in each photograph, robust; `prior` as in `fit_parameters`."""
+    """(count, 3) robust log intensities of the flash in each photograph. `prior`: see `fit_parameters`."""
     result = []
     for seen, exposure, deviation in zip(observations, *prior):
         single, expected = parameters.intensities(seen, sphere), exposure + parameters.power

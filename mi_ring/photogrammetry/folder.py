@@ -21,7 +21,7 @@ from mi_ring.system import command
 from mi_ring.system.optional import need
 
 TRANSPARENT = (".png", ".tif", ".tiff")  #: suffixes of files that may have an alpha channel
-FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: EXIF orientations by LibRaw's numbers
+FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of orientations, and EXIF's
 MIN_PHOTOGRAPHS = 8
 
 
@@ -30,7 +30,7 @@ class Picture:
     """A photograph in a file."""
 
     path: Path
-    upright: bool = True  #: turn pixels as EXIF says? Cameras of other tools refer to the pixels as stored
+    upright: bool = True  #: turn the pixels by the EXIF orientation; cameras of other tools need them as stored
 
     @property
     def name(self) -> str:
@@ -44,7 +44,7 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """(H, W, C) uint8 sRGB, or uint16: linear if raw, else as in the file. Raises InputError if that fails."""
+        """(H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read."""
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
@@ -63,8 +63,7 @@ class Picture:
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """The result of `read` on the file, opened by LibRaw if it is raw, else by Pillow, which turns HEIF upright."""
-        register_heif(self.path)
+        """`read(file)` of the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
         raw = self.suffix in RAW
         with (
             reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
@@ -74,7 +73,7 @@ class Picture:
 
     @cached_property
     def camera_orientation(self) -> int:
-        """How the camera was held, as an EXIF orientation. The file's pixels may be turned already."""
+        """How the camera was held, as an EXIF orientation. In HEIF files the pixels are turned already."""
         if self.suffix in HEIF:
             return self.decode(lambda image: image.info.get("original_orientation") or 1)
         if self.suffix in RAW:
@@ -84,7 +83,7 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """How the file's pixels must still be turned, as an EXIF orientation; HEIF's reader has turned them."""
+        """The EXIF orientation by which stored pixels are turned: 1 for HEIF, whose reader has turned them."""
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property
@@ -94,9 +93,8 @@ class Picture:
 
     @cached_property
     def exif(self) -> Image.Exif:
-        """EXIF data; empty if there are none."""
+        """EXIF data; empty if there is none or it cannot be read."""
         try:
-            register_heif(self.path)
             with open_image(self.path) as image:
                 exif = image.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
@@ -105,7 +103,7 @@ class Picture:
             return Image.Exif()
 
     def exif_field(self, tag: int) -> Any:
-        """A field of the Exif part of the data; None if there is none."""
+        """The value of a tag in the Exif part of EXIF data; None if it is missing."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @cached_property
@@ -122,13 +120,14 @@ class Picture:
     @cached_property
     def size(self) -> tuple[int, int]:
         """(width, height) of `pixels` [px]."""
-        register_heif(self.path)
-        raw = self.suffix in RAW
-        size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight)) if raw else image_size(self.path)
+        if self.suffix in RAW:
+            size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight))
+        else:
+            size = image_size(self.path)
         return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
-        """(h, w) uint8 for features: means of whole blocks of pixels, `longest` pixels along at most."""
+        """(h, w) uint8: reduced by block means to at most `longest` pixels along the longer side, for features."""
         rgb = self.srgb()
         scale = -(-max(rgb.shape[:2]) // longest)
         height, width = (n // scale * scale for n in rgb.shape[:2])
@@ -145,7 +144,7 @@ class Picture:
 
     @cached_property
     def white(self) -> float:
-        """The value that raw data show as white, 1 = full scale: their brightness is arbitrary."""
+        """The value of raw pixels that is shown as white (1 = full scale), because their brightness is arbitrary."""
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def linear(self) -> np.ndarray:
@@ -155,10 +154,10 @@ class Picture:
         return (value if self.encoding == "linear" else srgb_to_linear(value))[rgb]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
-        """The user's mask, (H, W) uint8, 255 the object; None if this photograph has none.
+        """The user's mask (H, W) uint8, 255 on the object; None if this photograph has none.
 
-        `source`: "alpha" for the alpha channel, "rembg" for a mask by that package, else a folder of masks named after
-        the photographs. Raises InputError if the mask cannot be read or has another size.
+        `source`: "alpha" takes the alpha channel, "rembg" calls that package; otherwise a folder of masks, see
+        `mask_file`. Raises InputError if the mask cannot be read or has another size.
         """
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
@@ -170,7 +169,7 @@ class Picture:
             mask = Picture(file, self.upright).pixels[:, :, 0]
             if mask.shape[::-1] != self.size:
                 sizes = *mask.shape[::-1], *self.size
-                raise InputError("{}: is {} x {} pixels, its photograph {} x {}".format(file, *sizes))
+                raise InputError("{}: is {} x {} pixels, but its photograph {} x {}".format(file, *sizes))
         else:
             return None
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
@@ -185,21 +184,15 @@ class Picture:
         self.__dict__.pop("pixels", None)
 
 
-def register_heif(path: Path) -> None:
-    """Enable Pillow to open a file, if it is HEIF."""
-    if path.suffix.lower() in HEIF:
-        need("pillow_heif", f"{path}").register_heif_opener()
-
-
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
-    """The function of rembg that makes masks, with its network loaded."""
+    """rembg's function that makes masks, with its network loaded. Raises InputError if rembg is not installed."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """(3, 3) from the axes of pixels (x right, y down, z forward) to those after they are turned by an orientation."""
+    """(3, 3) from the axes (x right, y down, z forward) of stored pixels to those after a turn by an orientation."""
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
@@ -211,23 +204,23 @@ def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """A vector (3,) fixed to the camera, or columns (3, n), in the axes of each photograph, by its name.
+    """A vector that is fixed to the camera, in the axes of each photograph's pixels; by the photograph's name.
 
-    `vector` is in the axes of most photographs as they are shown.
+    `vector`: (3,), or (3, n) for n vectors, in the axes of upright photographs with the most frequent orientation.
     """
     usual, _ = Counter(picture.camera_orientation for picture in pictures).most_common(1)[0]
     return {p.name: p.axes @ orientation_axes(usual).T @ vector for p in pictures}
 
 
 def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
-    """The direction that is up in each photograph as shown (3,), in the axes of its pixels, by its name."""
+    """The up direction (3,) of each photograph when shown upright, in the axes of its pixels; by its name."""
     return {p.name: p.axes @ orientation_axes(p.camera_orientation).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
-    """The photographs in a folder, by name. `upright`: turn their pixels as EXIF says?
+    """The photographs in a folder, sorted by name. `upright`: see `Picture`.
 
-    Raises InputError for a missing folder, for names that cannot be used, and for too few or identical photographs.
+    Raises InputError if the folder is missing, if a name cannot be used, or if photographs are too few or identical.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "
@@ -240,13 +233,13 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
         command.require_utf8(str(path))
         if "$" in path.name:
             raise InputError(f"{path}: FOLDER: has a $ in its name, which scene files take for a parameter; rename it")
-        if path.stem not in found or kind in RAW:  # of a raw file and a JPEG, the raw one is linear
+        if path.stem not in found or kind in RAW:  # a raw file is linear: prefer it to a JPEG of the same name
             found[path.stem] = path
     if len(found) < MIN_PHOTOGRAPHS:
         raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({', '.join(PLAIN + HEIF)} or raw); at least "
                          f"{MIN_PHOTOGRAPHS} are needed, better 40, from all around")  # fmt: skip
     if "object" in found:
-        raise InputError(f'{found["object"]}: FOLDER: "object" is what the scene calls the surface; rename the file')
+        raise InputError(f'{found["object"]}: FOLDER: "object" is a name that scenes need for the surface; rename it')
     sizes = Counter(path.stat().st_size for path in found.values())
     copies = defaultdict(list)
     for path in found.values():
@@ -258,31 +251,31 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """The focal length for film 36 mm wide, by the first photograph with one in EXIF; None if there is none [mm]."""
+    """The first focal length for film 36 mm wide in EXIF data [mm]; None if no photograph has one."""
     values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
     return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """Files of the photographs without an exposure in EXIF; empty if all are without."""
+    """File names of the photographs without an exposure in EXIF data; empty if no photograph has one."""
     missing = [picture.path.name for picture in pictures if np.isnan(picture.exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """(N,) exposures by EXIF, relative to their median; `unknown` for photographs without one."""
+    """(N,) exposures by EXIF, relative to their median; the value `unknown` where EXIF has none."""
     exposures = np.array([picture.exposure for picture in pictures])
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 
 
 def without_flash(pictures: Sequence[Picture]) -> list[str]:
-    """Files of the photographs whose flash did not fire, by EXIF; empty unless it fired in most: it may be a torch."""
+    """File names of the photographs whose flash did not fire, by EXIF; empty unless it fired in most photographs."""
     fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
 def camera_names(pictures: Sequence[Picture]) -> dict[str, int]:
-    """The camera models in EXIF data, and how many photographs each has taken."""
+    """The number of photographs by each camera model in EXIF data."""
     return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

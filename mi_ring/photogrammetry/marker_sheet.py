@@ -1,4 +1,4 @@
-"""The printed sheet of markers: its page, its corners in photographs, and scale, cameras and white from them."""
+"""The printed sheet of ChArUco markers: its page, its corners and white paper in photographs, poses and scale."""
 
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -15,21 +15,21 @@ from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.system.optional import LazyPackage
 
 pycolmap = LazyPackage("pycolmap", "the sheet of markers")
-COLUMNS, ROWS = 9, 13  #: of squares; each white square has a marker of MARKER times its size in its middle
-SQUARE, MARKER = 20, 0.75  #: [mm] as printed
-DOTS = 14  #: per mm of the page: edges of squares, and of the markers' seven modules, fall on whole dots
+COLUMNS, ROWS = 9, 13  #: number of squares
+SQUARE, MARKER = 20, 0.75  #: side of a square as printed [mm]; side of the marker in a white square [squares]
+DOTS = 14  #: per mm of the page: edges of squares and of the markers' seven modules fall on whole dots
 PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}  #: [mm]
-NOTE = "Print at 100 %. Five squares must measure 100 mm; if not, give what one measures by --square-mm."
+NOTE = "Print at 100 %. Five squares must measure 100 mm; if not, give the length of one by --square-mm."
 
-LONGEST = 2000  #: pixels along the picture that markers are searched in, at most; corners are refined at full size
+LONGEST = 2000  #: longer side of the image in which markers are searched [px]; corners are refined at full size
 MIN_CORNERS = 6
-MAX_STRAY = 0.25  #: distance from where the other corners predict one, in squares, beyond which it is wrong
-MAX_RMS = 0.02  #: of the corners in space, as a share of the width that is seen, beyond which the sheet is refused
-MAX_ANGLE = 0.002  #: between a corner and its triangulated point [radians], beyond which a photograph's corner is wrong
-MIN_PARALLAX = 0.02  #: between the rays that a corner is triangulated from [radians]
-CLIPPED = 0.95  #: linear colour, 1 = full scale, from which paper may be overexposed
-#: Where paper is white, in squares from the first corner of a square: half way between the edges of the square and of
-#: its marker, one side after another; and in the page's margin left, right and above of the outermost whole squares.
+MAX_STRAY = 0.25  #: a corner is an outlier if it is farther from where the other corners predict it [squares]
+MAX_RMS = 0.02  #: largest rms error of the triangulated corners [width of the sheet that is seen]
+MAX_ANGLE = 0.002  #: an observation is an outlier if its ray is farther from the triangulated corner [radians]
+MIN_PARALLAX = 0.02  #: between the rays from which a corner is triangulated [radians]
+CLIPPED = 0.95  #: linear colour (1 = full scale) from which paper may be overexposed
+#: Where paper is white, relative to the first corner of a square [squares]: in a white square, half way between its
+#: edge and the marker, one side after another; in the margin, left of, right of and above the outermost squares.
 INNER = (1 - MARKER) / 4
 RIM = np.linspace(INNER, 1 - INNER, 9)[:, None] * [1, 0] + [0, INNER]
 RIMS = np.concatenate([RIM, RIM[:, ::-1], 1 - RIM, 1 - RIM[:, ::-1]])
@@ -58,7 +58,7 @@ class Similarity(NamedTuple):
     rotation: np.ndarray  #: (3, 3)
     shift: np.ndarray  #: (3,)
     rms: float  #: of the corners [mm]
-    corners: int  #: how many agree
+    corners: int  #: number that fit
 
 
 def charuco() -> cv2.aruco.CharucoBoard:
@@ -68,7 +68,7 @@ def charuco() -> cv2.aruco.CharucoBoard:
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """The sheet in black and white, true to scale at `DOTS` per mm, with a line that says what to measure."""
+    """The sheet to print, in black and white, with `DOTS` per mm and a line that says what to measure."""
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
     left, top = ((np.array(sheet.size) - size) // 2).tolist()
@@ -79,7 +79,7 @@ def page(paper: Literal["a4", "letter"]) -> Image.Image:
 
 
 class MarkerSheet:
-    """The sheet as printed, with squares of this size [mm]."""
+    """The printed sheet. `square`: side of its squares [mm]."""
 
     def __init__(self, square: float = SQUARE) -> None:
         self.square = square
@@ -116,7 +116,7 @@ class MarkerSheet:
         return SheetDetection(ids, points, pixels)
 
     def pitch(self, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Lengths (n,) of the shorter sides of the squares at corners (n, 3) with these pixels (n, 2) [px]."""
+        """(n,) shorter sides [px] of the squares at n corners, by their `points` (n, 3) and `pixels` (n, 2)."""
         plane, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 0.05 * np.ptp(pixels, 0).max())
         if plane is None:
             return np.zeros(len(points))
@@ -128,15 +128,15 @@ class MarkerSheet:
 
 
 def are_collinear(points: np.ndarray) -> bool:
-    """Are points (n, 3) all about on one line?"""
+    """Are points (n, 3) nearly on one line?"""
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(values[1] <= 0.01 * values[0])
 
 
 def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
-    """The lens of photographs of one size (width, height), their poses [mm] and rms errors [px], by the sheet alone.
+    """Calibrate photographs of one `size` (width, height) by the sheet alone: lens, poses [mm], rms errors [px].
 
-    Lens: SIMPLE_RADIAL, with the principal point in the middle. Photographs that do not fit are left out. Raises
+    The lens is SIMPLE_RADIAL, with the principal point in the middle. Photographs that do not fit are left out. Raises
     InputError if fewer than three fit.
     """
     names = list(detections)
@@ -160,7 +160,7 @@ def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict
             return lens, dict(zip(names, poses)), dict(zip(names, errors.tolist()))
         names = [name for name, fit in zip(names, fits) if fit]
     raise InputError(f"sheet of markers: {len(names)} photographs show enough of it and fit each other; must be 3 or "
-                     "more: photograph it, flat, from all around")  # fmt: skip
+                     "more: keep it flat and photograph it from all around")  # fmt: skip
 
 
 def align(detections: Detections, cameras: Cameras) -> Similarity:
@@ -178,14 +178,14 @@ def align(detections: Detections, cameras: Cameras) -> Similarity:
         keep = errors <= max(4 * float(np.median(errors)), 1e-6 * np.ptp(true))
     rms, width = float(np.sqrt(np.mean(errors[keep] ** 2))), float(np.ptp(true[keep], 0).max())
     if keep.sum() < MIN_CORNERS or not rms < MAX_RMS * width:
-        raise InputError(f"sheet of markers: its corners are {rms:.2g} mm off in {width:.0f} mm; is it flat, did it "
-                         "stay in its place, and is there only one?")  # fmt: skip
+        raise InputError(f"sheet of markers: its corners have an error of {rms:.2g} mm on {width:.0f} mm; is it flat, "
+                         "did it not move, and is there only one?")  # fmt: skip
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3], rms, int(keep.sum()))
 
 
 def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """The corners that two photographs agree on: id, point (3,) in the cameras' frame, and point (3,) of the sheet."""
+    """Triangulate the corners: id, point (3,) in the cameras' frame, and point (3,) on the sheet [mm] of each."""
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0
     seen: dict[int, list[tuple]] = {}
@@ -204,15 +204,15 @@ def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int,
 
 
 class PaperSamples(NamedTuple):
-    """White paper of the sheet in a photograph."""
+    """Samples of the sheet's white paper in a photograph."""
 
     points: np.ndarray  #: (n, 3) on the sheet, in the frame of `SheetDetection`
     colours: np.ndarray  #: (n, 3) linear
-    in_margin: np.ndarray  #: (n,) bool; if the margin was cut off, the sample shows what the sheet lies on
+    in_margin: np.ndarray  #: (n,) bool: in the page's margin; if that was cut off, the sample shows the table
 
 
 def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
-    """Median colours below `CLIPPED` of white squares, and of the margin beside them, in a photograph (H, W, 3)."""
+    """Median colours of white squares and of the margin in a photograph (H, W, 3), without those above `CLIPPED`."""
     pixels = dict(zip(detection.ids.tolist(), detection.pixels))
     points = dict(zip(detection.ids.tolist(), detection.points))
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
@@ -228,20 +228,23 @@ def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
             continue
         plane = cv2.getPerspectiveTransform(unit, four)
         if (row + column) % 2:
-            # At a slant, two opposite rims are so narrow that they mix with the black beside them: the brighter pair.
-            rims = np.median(sampled(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
+            # In oblique views two opposite rims are so narrow that they mix with black: take the brighter pair.
+            rims = np.median(sample_colours(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
             samples.append((first + [0.5, 0.5] @ sides, rims[rims.sum(1).argmax()], False))
         for place, outermost in zip(MARGINS, (column == 0, column == COLUMNS - 3, row == 0)):
             if outermost:
-                colour = np.median(sampled(linear, place + PATCH, plane), 0)  # NaN if a part is outside the picture
+                colour = np.median(sample_colours(linear, place + PATCH, plane), 0)  # NaN if partly outside
                 samples.append((first + place @ sides, colour, True))
     samples = [sample for sample in samples if sample[1].max() < CLIPPED]
     where, colours, in_margin = zip(*samples) if samples else ((), (), ())
     return PaperSamples(np.reshape(where, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(in_margin, bool))
 
 
-def sampled(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Colours (n, 3) of a photograph (H, W, 3) at points (n, 2) that a homography (3, 3) maps to pixels, or NaN."""
+def sample_colours(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Colours (n, 3) of a photograph (H, W, 3) at points (n, 2), mapped to pixels by the homography `plane` (3, 3).
+
+    NaN outside the photograph.
+    """
     at = (cv2.perspectiveTransform(points[None], plane) - 0.5).astype(np.float32)
     x, y = np.ascontiguousarray(np.moveaxis(at, -1, 0))  # (1, n): versions of OpenCV differ on one-dimensional maps
     return cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[np.nan] * 4)[0]

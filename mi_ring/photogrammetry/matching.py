@@ -16,18 +16,19 @@ from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
 pycolmap = LazyPackage("pycolmap", "structure from motion")
-#: Pixels along the pictures that features are searched in, number of features, and their least contrast. A smooth
-#: object under even light has few strong features: weak ones are kept, and geometric verification sorts them.
+#: Longer side of the images in which features are searched [px], maximum number of features, and their least contrast.
+#: A smooth object has few strong features: weak ones are kept, and geometric verification removes the wrong ones.
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
-ALL_PAIRS = 150  #: photographs up to which all pairs are matched: with fewer pairs some cameras come out mirrored
-NEIGHBOURS, KEYS = 12, 40  #: with more: so many neighbours on each side, and so many key photographs with each other
-BATCH = 60  #: pairs that are matched at a time
+ALL_PAIRS = 150  #: all pairs of up to this number of photographs are matched: fewer pairs may mirror cameras
+NEIGHBOURS, KEYS = 12, 40  #: with more photographs: neighbours on each side, and key photographs with each other
+BATCH = 60  #: pairs per call
 MIN_MATCHES = 50  #: of a pair of photographs that overlap
-STATIC, MAX_STATIC = 0.01, 0.9  #: motion of features of a static pair, relative to the width; share of such pairs
+#: A pair is static if the features' motion varies by less than STATIC [widths]. MAX_STATIC: largest share of them.
+STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey pictures, and their features to the database; those that are there are kept."""
+    """Write reduced grey images, and their features to the database. Existing ones are kept."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -53,7 +54,7 @@ def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress)
 
 
 def grey_file(picture: Picture) -> str:
-    """The name of a reduced picture, without spaces, which end names in COLMAP's lists of pairs."""
+    """The file name of a photograph's grey image. It has no spaces, which separate names in COLMAP's lists of pairs."""
     return f"{quote(picture.name, safe='')}.png"
 
 
@@ -66,7 +67,7 @@ def camera_ids(database: Path) -> dict[str, int]:
 
 
 def pairs_to_match(count: int) -> list[tuple[int, int]]:
-    """Which of `count` photographs, in the order of their names, are matched with each other."""
+    """The pairs of `count` photographs, sorted by name, that are matched."""
     pairs = itertools.combinations(range(count), 2)
     if count <= ALL_PAIRS:
         return list(pairs)
@@ -75,10 +76,10 @@ def pairs_to_match(count: int) -> list[tuple[int, int]]:
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Match pairs that the database lacks. Raises InputError after the first batch if all are from one viewpoint."""
+    """Match the pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # else it depends on the thread
+    verification.ransac.random_seed = 0  # otherwise it depends on the thread
     pairs = pairs_to_match(len(pictures))
     batches = [pairs[k : k + BATCH] for k in range(0, len(pairs), BATCH)]
     database, listed = folder / "database.db", folder / "pairs.txt"
@@ -93,7 +94,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """The share of these pairs of files that match and were taken from one viewpoint: all features move alike."""
+    """The share of pairs of grey files that match and are from one viewpoint, so that all features move alike."""
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
     asked, static = set(map(frozenset, pairs)), 0
@@ -106,7 +107,7 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Both images of each matched pair in COLMAP's database, and the verified matches (n, 2) in each [px]."""
+    """Both images of each matched pair in COLMAP's database, and the verified matches (n, 2) [px] in each image."""
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mi_ring.capture.grabcut import grown
+from mi_ring.capture.grabcut import dilate_by_share
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, write_image
@@ -28,39 +28,39 @@ from mi_ring.photogrammetry.table_plane import FLATNESS, Plane, TableAppearance,
 from mi_ring.system.files import read_json, write_file
 from mi_ring.system.progress import Progress
 
-MIN_AGREEMENT = 0.8  #: of a mask with the common silhouette, intersection over union; else it is not used
-COARSE, GIVEN = 600, 1200  #: pixels along photographs in which the object is looked for, and along given masks; at most
-SMALL, CLOSE = 200, 400  #: pixels along the object in the views for its concavities and for its outlines
-TEXELS = 640  #: across the table's texture for those views
-WIDE = 2.0  #: half size of the table's texture from whole photographs, in that of their voxel grid
+MIN_AGREEMENT = 0.8  #: a mask is used if its overlap (IoU) with the common silhouette is at least this
+COARSE, GIVEN = 600, 1200  #: longer side [px] of photographs in which the object is searched, and of given masks
+SMALL, CLOSE = 200, 400  #: size of the object in the views that find its concavities and its outlines [px]
+TEXELS = 640  #: width of the table's texture for these views
+WIDE = 2.0  #: half size of the table's texture from whole photographs [half size of their voxel grid]
 
 
 class SegmentedObject(NamedTuple):
-    """The object as the photographs show it."""
+    """The object's masks and place."""
 
-    masks: dict[str, np.ndarray]  #: (H, W) uint8 by the photograph's name, of `OBJECT`, `UNKNOWN` and 0
+    masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
-    radiance: float  #: of the object, mean, 1 = full scale
+    radiance: float  #: mean radiance of the object (1 = full scale)
     plane: Plane | None  #: the table under the object; None if there is none
 
 
 class SegmentationInput(NamedTuple):
-    """What the user, or the sheet, says of the object."""
+    """What is known before the object is segmented, from the user or from the sheet."""
 
     plane: Plane | None = None  #: the table
-    box: tuple[float, ...] | None = None  #: lowest and highest x, y and z of the object, one after another
-    masks: str | Path = "auto"  #: "auto": find them; else as `Picture.mask` has it
-    sheet: bool = False  #: is the plane that of the printed sheet?
+    box: tuple[float, ...] | None = None  #: around the object: x low, x high, y low, y high, z low, z high
+    masks: str | Path = "auto"  #: "auto": find them; otherwise the source for `Picture.mask`
+    sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """A text that changes with the source of the masks, and with the files in a folder of masks."""
+        """The source of the masks; for a folder of masks a hash of its files' names, sizes and times."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """(N,) bool: are points (N, 3) in the box and above the table's relief, `flatness` · `camera_distance`?"""
+        """(N,) bool: are points (N, 3) in the box, and higher than `flatness` · `camera_distance` above the table?"""
         allowed = np.ones(len(points), bool)
         if self.plane:
             allowed &= self.plane.height(points) > flatness * camera_distance
@@ -73,9 +73,9 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """The object and its masks. Masks in `folder` are used again: the user may have edited or removed some.
+    """Find the object and its masks. Existing masks in `folder` are used: the user may have edited or removed some.
 
-    Raises InputError if they were found with other cameras or another `known`, and if no object is found.
+    Raises InputError if these were found with other cameras or another `known`, or if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
@@ -84,8 +84,8 @@ def find_object(
     if saved := read_json(record):
         if other := [name for name, value in asked.items() if saved["asked"][name] != value]:
             what = "cameras" if "cameras" in other else f"--{other[0]}"
-            raise InputError(f"{folder}: has masks that were found with other {what}; remove it to have them found "
-                             "anew, or give another DIR")  # fmt: skip
+            raise InputError(f"{folder}: has masks that were found with other {what}; remove it to find them again, or "
+                             "give another DIR")  # fmt: skip
         plane = saved["plane"] and Plane(np.array(saved["plane"][0]), saved["plane"][1])
         return SegmentedObject(kept_masks(placed, folder), np.array(saved["center"]), saved["level"], plane)
     for lens, _ in sparse.cameras.values():
@@ -112,7 +112,7 @@ def find_object(
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """The masks in a folder as `SegmentedObject` has them. Raises InputError if there are none or a size is wrong."""
+    """`SegmentedObject.masks` from the files in a folder. Raises InputError if there are none or a size is wrong."""
     found = {}
     for picture in pictures:
         file = folder / f"{picture.name}.png"
@@ -120,19 +120,19 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
             mask = read_as(file, "mask", read_image)[..., 0]
             (height, width), scale = mask.shape, max(1, reduction(mask, picture.size))
             if (width, height) != (picture.size[0] // scale, picture.size[1] // scale):
-                raise InputError("{}: is {} x {} pixels, which is no whole part of the {} x {} of its photograph; keep "
-                                 "the size of masks".format(file, width, height, *picture.size))  # fmt: skip
+                raise InputError("{}: is {} x {} pixels, which is no whole part of the {} x {} of its photograph; do "
+                                 "not change the size of masks".format(file, width, height, *picture.size))  # fmt: skip
             grey = mask / np.iinfo(mask.dtype).max if mask.dtype != np.float32 else mask
             found[picture.name] = np.array([0, UNKNOWN, OBJECT], np.uint8)[np.digitize(grey, [0.25, 0.75])]
     if not found:
-        raise InputError(f"{folder}: has no masks any more; remove it to have them found anew")
+        raise InputError(f"{folder}: has no masks any more; remove it to find them again")
     return found
 
 
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """The object, and the user's masks. Raises InputError if these are too few or have no object in common."""
+    """The object by the user's masks, and the masks. Raises InputError if they are too few or show no common object."""
     masks = {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(known.masks)
@@ -154,7 +154,7 @@ def given_masks(
 
 
 def require_half(count: int, pictures: Sequence[Picture], source: str | Path) -> None:
-    """Raise InputError if the `count` of masks is below half of the photographs."""
+    """Raise InputError if fewer than half of the photographs have a mask. `source`: as for `Picture.mask`."""
     if count < len(pictures) / 2:
         name = pictures[0].path.name
         what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
@@ -163,7 +163,7 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
 
 
 def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """(H, W) uint8: 1 where a photograph shows the box, as `SegmentationInput` has it."""
+    """(H, W) uint8: 1 where a photograph shows the box of `SegmentationInput`; 1 everywhere if it reaches behind it."""
     pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
     if depth.min() <= 0:  # a corner is behind the camera
         return np.ones(camera.size[::-1], np.uint8)
@@ -174,7 +174,7 @@ def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
 def find_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """The object, and masks where it is clear. Raises InputError if no object is found or too few masks agree."""
+    """Find the object and its clear masks. Raises InputError if no object is found or too few masks agree."""
     folder = pictures[0].path.parent
     found = locate_object(grid, sparse.points, known, progress)
     silhouettes = [found.silhouette(view) for view in grid.views] if found else []
@@ -194,7 +194,7 @@ def find_masks(
     masks = {}
     for view, (_, window), mask, agreement in zip(close, windows, result.masks, result.agreement):
         if agreement >= MIN_AGREEMENT:
-            if known.plane:  # there are shadows beside the object
+            if known.plane:  # the object casts shadows on the table
                 silhouette, tolerance = result.object.silhouette(view), result.object.voxel_pixels(view)
                 unknown = automatic_masks.disputed_pixels(mask, silhouette, tolerance)
             else:
@@ -208,7 +208,7 @@ def refine_object(
     views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
     progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
-    """Refined masks in views of the object, which is `found` so far. `whole`: the grid with the whole photographs."""
+    """Refine the object `found` so far in views around it. `whole`: the grid with the views of whole photographs."""
     grid = VoxelGrid.around(views, found)
     grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
     silhouettes, backgrounds = [found.silhouette(view) for view in views], automatic_masks.empty_masks(views)
@@ -216,10 +216,10 @@ def refine_object(
         near = TexelGrid(known.plane, grid.center, grid.half_size, TEXELS)
         far = TexelGrid(known.plane, grid.center, WIDE * whole.half_size, TEXELS)
         parts = (views, near, silhouettes), (whole.views, far, [found.silhouette(view) for view in whole.views])
-        tables = [TableAppearance(own, texels, progress, [grown(s, settings.band) for s in hidden])
+        tables = [TableAppearance(own, texels, progress, [dilate_by_share(s, settings.band) for s in hidden])
                   for own, texels, hidden in parts]  # fmt: skip
         backgrounds = bare_table(views, silhouettes, tables, progress) or tables[0].pattern_masks()
-    else:  # parts that the flash grazes are as dark as the room: a few photographs must not decide
+    else:  # parts under grazing light are as dark as the room: do not let a few masks remove them
         settings = settings._replace(agreement=automatic_masks.MIN_AGREEMENT)
     return automatic_masks.refine_masks(grid, silhouettes, backgrounds, progress, settings)
 
@@ -227,10 +227,10 @@ def refine_object(
 def locate_object(
     grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, progress: Progress
 ) -> VoxelObject | None:
-    """The object by its difference from the table, else by its brightness, else by a short fit; None if all fail.
+    """Locate the object by its difference from the table, its brightness, or a short fit; None if all three fail.
 
-    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used on the sheet, as paper is bright,
-    nor on pixels with the table's pattern, as the flash lights the middle of the table.
+    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used with the sheet, whose paper is
+    bright, and not where a pixel shows the table's pattern, because the flash lights the table.
     """
     grid.allowed = known.allows(grid.points, grid.camera_distance)
     table = known.plane and TableAppearance(grid.views, TexelGrid(known.plane, grid.center, grid.half_size), progress)

@@ -1,4 +1,4 @@
-"""Reduced, undistorted photographs with their cameras, in which the object is looked for."""
+"""Reduced, undistorted photographs with their cameras, in which the object is searched."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from mi_ring.photogrammetry.folder import Picture
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
-MARGIN = 0.3  #: around the object in a window, as a share of its size
+MARGIN = 0.3  #: around the object in a window [size of the object]
 
 
 class ReducedView(NamedTuple):
@@ -31,7 +31,7 @@ class ReducedView(NamedTuple):
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows and columns (N,) of the pixels that points (N, 3) fall on, and is the point in the picture (N,)?"""
+        """Rows (N,), columns (N,) of the pixels of points (N, 3), and whether the view shows each point (N,)."""
         projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
         x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -42,11 +42,11 @@ class ReducedView(NamedTuple):
 
 
 Views = Sequence[ReducedView]
-Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 where they hold
+Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 inside
 
 
-def straighten(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """The window (h, w, …) of a photograph's image (H, W, …) uint8: reduced by area, then undistorted."""
+def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Reduce an image (H, W, …) uint8 by area means and undistort it: the pixels (h, w, …) of a window."""
     height, width = (side // window.scale for side in image.shape[:2])
     whole = image[: height * window.scale, : width * window.scale]
     small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
@@ -55,19 +55,19 @@ def straighten(image: np.ndarray, lens: Lens, window: Window, interpolation: int
 
 
 def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> ReducedView:
-    """A window of a photograph with its camera; `pose` (4, 4) camera-to-world, OpenCV's axes."""
+    """A window of a photograph with its camera. `pose` (4, 4): camera-to-world, OpenCV's axes."""
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
-    valid = straighten(np.ones(rgb.shape[:2], np.uint8), lens, window, cv2.INTER_NEAREST)
-    return ReducedView(picture.name, straighten(rgb, lens, window), valid > 0, camera)
+    valid = undistort_view(np.ones(rgb.shape[:2], np.uint8), lens, window, cv2.INTER_NEAREST)
+    return ReducedView(picture.name, undistort_view(rgb, lens, window), valid > 0, camera)
 
 
 def read_windows(
     pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], cameras: Mapping[str, tuple[Lens, np.ndarray]],
     progress: Progress,
 ) -> list[list[ReducedView]]:  # fmt: skip
-    """Each photograph's windows as views; `cameras`: lenses and poses by name."""
+    """The views of each photograph's windows. `cameras`: lens and pose by the photograph's name."""
 
     def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
         views = [reduce_photograph(picture, *cameras[picture.name], window) for window in wanted]
@@ -78,12 +78,12 @@ def read_windows(
 
 
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
-    """A photograph's mask (H, W) uint8, reduced to `longest` pixels along at most and undistorted: (h, w), 0 or 1."""
-    return (straighten(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
+    """Undistort a photograph's mask (H, W) uint8 and reduce its longer side to at most `longest` px: (h, w), 0 or 1."""
+    return (undistort_view(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
-    """The window around a mask (h, w) of the whole picture, reduced so that the mask is about `pixels` long."""
+    """The window around a mask (h, w) of the whole photograph. In the window the mask is about `pixels` long."""
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)
     unit = np.round(size / mask.shape[::-1])
@@ -97,7 +97,7 @@ def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
 
 
 def paste_mask(mask: np.ndarray, lens: Lens, window: Window) -> np.ndarray:
-    """A window's mask (h, w) as a mask of the whole picture, reduced alike; 0 outside the window."""
+    """Paste a window's mask (h, w) into a mask of the whole photograph at the window's scale; 0 outside the window."""
     full = np.zeros((lens.size[1] // window.scale, lens.size[0] // window.scale), mask.dtype)
     left, top = window.left // window.scale, window.top // window.scale
     part = full[top : top + mask.shape[0], left : left + mask.shape[1]]

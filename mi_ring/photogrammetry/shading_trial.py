@@ -1,4 +1,4 @@
-"""Finds the object by its shading alone: a short fit without masks, which starts from a sphere of sparse points."""
+"""Finds the object by its shading alone: a short fit without masks that starts from a sphere."""
 
 import numpy as np
 
@@ -13,14 +13,14 @@ from mi_ring.system.progress import Progress
 ITERATIONS = 100
 MIN_POINTS = 30  #: near the object
 MIN_RADIUS, MAX_RADIUS = 0.15, 0.8  #: of the sphere, relative to the half size of the voxel grid
-#: Mean albedo that the assumed intensity implies if the true one is unknown. It is above 1, so that fits notice.
+#: If the flash's intensity is unknown, it is set so that this is the mean albedo. Above 1, so that fits notice.
 ASSUMED_ALBEDO = 3.0
 SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128,), shares=(1,), subdivisions=4,
                          masks="given", domain="sphere", weights={"mask": 0.0})  # fmt: skip
 
 
 def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
-    """Centre (3,) and radius of a sphere around most of the points (N, 3) near `center`; None if these are too few."""
+    """Centre (3,) and radius of a sphere around most points (N, 3) near `center`; None if these are too few."""
     near = points[np.linalg.norm(points - center, axis=1) < half_size]
     if len(near) < MIN_POINTS:
         return None
@@ -30,7 +30,7 @@ def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> 
 
 
 def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """(H, W) uint8 of each view: 1 on a surface that is fitted from a sphere. Raises InputError if the fit diverges."""
+    """Fit a surface from a sphere: (H, W) uint8 of each view, 1 on the surface. Raises InputError if it diverges."""
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.valid].mean() for view in views]))
     intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)

@@ -1,4 +1,4 @@
-"""Structure from motion, cameras and points from photographs, by COLMAP. A `model` is a `pycolmap.Reconstruction`."""
+"""Structure from motion by COLMAP: cameras and points. A `model` is a `pycolmap.Reconstruction`."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -24,14 +24,14 @@ from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
 pycolmap = LazyPackage("pycolmap", "structure from motion")
-SMALL = 1000  #: pixels along photographs below which they may have too few features
-TEXTURED = 300  #: features of a photograph with enough texture
-EPIPOLAR = 2.5e-3  #: largest distance of a match that two cameras explain, as a share of the picture's width
-PAIR_MATCHES, PAIR_EXPLAINED = 15, 0.7  #: matches of a pair, and share that its cameras must explain, to connect parts
-MIN_PART = 3  #: photographs of a part that is removed when it is disconnected
+SMALL = 1000  #: photographs with a shorter longer side [px] may have too few features
+TEXTURED = 300  #: least number of features of a photograph with enough texture
+EPIPOLAR = 2.5e-3  #: a pair of cameras explains a match up to this Sampson distance [width of the image]
+PAIR_MATCHES, PAIR_EXPLAINED = 15, 0.7  #: least number of matches, and share explained, of a pair that connects parts
+MIN_PART = 3  #: a disconnected part with fewer photographs is kept
 MAX_NAMES = 30  #: of photographs in a message
-MIN_POINTS = 30  #: of the sparse points, that a photograph must show
-BLURRED = 0.25  #: detail below which a photograph is blurred, relative to those with a camera
+MIN_POINTS = 30  #: least number of sparse points that a photograph must show
+BLURRED = 0.25  #: a photograph with less detail is blurred [detail of those with a camera]
 
 
 @dataclass
@@ -42,10 +42,10 @@ class SparseModel:
     points: np.ndarray  #: (N, 3)
     error: float | None  #: mean reprojection error [px of the photographs]; None if unknown
     failed: dict[str, str]  #: photographs without a camera, and why
-    source: str = ""  #: of the cameras; empty for structure from motion
+    source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """A text that changes with the cameras."""
+        """A hash of the cameras."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
@@ -55,7 +55,7 @@ class SparseModel:
         return float(np.median([np.linalg.norm(pose[:3, 3] - point) for _, pose in self.cameras.values()]))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
-        """The model in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """The model after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,)."""
         cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
@@ -63,7 +63,7 @@ class SparseModel:
 def structure_from_motion(
     pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Cameras of photographs, one lens for each size. Raises InputError, with the reason, if less than half get one."""
+    """The cameras of photographs, one lens per size. Raises InputError if fewer than half of them get a camera."""
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
     if sparse.is_dir():
@@ -88,11 +88,11 @@ def structure_from_motion(
 
 
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
-    """The model that explains most of the matches; None if there is none.
+    """The better of two models: the one whose cameras explain more matches; None if there is none.
 
     Global mapping ("Global Structure-from-Motion Revisited", Pan et al. 2024) uses all matches from the start.
-    Incremental mapping may mirror photographs that it adds by a few points in one plane, but copes better with wrong
-    matches, as of repeated patterns and moving shadows. From both, disconnected parts are removed.
+    Incremental mapping tolerates more wrong matches (repeated patterns, moving shadows), but may mirror a camera that
+    sees few points in one plane. Disconnected parts of both are removed.
     """
     paths = database, _, output = folder / "database.db", folder / "grey", folder / "models"
     output.mkdir(exist_ok=True)
@@ -112,13 +112,13 @@ def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
 
 
 def deregister(model: Any, images: Iterable[int]) -> None:
-    """Remove the cameras of these images from a model."""
+    """Remove the poses of these images from a model."""
     for k in list(images):
         model.deregister_frame(model.images[k].frame_id)
 
 
 def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
-    """Models from the rotations and positions of all cameras together; `paths`: database, pictures, output."""
+    """Models by global mapping, by their numbers. `paths`: database, images, output."""
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
@@ -128,7 +128,7 @@ def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
 
 
 def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
-    """Models to which one of `count` photographs is added after another; `paths`: database, pictures, output."""
+    """Models of `count` photographs by incremental mapping, by their numbers. `paths`: database, images, output."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
@@ -141,7 +141,7 @@ def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> 
 
 
 class ImagePair(NamedTuple):
-    """Two images of a model, the number of their matches, and how many of these their cameras explain."""
+    """Two images of a model, their number of matches, and how many of these their poses explain."""
 
     first: int
     second: int
@@ -162,9 +162,10 @@ def check_pairs(model: Any, database: Path) -> list[ImagePair]:
 
 
 def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> list[int]:
-    """The images of all parts but the largest. Pairs that explain most of their matches connect parts.
+    """The images outside the largest connected part. A pair that explains most of its matches connects two images.
 
-    Other parts are placed at random. Those of one or two images are kept: the vote on masks tolerates them.
+    The poses of such parts are random relative to the largest. Parts of one or two images are kept: the vote on masks
+    tolerates them.
     """
     index = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= PAIR_MATCHES and p.explained > PAIR_EXPLAINED * p.matches]
@@ -176,7 +177,7 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson's distance (n,) [px] of matches (n, 2) [px] of two images from the epipolar geometry of their poses."""
+    """Sampson distances (n,) [px] of matches (n, 2) [px] in two images, by the epipolar geometry of their poses."""
     cameras = model.cameras[a.camera_id], model.cameras[b.camera_id]
     rays = (camera.cam_from_img(pixels) for camera, pixels in zip(cameras, (first, second)))
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
@@ -184,7 +185,7 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
-    """The model in terms of the photographs at full size."""
+    """The model with cameras and errors [px] of the photographs at full size."""
     cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
     return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
@@ -196,43 +197,43 @@ def model_points(model: Any) -> np.ndarray:
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """Why the photographs that are not `placed` have no camera, by name."""
+    """The reasons why photographs that are not `placed` have no camera, by name."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
-    detail = {p.name: detail_of(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
+    detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
         with pycolmap.Database.open(folder / "database.db") as opened:
             features = opened.num_keypoints_for_image(opened.read_image_with_name(file).image_id)
-        reasons[name] = ("nothing in it fits the others: it shows something else, or there are too few photographs in "
-                         "between")  # fmt: skip
+        reasons[name] = ("nothing in it matches the others: it shows something else, or photographs in between are "
+                         "missing")  # fmt: skip
         if features < TEXTURED:
-            reasons[name] = f"{features} features only: out of focus, blurred or too dark"
+            reasons[name] = f"only {features} features: out of focus, blurred or too dark"
         elif detail[name] < BLURRED * np.median([detail[other] for other in placed]):
             reasons[name] = "far less detail than in the others: blurred, out of focus, or it shows something else"
     return reasons
 
 
-def detail_of(file: Path) -> float:
-    """Variance of a picture's Laplacian, after a blur that removes most noise."""
+def sharpness(file: Path) -> float:
+    """Sharpness of an image: the variance of its Laplacian, after a blur against noise."""
     grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
-    """Why only `count` photographs have a camera, and what to do."""
+    """The reason why only `count` photographs have a camera, and what to do."""
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])
         total = opened.num_images()
     if features < TEXTURED:
         return (f"they have {features:.0f} features each; they are out of focus or too dark, or the object has no "
-                "texture: lay a sheet of `mi-ring board` under it")  # fmt: skip
+                "texture: put a sheet of `mi-ring board` under it")  # fmt: skip
     largest = max(max(picture.size) for picture in pictures)
     if largest < SMALL:
-        return (f"they have {largest} pixels along at most, which is too few for features; give them as the camera "
-                f"wrote them, {SMALL} or more")  # fmt: skip
+        return (f"their longer side has {largest} pixels, too few for features; give the camera's own files, with "
+                f"{SMALL} pixels or more")  # fmt: skip
     if count >= total / 4:
-        return ("the others hang on matches of which many do not fit; take more photographs, also between these and "
-                "the others, 10 degrees at a time")  # fmt: skip
+        return ("many matches of the others are wrong; take more photographs, also between these and the others, 10 "
+                "degrees at a time")  # fmt: skip
     if matched >= 2 * total:
         return "they fit each other but show everything from one place; walk around the object, 10 degrees at a time"
     return "they show different things, or too little of the same; photograph one object, 10 degrees at a time"

@@ -10,7 +10,7 @@ from scipy import ndimage
 from trimesh.geometry import align_vectors
 from trimesh.points import plane_fit
 
-from mi_ring.capture.grabcut import disk, grown
+from mi_ring.capture.grabcut import dilate_by_share, disk
 from mi_ring.images import srgb_to_linear
 from mi_ring.photogrammetry.flash_light import FlashCalibration, irradiance
 from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
@@ -18,23 +18,21 @@ from mi_ring.scene.lights import Light
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
-FLATNESS = 0.004  #: distance from the plane up to which a point belongs to it, in units of the cameras' distance
-MIN_MEMBERS = 0.15  #: share of the points that belong to a table
-TEXELS, COARSE_TEXELS = 320, 160  #: across the table's texture, by default and to find how it is lit
+FLATNESS = 0.004  #: a point up to this distance from the plane belongs to it [distance of the cameras]
+MIN_MEMBERS = 0.15  #: least share of the points that belong to a table
+TEXELS, COARSE_TEXELS = 320, 160  #: width of the table's texture, by default and while its illumination is estimated
 CHUNK = 50_000  #: texels per call, to bound memory
-SIGNIFICANT, MIN_DIFFERENCE = (
-    4.0,
-    0.2,
-)  #: a pixel is not table if its log radiance differs by so many medians and so much
-MIN_RADIANCE = 2e-3  #: lower radiance counts as this
+#: A pixel is not table if its log radiance differs by more than SIGNIFICANT medians, and by more than MIN_DIFFERENCE.
+SIGNIFICANT, MIN_DIFFERENCE = 4.0, 0.2
+MIN_RADIANCE = 2e-3  #: lower radiance is replaced by this
 LOG_RADIANCE = np.log(np.maximum(srgb_to_linear(np.arange(256, dtype=np.float32) / 255), MIN_RADIANCE))  #: by sRGB byte
-#: The table's pattern: least correlation in a window, size of the window [px], and least contrast of the pattern in it.
+#: A window shows the table's pattern: least correlation, width of the window [px], and least contrast in it.
 CORRELATED, WINDOW, CONTRAST = 0.8, 15, 0.15
-#: The bare table: a pixel shows it if its difference from the expected log radiance, and from two log ratios of
-#: colours, is at most the `QUANTILE` of all pixels that are not `NEAR` the object, between `LOWEST` and `HIGHEST`.
+#: A pixel shows the bare table if log radiance and two log colour ratios are as expected. The largest difference is the
+#: QUANTILE of the differences far from the object, clipped to LOWEST and HIGHEST.
 QUANTILE, LOWEST, HIGHEST = 0.99, (0.1, 0.05, 0.05), (0.4, 0.15, 0.15)
-#: The object is too similar if more than the share `CONFUSED` of it looks like the table, `INSIDE` of its outline. Both
-#: widths, and that of a `SPECK` that does not count, are relative to the object's size.
+#: Far is farther than NEAR from the object. The object looks like the table if more than the share CONFUSED of its
+#: inside, farther than INSIDE from its outline, does. Smaller regions than SPECK do not count [size of the object].
 NEAR, INSIDE, CONFUSED, SPECK = 0.3, 0.1, 0.03, 0.015
 
 
@@ -54,7 +52,10 @@ class Plane(NamedTuple):
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """The plane of most points (N, 3) around `center` (3,), below other points and cameras (K, 3); None without one."""
+    """The plane with most points (N, 3) around `center` (3,), by RANSAC; None if there is none.
+
+    Other points and the cameras (K, 3) must be above it.
+    """
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
         return None
@@ -84,7 +85,7 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half
 
 
 class TexelGrid:
-    """A square of texels in a plane, around its point below `center` (3,), `half_size` · 4 wide."""
+    """A square of texels² in a plane, around the point below `center` (3,), with sides of 4 `half_size`."""
 
     def __init__(self, plane: Plane, center: np.ndarray, half_size: float, texels: int = TEXELS) -> None:
         self.texels, self.normal, across = texels, plane.normal, plane.axes()[:2]
@@ -97,14 +98,14 @@ class TexelGrid:
 
     @property
     def to_world(self) -> np.ndarray:
-        """(4, 4) from Mitsuba's rectangle (-1 to 1 in x and y, facing z) to the texels; the first row is at y = -1."""
+        """(4, 4) from Mitsuba's rectangle (x and y from -1 to 1, normal z) to the world. The first row is at y = -1."""
         middle = self.from_texel @ np.array([(self.texels - 1) / 2, (self.texels - 1) / 2, 1])
         across = self.from_texel[:, :2] * self.texels / 2
         normal = np.cross(across[:3, 0], across[:3, 1]) / np.linalg.norm(across[:, 0])
         return np.column_stack([across, [*normal, 0], middle])
 
     def render(self, view: ReducedView, texels: np.ndarray) -> np.ndarray:
-        """Texels (texels², …), float32 or uint8, as a view shows them (H, W, …); NaN, or 0, outside the texels."""
+        """Values (texels², …) of the texels in a view: (H, W, …). Outside: NaN for float32, 0 for uint8."""
         width, height = view.camera.size
         pixel_centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         from_pixel = np.linalg.inv(view.camera.projection @ self.from_texel) @ pixel_centre
@@ -121,10 +122,10 @@ class TexelGrid:
 def estimate_albedo(
     views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
 ) -> np.ndarray | None:
-    """Diffuse albedo (texels, texels, 3) of the table, median over views; None if no view shows the table.
+    """Diffuse albedo (texels, texels, 3) of the table, the median over views; None if no view shows the table.
 
-    `lights`: one for each view; `flash`: their cone, room's light and response; `hidden` (H, W): above 0 where the
-    table may be hidden. Texels that no view shows get the median of the others. Interreflection is ignored.
+    `lights`: one per view. `flash`: cone, room's light and response. `hidden` (H, W): above 0 where the table may be
+    hidden. Texels that no view shows get the median of the others. Interreflection is ignored.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -144,9 +145,9 @@ def estimate_albedo(
 
 
 class TableAppearance:
-    """The table as all views show it: one texture, times a smooth illumination in each view.
+    """The table's appearance: one texture, multiplied by a smooth illumination in each view.
 
-    `hidden` (H, W): above 0 where something may hide the table; by default nowhere.
+    `hidden` (H, W): above 0 where something may hide the table; None: nowhere.
     """
 
     def __init__(self, views: Views, grid: TexelGrid, progress: Progress, hidden: Masks | None = None) -> None:
@@ -157,7 +158,7 @@ class TableAppearance:
         every = -(-grid.texels // COARSE_TEXELS)
         some = np.arange(grid.texels**2).reshape(grid.texels, -1)[::every, ::every].ravel()
         stack = self.observe_all(some)
-        for number in range(3):  # texture and illumination in turn
+        for number in range(3):  # estimate texture and illumination in turn
             texture = nan_median(stack)
             for own, lighting in zip(progress(stack, f"table, round {number + 1}"), self.lighting):
                 change = fit_lighting(own - texture, self.basis[some])
@@ -180,7 +181,7 @@ class TableAppearance:
         return np.stack(list(in_threads(partial(self.observe, texels=texels), range(len(self.views)))))
 
     def foreign_masks(self) -> list[np.ndarray]:
-        """(H, W) uint8 of each view: 1 where it differs from the table, which is where something stands on it."""
+        """(H, W) uint8 of each view: 1 where it differs from the table, because something stands there."""
         result, everywhere = [], np.arange(len(self.texture))
         for number, view in enumerate(self.progress(self.views, "beside the table")):
             rest = np.abs(self.observe(number, everywhere) - self.texture).max(1)
@@ -191,7 +192,7 @@ class TableAppearance:
         return result
 
     def pattern_masks(self) -> list[np.ndarray]:
-        """(H, W) uint8 of each view: 1 where it certainly shows the table, because it has the table's pattern."""
+        """(H, W) uint8 of each view: 1 where it certainly shows the table, by the table's pattern."""
         known = self.texture.mean(1)
         return [
             match_pattern(LOG_RADIANCE[view.rgb].mean(-1), self.grid.render(view, known))
@@ -199,7 +200,7 @@ class TableAppearance:
         ]
 
     def expected(self, view: ReducedView) -> np.ndarray:
-        """Log radiance (H, W, 3) that a view, or a window of it, would show of the table alone; NaN if unknown."""
+        """Log radiance (H, W, 3) of a view, or of a window of it, without the object; NaN if unknown."""
         number = [other.name for other in self.views].index(view.name)
         return self.grid.render(view, self.texture + (self.basis @ self.lighting[number])[:, None])
 
@@ -207,10 +208,10 @@ class TableAppearance:
 def bare_table(
     views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
 ) -> list[np.ndarray] | None:
-    """(H, W) uint8 of each view: 1 where it shows the bare table. None if the object itself looks like the table.
+    """(H, W) uint8 of each view: 1 where it shows the bare table. None if the object looks like the table.
 
-    Darker pixels count, too, as shadows; if the object then looks like the table, they do not. The first of the tables
-    that knows a pixel is used. `silhouettes` (H, W): of the object, roughly.
+    Darker pixels count as shadows on the table, unless the object then looks like the table. Each pixel is compared
+    with the first of the `tables` that shows it. `silhouettes` (H, W): rough ones of the object.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -222,14 +223,14 @@ def bare_table(
         result, wrong, inside = [], 0, 0
         for view, silhouette, difference in zip(views, silhouettes, differences):
             size, known = np.sqrt(max(1, int(silhouette.sum()))), view.valid & np.isfinite(difference).all(-1)
-            around = known & (grown(silhouette, NEAR) == 0)
+            around = known & (dilate_by_share(silhouette, NEAR) == 0)
             usual = np.quantile(np.abs(difference[around]), QUANTILE, 0) if around.any() else 0
             limits = np.clip(usual, LOWEST, HIGHEST)
             darker = difference[..., 0] if shadows else np.abs(difference[..., 0])
             same = known & (darker < limits[0]) & (np.abs(difference[..., 1:]) < limits[1:]).all(-1)
             smooth = cv2.medianBlur(same.astype(np.uint8), 5)
             result.append(cv2.morphologyEx(smooth, cv2.MORPH_OPEN, disk(SPECK * size)))
-            core = known & (grown(silhouette, -INSIDE) > 0)
+            core = known & (dilate_by_share(silhouette, -INSIDE) > 0)
             wrong, inside = wrong + (result[-1][core] > 0).sum(), inside + core.sum()
         if wrong <= CONFUSED * inside:
             return result
@@ -237,9 +238,9 @@ def bare_table(
 
 
 def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Difference (H, W, 3) of log radiances (H, W, 3): of their means, of red/green and of blue/green; NaN if unknown.
+    """Differences (H, W, 3) of log radiances (H, W, 3): in the mean, in red/green and in blue/green; NaN if unknown.
 
-    The nearest expected value of a pixel and its neighbours counts, because the texture may be a pixel off.
+    The pixel is compared with the nearest value of 3 × 3 expected ones, because the texture may be shifted by a pixel.
     """
 
     def split(log: np.ndarray) -> np.ndarray:
@@ -253,13 +254,13 @@ def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def nan_median(stack: np.ndarray) -> np.ndarray:
-    """The lower median over the first axis, ignoring NaN; NaN if all are. Much faster than `np.nanmedian`."""
+    """The lower median over the first axis without NaN; NaN if all are NaN. Much faster than `np.nanmedian`."""
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
 
 
 def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Coefficients (6,) of a basis (N, 6), fitted to the mean of a difference (N, 3) in log radiance, robust."""
+    """Robust least-squares coefficients (6,) of a `basis` (N, 6) for the mean channel of a `difference` (N, 3)."""
     mean = difference.mean(1)
     known = np.isfinite(mean)
     if not known.any():
@@ -272,7 +273,7 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 where log radiance (H, W) correlates with the table's pattern (H, W), which is NaN if unknown."""
+    """(H, W) uint8: 1 where log radiance `seen` (H, W) correlates with that of the `table` (H, W), NaN if unknown."""
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

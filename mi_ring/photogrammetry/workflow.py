@@ -1,4 +1,4 @@
-"""The stages from photographs to a capture. Each keeps its results, so that an interrupted run continues from there."""
+"""The stages from photographs to a capture. Each stage saves its results, so that an interrupted run continues."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ from mi_ring.importers.frames import frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
-from mi_ring.photogrammetry.folder import Picture, register_heif, relative_exposures, turn_with_cameras
+from mi_ring.photogrammetry.folder import Picture, relative_exposures, turn_with_cameras
 from mi_ring.photogrammetry.marker_sheet import MarkerSheet, PaperSamples, SheetDetection, calibrate, sample_paper
 from mi_ring.photogrammetry.object_masks import SegmentedObject
 from mi_ring.photogrammetry.shading_trial import ASSUMED_ALBEDO
@@ -32,19 +32,19 @@ from mi_ring.system.progress import Progress
 
 MIN_DEGREES = 15.0  #: between the directions of two of the photographs
 MIN_DETECTIONS = 3  #: photographs that must show the sheet
-FORMAT = 2  #: of the kept results; raise it when they change
+FORMAT = 2  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if the results in `folder` are of other photographs or of another version of the format."""
+    """Raise InputError if the results in `folder` are of other photographs or of another format."""
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
     record, first = folder / "photographs.json", folder / "sheet.json"  # without the latter there are no results
     photographs, saved = {p.path.name: [p.path.stat().st_size, p.orientation] for p in pictures}, read_json(record)
     if first.exists() and saved:
         if saved.get("format") != FORMAT:
-            raise InputError(f"{folder}: was begun by another version of mi_ring, which kept other things; remove it, "
-                             "or give another DIR")  # fmt: skip
+            raise InputError(f"{folder}: was begun by another version of mi_ring, with another format; remove it, or "
+                             "give another DIR")  # fmt: skip
         if saved["photographs"] != photographs:
             raise InputError(f"{folder}: is of other photographs than {pictures[0].path.parent} holds now; remove it, "
                              "or give another DIR")  # fmt: skip
@@ -54,9 +54,10 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 def make_upright(
     sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
 ) -> tuple[SparseModel, Plane | None, bool]:
-    """The model and the table in a frame with origin `center` (3,), z up, and unit the cameras' distance; is up known?
+    """Move model and table to a frame with origin `center` (3,), z up, and the cameras at distance 1.
 
-    Up is the table's normal, or else the mean of `ups` (3,), each in the axes of its camera, unless these cancel out.
+    Up is the table's normal, otherwise the mean of `ups` (3,), each in the axes of its camera. Returns the model, the
+    table, and whether up is known: it is not if the `ups` cancel out.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
@@ -76,7 +77,10 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """The sheet with squares of this size [mm]; None if few photographs show it. InputError if one is damaged."""
+    """Find the sheet, with squares of this side [mm], or None if few photographs show it.
+
+    Raises InputError if a photograph cannot be read.
+    """
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
 
@@ -86,7 +90,7 @@ def find_sheet(
                 paper = sample_paper(picture.linear(), detection) if detection else ()
                 return [a.tolist() for a in (*detection, *paper)] if detection else None
             except InputError as error:
-                if isinstance(error.__cause__, ImportError):  # a package is missing: not the file's fault
+                if isinstance(error.__cause__, ImportError):  # a package is missing: the file is fine
                     raise
                 return error
             finally:
@@ -95,8 +99,8 @@ def find_sheet(
         results = list(progress(in_threads(observe, pictures), "sheet", len(pictures)))
         if bad := [(p.path.name, error) for p, error in zip(pictures, results) if isinstance(error, InputError)]:
             names = ", ".join(name for name, _ in bad)
-            more = f"{len(bad)} photographs cannot be read: {names}; mend or remove them"
-            raise InputError(f"{bad[0][1]}; {more if len(bad) > 1 else 'mend or remove it'}")
+            more = f"{len(bad)} photographs cannot be read: {names}; repair or remove them"
+            raise InputError(f"{bad[0][1]}; {more if len(bad) > 1 else 'repair or remove it'}")
         saved = {picture.name: values for picture, values in zip(pictures, results) if values}
         write_file(record, json.dumps(saved))
     detections, papers = {}, {}
@@ -108,15 +112,16 @@ def find_sheet(
 
 
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
-    """The cameras of another tool beside the photographs, if any. Raises InputError if invalid, or missing for most."""
+    """The cameras of another tool beside the photographs; None without them.
+
+    Raises InputError if they are invalid, or if most photographs have none.
+    """
     source = detect(pictures[0].path.parent)
     if source is None:
         return None
     source = replace(source, photographs=[picture.path for picture in pictures])
     if isinstance(source, Photogrammetry):  # exposures come from `Picture`, where some may be missing
         source = replace(source, exif=False)
-    for picture in pictures:
-        register_heif(picture.path)
     imported = frames_of(source)
     require_cameras(imported)
     frames = {frame.image.stem: frame for frame in imported}
@@ -132,13 +137,13 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
     points, folder = np.zeros((0, 3)), Colmap.model(source.src)
     if isinstance(source, Colmap) and folder:
         points = model_points(need("pycolmap", f"{folder}").Reconstruction(folder))
-    # Geocentric coordinates in metres are too large for float32.
+    # Move the origin: geocentric coordinates in metres are too large for float32.
     middle = np.median([pose[:3, 3] for _, pose in cameras.values()], axis=0)
     return SparseModel(cameras, points, None, failed, f"{source.src}").moved(1.0, np.eye(3), -middle)
 
 
 def require_parallax(sparse: SparseModel, folder: Path) -> None:
-    """Raise InputError if all photographs are from one side: depth is then unknown."""
+    """Raise InputError if all photographs are from one side, so that depth is unknown."""
     forward = np.stack([pose[:3, 2] for _, pose in sparse.cameras.values()])
     widest = float(np.degrees(np.arccos(np.clip((forward @ forward.T).min(), -1, 1))))
     if widest < MIN_DEGREES:
@@ -149,9 +154,9 @@ def require_parallax(sparse: SparseModel, folder: Path) -> None:
 def find_cameras(
     pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
 ) -> SparseModel:
-    """The cameras of another tool, else from structure from motion, else from the sheet.
+    """The cameras of another tool, otherwise by structure from motion, otherwise by the sheet.
 
-    On a turntable from the sheet only: structure from motion would track the room. Raises InputError if too few
+    With a turntable only by the sheet: structure from motion would track the room. Raises InputError if too few
     photographs get a camera.
     """
     if turntable:
@@ -166,12 +171,12 @@ def find_cameras(
     except InputError as error:
         if sheet is None or len(sheet.detections) < len(pictures) / 2:
             raise
-        print(f"{error}\nThe cameras are those by the sheet alone.")
+        print(f"{error}\nThe cameras are found by the sheet alone.")
         return cameras_from_sheet(pictures, sheet)
 
 
 def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
-    """Cameras from the sheet alone, in its frame [mm]. Raises InputError if less than half of all get one."""
+    """Cameras by the sheet alone, in its frame [mm]. Raises InputError if fewer than half of all get one."""
     cameras: dict[str, tuple[Lens, np.ndarray]] = {}
     errors: list[float] = []
     for size in dict.fromkeys(picture.size for picture in pictures):
@@ -192,7 +197,10 @@ def flash_from_sheet(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     sheet: SheetObservations,
 ) -> FlashCalibration | None:  # fmt: skip
-    """The flash, about `offset` (3,) from the lens, by the sheet; None if that is not seen. The object is a sphere."""
+    """Calibrate the flash by the sheet, with the object as a sphere; None if no photograph shows the paper.
+
+    `offset` (3,): approximate position of the flash relative to the lens, as for `calibrate_flash`.
+    """
     radii = []
     for name, mask in found.masks.items():
         lens, pose = sparse.cameras[name]
@@ -213,17 +221,17 @@ def posed_pictures(
 ) -> list[PosedPicture]:  # fmt: skip
     """The photographs that have a camera, with their calibration.
 
-    `offset` (3,): of the flash from the lens [scene units], if it is not calibrated. Its intensity is then set so low
-    that fits notice that it is unknown.
+    Without a calibrated `flash`, `offset` (3,) is its position relative to the lens [scene units], and its intensity is
+    that of `ASSUMED_ALBEDO`.
     """
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
     assumed = np.full(3, np.pi * found.radiance / ASSUMED_ALBEDO * sparse.distance(found.center) ** 2)
+    falloff, gamma = (flash.falloff, flash.gamma) if flash else (0.0, 1.0)
     result, placed = [], [picture for picture in pictures if picture.name in sparse.cameras]
     for picture, exposure in zip(placed, relative_exposures(placed)):
         name, (lens, pose) = picture.name, sparse.cameras[picture.name]
         intensity = known.get(name, exposure * (flash.power if flash else assumed))
         light = Light("point", pose[:3, :3] @ offsets[name] + pose[:3, 3], intensity)
-        posed = PosedPicture(picture, lens, pose, found.masks.get(name), light, measured=name in known)
-        result.append(replace(posed, falloff=flash.falloff, gamma=flash.gamma) if flash else posed)
+        result.append(PosedPicture(picture, lens, pose, found.masks.get(name), light, name in known, falloff, gamma))
     return result

@@ -1,4 +1,4 @@
-"""Scenes made of the parts of other scenes: with other lamps, another surface, or without tables."""
+"""Makes scenes from parts of other scenes: with other lamps, another object, or without tables."""
 
 from collections.abc import Iterable
 from typing import Any, Protocol
@@ -11,11 +11,11 @@ from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.xml_elements import load_bsdf
 
-MAX_EXTENT = 4.0  #: radius of a ball that holds the object during a fit, in radii of the normalising sphere
+MAX_EXTENT = 4.0  #: radius of a ball that contains the object during a fit [radius of the normalising sphere]
 
 
 class RenderedObject(Protocol):
-    """What is rendered of a `FittedObject`, which is above this room. Tensors are torch's."""
+    """The parts of a `FittedObject` that are rendered; this room must not import it. Tensors are torch's."""
 
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
     radius: Any  #: its radius, a tensor
@@ -43,28 +43,28 @@ def lamps_of(scene) -> list:
 
 
 def lamp_lights(scene) -> list[Light]:
-    """The `lamps_of` a scene as numbers."""
+    """The lamps of a scene as numbers."""
     return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """A scene with these lamps instead of its `lamps_of`."""
+    """A scene with these lamps instead of its own."""
     before = lamps_of(scene)
     others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
     return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
 
 
 def move_lamps(scene, places, strengths) -> None:
-    """Give new positions or directions and strengths to the `lamps_of` a scene, Floats of 3 numbers for each lamp.
+    """Set the positions or directions, and the strengths, of a scene's lamps: attached Floats with 3 numbers per lamp.
 
-    The lamps must be made by `with_lamps`. The Floats may be attached.
+    The lamps must be made by `with_lamps`.
     """
     for k, lamp in enumerate(lamps_of(scene)):
         move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """A scene of these objects. They keep their ids, and meshes are not merged."""
+    """A scene of these objects. They keep their ids. Meshes are not merged."""
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
@@ -84,10 +84,10 @@ def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
 def with_fitted_shape(
     scene: mi.Scene, shape: mi.Mesh, ring: RenderedObject, unit: float = 1.0
 ) -> tuple[mi.Scene, mi.Mesh]:
-    """A scene with a new shape instead of `shape`, with the BSDF and attributes of a `FittedObject`; and that shape.
+    """A scene with a new shape instead of `shape`, with the BSDF and attributes of a `FittedObject`; and the new shape.
 
-    The shape is in units of `unit` scene units. At first it is a ball about the object: when a scene is assembled, its
-    distant emitters are placed outside of what it contains.
+    Lengths of the shape are in units of `unit` scene units. It is a ball that contains the object, because Mitsuba
+    places distant emitters outside of a scene's bounding sphere when the scene is assembled.
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
@@ -109,7 +109,7 @@ def with_fitted_shape(
 
 
 def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
-    """A scene without its `table` shapes, and a scene of these alone; the same scene and None if there are none."""
+    """A scene without its `table` shapes, and a scene of these; the same scene and None if there are none."""
     tables = [shape for shape in scene.shapes() if is_table(shape)]
     if not tables:
         return scene, None

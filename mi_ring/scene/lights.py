@@ -1,4 +1,4 @@
-"""Point lights and directional lights, as numbers and as emitters of Mitsuba; which emitters light every photograph."""
+"""Point and directional lights, as numbers and as Mitsuba emitters; the emitters that light every photograph."""
 
 from typing import Literal, NamedTuple
 
@@ -18,9 +18,9 @@ class Light(NamedTuple):
 
 
 def position_of(emitter):
-    """Position of an emitter and True, or the direction toward it and False if it is infinitely far away; attached.
+    """Position of an emitter and True, or direction toward a distant emitter and False; attached.
 
-    None for other emitters, like area lights and environment maps.
+    None for other emitters, such as area lights and environment maps.
     """
     params = mi.traverse(emitter)
     match emitter.class_name():
@@ -50,7 +50,7 @@ def emitter_of(light: Light) -> mi.Emitter:
 
 
 def move_lamp(emitter, place, strength) -> None:
-    """Give an emitter made by `emitter_of` a new position, or unit direction toward it, and a new RGB strength.
+    """Set the position, or unit direction toward it, and the RGB strength of an emitter made by `emitter_of`.
 
     Both may be attached.
     """
@@ -74,7 +74,7 @@ def strength_of(emitter):
 def shared_emitters(scene, rooms: bool = False) -> list:
     """The emitters of a scene that light every photograph: all but `flash`, which is the light of one photograph.
 
-    Without `rooms` also without `room` emitters, whose light is in `Photographs.room`.
+    `rooms`: also the `room` emitters, whose light is in `Photographs.room`.
     """
     return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
 

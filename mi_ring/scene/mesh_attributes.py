@@ -10,10 +10,10 @@ from mi_ring.errors import SceneError
 
 
 class Members(mi.TraversalCallback):
-    """Keeps the named members of an object that it traverses; `mi.traverse` itself only keeps numbers.
+    """The named members of an object. `mi.traverse` keeps only numbers.
 
-    Not a local class: Python frees those late, together with the objects that they have seen. As long as a BSDF lives,
-    Dr.Jit compiles it into the kernels of all scenes.
+    This is no local class: Python frees those late, with the objects that they have seen, and Dr.Jit compiles every
+    BSDF in memory into the kernels of all scenes.
     """
 
     def __init__(self, parent):
@@ -43,7 +43,7 @@ def attribute_of(texture) -> str | None:
         return None
     name = re.match(r'MeshAttribute\[\s*name = "([^"]+)"', str(texture))  # Mitsuba has it nowhere else
     if not name:
-        raise SceneError(f"bsdf: it cannot be told which mesh attribute is read by {' '.join(str(texture).split())}")
+        raise SceneError(f"bsdf: the mesh attribute is unknown that is read by {' '.join(str(texture).split())}")
     return name[1]
 
 
@@ -56,25 +56,22 @@ def attributes_of(bsdf) -> set[str]:
 
 
 def require_attributes(shape) -> None:
-    """Raise SceneError if the BSDF of a shape reads a mesh attribute that the shape does not have.
+    """Raise SceneError if a shape lacks a mesh attribute that its BSDF reads, or if its number of channels is wrong.
 
-    Also if it has another number of channels. Mitsuba renders such a shape black, without an error.
+    Mitsuba would render such a shape black, without an error.
     """
     bsdf = shape.bsdf()
     for name in sorted(attributes_of(bsdf)):
         if not shape.is_mesh() or not shape.has_attribute(name):
-            raise SceneError(
-                f'shape "{shape.id()}": its BSDF reads the mesh attribute "{name}", which the shape does not have'
-            )
+            raise SceneError(f'shape "{shape.id()}": its BSDF reads the mesh attribute "{name}", which the shape does '
+                             "not have")  # fmt: skip
     for name, expected in getattr(bsdf, "channels", {}).items():  # of `cooktorrance`
         if attribute := attribute_of(bsdf.textures[name]):
             count = shape.face_count() if attribute.startswith("face_") else shape.vertex_count()
             found = dr.width(mi.traverse(shape)[attribute]) // count
             if found != expected:
-                raise SceneError(
-                    f'shape "{shape.id()}": {name} of its BSDF needs a mesh attribute of {expected} channel(s), '
-                    f'"{attribute}" has {found}'
-                )
+                raise SceneError(f'shape "{shape.id()}": {name} of its BSDF needs a mesh attribute of {expected} '
+                                 f'channel(s), but "{attribute}" has {found}')  # fmt: skip
 
 
 def constant_values(bsdf) -> dict[str, list]:

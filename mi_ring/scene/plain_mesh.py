@@ -8,8 +8,7 @@ POSITIONS, FACES = "vertex_positions", "faces"
 
 
 def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
-    """A mesh of vertices (V, 3) and faces (F, 3), with smooth normals or without, and with texture coordinates (V, 2)
-    if they are given."""
+    """A mesh of vertices (V, 3) and faces (F, 3). `normals`: has it smooth ones? `uv`: (V, 2) texture coordinates."""
     mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
     params = mi.traverse(mesh)
     params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())

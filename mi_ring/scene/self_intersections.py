@@ -5,14 +5,14 @@ import numpy as np
 
 from mi_ring.scene.plain_mesh import scene_of
 
-HIT_OFFSET = 1e-6  #: how far past a hit a ray goes on, for a mesh of size 1: more than float32's rounding error
+HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than float32's rounding error
 
 
 def crossing_triangles(vertices, faces) -> np.ndarray:
-    """Which triangles (F,) bool of a mesh without seams, vertices (V, 3) and faces (F, 3), cross another triangle.
+    """Which triangles (F,) bool of a mesh cross another triangle: vertices (V, 3), faces (F, 3), no seams.
 
-    Two triangles cross where an edge of one pierces the other, so all edges are traced as rays. An edge does not pierce
-    triangles that share a vertex with it. Triangles that overlap in one plane do not count.
+    Two triangles cross if an edge of one pierces the other, so all edges are traced as rays. An edge does not pierce
+    triangles that contain one of its vertices. Triangles that overlap in one plane do not count.
     """
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     low, high = vertices.min(0), vertices.max(0)

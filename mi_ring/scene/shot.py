@@ -1,4 +1,4 @@
-"""A photograph as plain values: its camera, its light, the camera's response and its files."""
+"""A photograph's camera, light, response and files, without Mitsuba."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +18,8 @@ class Files(NamedTuple):
     """The files of a photograph; None where it has none."""
 
     filename: Path | None = None  #: the photograph
-    mask: Path | None = None  #: 0 background, 255 object; `filename` itself if its alpha channel is meant
-    valid: Path | None = None  #: 0 where the photograph shows nothing
+    mask: Path | None = None  #: 0 background, 255 object; equal to `filename` if the alpha channel is the mask
+    valid: Path | None = None  #: 0 where a pixel is ignored
     ambient: Path | None = None  #: the same view without the photograph's own light
 
 
@@ -60,24 +60,24 @@ class Response:
     def changed(
         self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
     ) -> "Response":
-        """With `gamma`, `contrast` and `gain` times these, and `vignetting` plus this."""
+        """A response with `gamma`, `contrast` and `gain` multiplied by these values, and `vignetting` added."""
         red, green, blue = np.multiply(self.gain, gain).tolist()
         return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph of a capture. It never changes; `dataclasses.replace` makes another one with a changed field."""
+    """A photograph of a capture. It is immutable; use `dataclasses.replace` for one with changed fields."""
 
     name: str  #: the sensor's id in the scene file
     camera: Camera
-    light: Light | None = None  #: its own light, which lights no other photograph; None as in `own_light`
+    light: Light | None = None  #: its own light, which lights no other photograph; None: see `own_light`
     falloff: float = 0.0  #: exponent of the cosine between the direction from a point light and where the camera looks
     response: Response = Response()
     files: Files = NO_FILES
     encoding: Encoding = "auto"  #: of the photograph's file
     saturation: float = 1.0  #: encoded value from which a pixel is clipped (1 = full scale)
-    calibrated: bool = False  #: are camera and light exact? Then a fit does not refine them by default
+    calibrated: bool = False  #: are camera and light exact? If so, a fit does not refine them by default
     window: Window | None = None  #: the part of its files that it shows, with the camera of that part; None: all
 
     def through(self, window: Window) -> "Shot":
@@ -111,18 +111,18 @@ class Shot:
 
     @property
     def file_name(self) -> str:
-        """Of the photograph's file, without its folder; `name` where it has no file."""
+        """Name of the photograph's file without folder; `name` if it has no file."""
         return self.files.filename.name if self.files.filename else self.name
 
     @property
     def own_light(self) -> Light:
-        """`light`, or where it is None a point light of intensity 1 at the camera's centre."""
+        """`light`; if it is None, a point light of intensity 1 at the camera."""
         return self.light or Light("point", self.camera.position, np.ones(3))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
-        """The same photograph, its camera and light in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """The photograph after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,) of camera and light."""
         light = self.own_light
-        if light.kind == "point":  # as bright as before from scaled distances
+        if light.kind == "point":  # scaled so that irradiance does not change
             light = Light("point", scale * rotation @ light.vector + shift, scale**2 * light.rgb)
         else:
             light = light._replace(vector=rotation @ light.vector)

@@ -1,4 +1,4 @@
-"""Which parts of a surface the photographs show."""
+"""Finds which parts of a surface the photographs show."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.scene.assembly import RenderedObject
 from mi_ring.scene.plain_mesh import mesh_of
 
-SURFACE_OFFSET = 1e-5  #: of a ray's origin from the surface, for a mesh of size 1: more than float32's rounding error
+SURFACE_OFFSET = 1e-5  #: of rays from the surface, for a mesh of size 1: more than float32's rounding error
 
 
 class MaskedCamera(NamedTuple):
-    """The camera of a photograph, and which of its pixels are valid."""
+    """The camera of a photograph, and its valid pixels."""
 
     camera: Camera
     valid: np.ndarray | None  #: (H, W) uint8, 0 where a pixel is not valid; None if all are
@@ -74,9 +74,9 @@ def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
 def visible_points(
     ring: RenderedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
 ) -> tuple[np.ndarray, float]:
-    """Which domain points (V, 3), vertices of faces (F, 3), are seen on the object, (V,) bool.
+    """Which vertices of a mesh of the domain are seen on the object, (V,) bool, and the share of area that is not seen.
 
-    And the share of the object's area that is not seen.
+    `s` (V, 3): the vertices in the domain; `faces` (F, 3).
     """
     with torch.no_grad():
         vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()

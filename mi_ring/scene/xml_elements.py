@@ -1,4 +1,4 @@
-"""XML elements as objects of Mitsuba."""
+"""Makes Mitsuba objects of XML elements."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -8,7 +8,7 @@ from mi_ring.errors import InputError
 
 
 def require_parts(root: ElementTree.Element) -> None:
-    """Raise RuntimeError for elements that lack a part without which Mitsuba crashes."""
+    """Raise RuntimeError if an element lacks a part without which Mitsuba crashes."""
     for element in root.iter():
         if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
             raise RuntimeError("bitmap: filename is missing")
@@ -17,7 +17,7 @@ def require_parts(root: ElementTree.Element) -> None:
 
 
 def load_element(element: ElementTree.Element) -> mi.Object:
-    """An element as an object of Mitsuba. Raises RuntimeError if Mitsuba refuses it."""
+    """Load an element as a Mitsuba object. Raises RuntimeError if Mitsuba refuses it."""
     require_parts(element)
     whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
     whole.extend(element)

@@ -1,4 +1,4 @@
-"""Simulated errors of photographs and calibration: sensor noise, quantisation, exposure, wrong cameras and lights."""
+"""Simulated errors: sensor noise, quantisation, varying exposure, wrong cameras and lights."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,21 +12,21 @@ from mi_ring.scene.shot import Shot
 
 Format = Literal["exr", "png16", "png8"]
 
-NOISE_LIMIT = 16.0  #: radiance is clipped here before noise is drawn [full scale]
-HALF_LIMIT = 6e4  #: radiance is clipped here before it is written as half floats
+NOISE_LIMIT = 16.0  #: radiance is clipped to this before noise is added [full scale]
+HALF_LIMIT = 6e4  #: radiance is clipped to this before it is written as half floats
 
 
-def noisy(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
-    """Linear values with shot noise, by `electrons` at full scale (0: none), and `read` noise [electrons]."""
-    full = electrons or 10_000.0  # the unit of read noise where there is no shot noise
+def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
+    """Linear values with shot noise of `electrons` at full scale (0: none), and `read` noise [electrons]."""
+    full = electrons or 10_000.0  # unit of read noise if there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
     if electrons:
         value = random.poisson(value).astype(float)
     return (value + random.normal(0, read, value.shape)) / full
 
 
-def encoded(linear: np.ndarray, kind: Format) -> np.ndarray:
-    """Pixels (H, W, 3) as in the file: linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
+def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
+    """Encoded pixels (H, W, 3): linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
     if kind == "exr":
         return np.clip(linear, 0, HALF_LIMIT).astype(np.float16)
     if kind == "png16":
@@ -35,7 +35,7 @@ def encoded(linear: np.ndarray, kind: Format) -> np.ndarray:
 
 
 def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndarray:
-    """(count, 3) lognormal factors: `spread` per cent for all channels, and a third of it for each channel."""
+    """(count, 3) lognormal factors with standard deviation `spread` [%], plus a third of it for each channel."""
     return np.exp(random.normal(0, spread / 100, (count, 1)) + random.normal(0, spread / 300, (count, 3)))
 
 
@@ -43,12 +43,11 @@ def miscalibrated(
     shots: Sequence[Shot], center: np.ndarray, random: np.random.Generator, turned: float = 0.0, shifted: float = 0.0,
     scaled: float = 0.0,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Photographs with known errors of cameras and lights. Distances are those of the cameras from the `center` (3,).
+    """Photographs with random errors of cameras and lights. Distances are from the camera to `center` (3,).
 
-    `turned`: standard deviation of each camera's rotation about each of its axes [deg], and of its translation along
-    each [% of the distance]; its flash moves with it. `shifted`: all point lights move by so many per cent of the
-    distance, in one direction of the cameras' axes. `scaled`: standard deviation of a lognormal factor of each light's
-    power [%].
+    `turned`: standard deviation of a camera's rotation about each axis [deg] and of its translation along each axis [%
+    of the distance]; its flash moves with it. `shifted`: translation of all point lights [% of the distance], in one
+    direction in the camera's axes. `scaled`: standard deviation of a lognormal factor of a light's power [%].
     """
     wrong = []
     direction = random.normal(size=3)

@@ -21,12 +21,12 @@ from mi_ring.system.progress import progress
 
 CENTER, HEIGHT = np.array([40.0, -15.0, 110.0]), 80.0  #: of the pot [mm]; y is up
 VIEWS, SIZE, FOCAL = 28, 192, 400.0  #: number of photographs, their width and height [px], focal length [px]
-DISTANCE = 230.0  #: from the camera to the middle of the pot [mm]
+DISTANCE = 230.0  #: from a camera to the middle of the pot [mm]
 FLASH = np.array([18.0, 12.0, 0.0])  #: position of the flash relative to the lens: left, up, forward [mm]
 SPP, DEPTH = 64, 4  #: paths per pixel, and their greatest depth
 BRIGHTNESS = 0.9  #: linear pixel value of a white surface that faces the flash
 
-#: Profile of the pot, (radius, height) in units of its height: foot, belly, shoulder, neck, lip, closed top.
+#: Profile of the pot, (radius, height) [height of the pot]: foot, belly, shoulder, neck, lip, closed top.
 PROFILE = np.array([
     (0.0, -0.5), (0.19, -0.49), (0.19, -0.43), (0.24, -0.33), (0.36, -0.1), (0.31, 0.14), (0.18, 0.28), (0.16, 0.36),
     (0.23, 0.46), (0.16, 0.49), (0.0, 0.46),
@@ -46,12 +46,12 @@ class ColouredMesh(NamedTuple):
 
 
 def pot(level: int = 6) -> ColouredMesh:
-    """A closed pot: a profile rotated about y, with flutes, flattened, and leaning a little."""
+    """A closed pot: `PROFILE` rotated about y, fluted, flattened and sheared. `level`: subdivisions of the sphere."""
     sphere = trimesh.creation.icosphere(subdivisions=level)
     x, y, z = sphere.vertices.T
     t, angle = np.arccos(np.clip(-y, -1, 1)) / np.pi, np.arctan2(z, x)  # position along the profile, and around y
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(PROFILE, axis=0), axis=1)))
-    # At both ends the height has slope 0 and the radius has curvature 0: no tips.
+    # At both ends the height has slope 0 and the radius has curvature 0, so that the surface is smooth there.
     radius, height = (
         CubicSpline(along / along[-1], values, bc_type=((order, 0.0), (order, 0.0)))(t)
         for values, order in zip(PROFILE.T, (2, 1))

@@ -1,4 +1,4 @@
-"""Lights of a synthetic capture: one for each photograph, further lamps, the room, and environments."""
+"""Lights of a synthetic capture: one per photograph, further lamps, and the room."""
 
 from typing import Literal
 
@@ -11,11 +11,11 @@ from mi_ring.scene.lights import Light
 LightKind = Literal["flash", "point", "distant", "lamp"]
 RoomKind = Literal["constant", "harmonics"]
 
-LOW_ORDERS = 9  #: number of spherical harmonics of orders 0 to 2; a room has no others
+LOW_ORDERS = 9  #: number of spherical harmonics of orders 0 to 2, which a room has
 TINT, CONTRAST = 0.12, 0.5  #: of a room's light: variation of the colours, standard deviation of each harmonic
 CANDIDATES = 4  #: random directions for a further lamp; the one farthest from the other lamps is taken
-WEAKEST = 0.4  #: least intensity of a further lamp, in units of the first lamp's
-DARKEST = 0.15  #: least radiance of a room in any direction, in units of its mean
+WEAKEST = 0.4  #: least intensity of a further lamp [intensity of the first lamp]
+DARKEST = 0.15  #: least radiance of a room in any direction [its mean radiance]
 
 
 def lights_of(
@@ -24,9 +24,9 @@ def lights_of(
 ) -> list[Light]:  # fmt: skip
     """A light for each camera. The median irradiance of a surface at the origin that faces its light is 1 W/m².
 
-    All point lights have the same intensity. `offset`: of a flash from the lens, left, up and forward, in units of the
-    camera's distance from the origin. `spread`: largest angle between camera and point or distant light, seen from the
-    origin [deg]. `distance`: of a lamp, which is in one place for all photographs.
+    All point lights have one intensity. `offset`: of a flash from the lens, left, up and forward [distance of the
+    camera from the origin]. `spread`: largest angle between a camera and its point or distant light, seen from the
+    origin [deg]. `distance`: of a lamp from the origin; it is in one place for all photographs.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
@@ -34,7 +34,7 @@ def lights_of(
         away = random.normal(size=3)
         places = [distance * away / np.linalg.norm(away)] * len(cameras)
     else:
-        places = [near(camera.position, np.radians(spread), random) for camera in cameras]
+        places = [rotate_randomly(camera.position, np.radians(spread), random) for camera in cameras]
     if kind == "distant":
         return [Light("directional", -place / np.linalg.norm(place), np.ones(3)) for place in places]
     intensity = np.full(3, np.median([place @ place for place in places] or [0]))
@@ -42,7 +42,7 @@ def lights_of(
 
 
 def further_lamps(count: int, first: Light, random: np.random.Generator) -> list[Light]:
-    """Lamps at the distance of the `first` from the origin, in other directions, weaker and of other colours."""
+    """`count` lamps at the `first` one's distance from the origin, in other directions, weaker, of other colours."""
     distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
     lights = []
     for _ in range(count):
@@ -54,8 +54,8 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
     return lights
 
 
-def near(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-    """A random point (3,) as far from the origin as `position`, within an angle of `spread` [rad] from it."""
+def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
+    """`position` (3,), rotated about the origin by a random angle up to `spread` [rad] in a random direction."""
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -65,7 +65,7 @@ def near(position: np.ndarray, spread: float, random: np.random.Generator) -> np
 
 
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera."""
+    """Random spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera."""
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
     room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)

@@ -1,4 +1,4 @@
-"""Materials of the object: any BSDF of Mitsuba, a measured BRDF, or two of these in a pattern."""
+"""Materials of the object: any Mitsuba BSDF, a measured BRDF, or two of these in a pattern."""
 
 import re
 import shlex
@@ -19,27 +19,27 @@ from mi_ring.scene.xml_elements import load_element
 COLOURS = "vertex_color"  #: name of the mesh attribute with the colours of the mesh file
 COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: default material of a mesh with colours
 PLAIN = "principled base_color=0.55,0.4,0.25 roughness=0.4"  #: default material of other meshes
-FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin and its parameters"
+FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin with its parameters"
 
 
 class Pattern(NamedTuple):
-    """Where on a surface the second of two materials is: a texture, projected along one axis of the world."""
+    """A texture that says where a surface has the second of two materials. It is projected along one axis."""
 
-    weights: np.ndarray  #: (rows, columns) share of the second material; repeats
+    weights: np.ndarray  #: (rows, columns) share of the second material; the texture repeats
     uv: np.ndarray  #: (V, 2) texture coordinates of the vertices
 
     def blend(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
-        """Both materials as one BSDF."""
+        """A BSDF that blends both materials by this texture."""
         pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
         nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
         return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
 
 
 def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
-    """Pattern over the bounding box of vertices (V, 3): "stripes", "checks", or the bright parts of a picture file.
+    """Pattern on vertices (V, 3). `kind`: "stripes", "checks", or an image file whose bright pixels are used.
 
-    `bands`: number of stripes or checks along the axis `up` (0, 1 or 2). Texture coordinates are linear in space:
-    edges are sharp on coarse meshes, too. Raises InputError, which names the `field`, if a picture cannot be read.
+    `bands`: number of stripes or checks along the axis `up` (0, 1 or 2). Texture coordinates are linear in space, so
+    that edges are sharp on coarse meshes. Raises InputError, which names the `field`, if the image cannot be read.
     """
     low, high = vertices.min(0), vertices.max(0)
     across, height = (up + 1) % 3 if up != 1 else 0, max(high[up] - low[up], 1e-9)
@@ -58,7 +58,7 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """The BSDF that a text in one of the `FORMS` describes. `coloured`: has the mesh colours? Raises InputError."""
+    """The BSDF for a text in one of the `FORMS`. `coloured`: does the mesh have colours? Raises InputError."""
     file, _, name = text.partition(".npz:")
     path = Path(f"{file}.npz" if name else text)
     found: Any = None
@@ -69,7 +69,7 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
                 root = ElementTree.fromstring(path.read_bytes())
             if root.tag != "bsdf":
                 raise InputError(f"{path}: {field}: begins with <{root.tag}>, must be one <bsdf>")
-            move_names(root, path.resolve().parent, Path.cwd())  # they are relative to the file
+            move_names(root, path.resolve().parent, Path.cwd())  # names are relative to the file
             found = load_element(root)
         elif ".npz" in text.lower() or text.lower().endswith(".binary"):
             require_file(path, FORMS, field)
@@ -78,14 +78,14 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
         else:
             found = mi.load_dict(parse_plugin(text, field, coloured))
     except RuntimeError as error:
-        raise InputError(f"{field}: {text}: {explained(str(error))}") from error
+        raise InputError(f"{field}: {text}: {explain(str(error))}") from error
     if not isinstance(found, mi.BSDF):
         raise InputError(f"{field}: {text}: is no BSDF; give {FORMS}")
     return found
 
 
-def explained(message: str) -> str:
-    """A message of Mitsuba about a plugin or its parameters, in the words of a command line."""
+def explain(message: str) -> str:
+    """A message of Mitsuba about a plugin or its parameters, rewritten for users of the command."""
     if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
     if kind := re.search(r"Plugin \"(.*?)\" not found", message):
@@ -103,7 +103,7 @@ def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{field}: is {text!r} ({error}); give {FORMS}") from error
     if name in ("bitmap", "blendbsdf"):  # Mitsuba crashes if their nested parts are missing
-        raise InputError(f"{field}: {text}: has parts that are no numbers and colours; give {FORMS}")
+        raise InputError(f"{field}: {text}: needs nested parts, which only an .xml can give; give {FORMS}")
     result: dict[str, Any] = {"type": name}
     for word in words:
         key, sign, value = word.partition("=")

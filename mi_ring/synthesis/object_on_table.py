@@ -1,4 +1,4 @@
-"""The object of a synthetic capture, the table that it may stand on, and their pictures under one light."""
+"""The object of a synthetic capture, its table, and their images under one light."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -21,18 +21,18 @@ from mi_ring.synthesis.materials import COLOURS, Pattern
 from mi_ring.synthesis.tracing import LensCamera, clamped_radiance_along, hits_along, pixel_means, radiance_along
 
 SMOOTH = 10_000  #: least number of vertices after subdivision
-TABLE, BELOW = 8.0, 2e-3  #: side of the table, and its distance below the sheet [object radii]
+TABLE, BELOW = 8.0, 2e-3  #: side of the table, and its distance below the sheet [radius of the object]
 WOOD = 0.42, 0.3, 0.2  #: sRGB colour of the table
-BRIGHTEST = 4.0  #: most indirect light of one path, in units of the radiance of a white surface in the light
+BRIGHTEST = 4.0  #: largest indirect radiance of a path [radiance of a white surface in the light]
 PAPER, INK = 0.8, 0.05  #: albedos
-DOTS_PER_PIXEL = 3  #: of the printed page, in the texture of the sheet
+DOTS_PER_PIXEL = 3  #: dots of the printed page per pixel of the sheet's texture
 
 
 class ObjectOnTable:
-    """An object with its BSDF, and the shapes that it stands on, if any."""
+    """An object with its BSDF, and the shapes on which it stands."""
 
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
-        """`vertices` (V, 3) of the object: without a table only the pixels around them are rendered."""
+        """`vertices` (V, 3): of the object; without a table, only the pixels around them are rendered."""
         self.object, self.vertices, self.tables = mesh, vertices, list(tables)
 
     def under(self, emitter: mi.Object) -> mi.Scene:
@@ -43,7 +43,7 @@ class ObjectOnTable:
     def radiance(
         self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
-        """Linear radiance (H, W, 3) under one light. `hidden`: an environment is invisible itself."""
+        """Linear radiance (H, W, 3) under one light. `hidden`: an environment map is not visible."""
         trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
         if isinstance(light, Light):
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
@@ -61,15 +61,15 @@ class ObjectOnTable:
 
 
 def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimesh, np.ndarray | None, np.ndarray]:
-    """A mesh file with the middle of its bounding box at the origin and its farthest vertex at `radius`.
+    """Read a mesh. Moves the middle of its bounding box to the origin, and scales its farthest vertex to `radius`.
 
-    Returns the mesh, its linear colours (V, 3) or None, and the matrix (4, 4) that moved it. `smooth`: Loop subdivision
-    to at least `SMOOTH` vertices. Raises InputError if the file has no surface.
+    Returns the mesh, its linear colours (V, 3) or None, and the matrix (4, 4) of that motion. `smooth`: Loop
+    subdivision to at least `SMOOTH` vertices. Raises InputError if the file has no surface.
     """
     mesh = read_mesh(path, "MESH")
     mesh.remove_unreferenced_vertices()
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all() or not np.ptp(mesh.vertices, axis=0).any():
-        raise InputError(f"{path}: MESH: has {len(mesh.faces)} triangles, and must have some, of finite size")
+        raise InputError(f"{path}: MESH: has {len(mesh.faces)} triangles; must have some, of finite size")
     colours = None
     visual: Any = mesh.visual
     names = "image", "baseColorTexture"  # attributes of trimesh's materials
@@ -86,7 +86,7 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
             mesh = mesh.subdivide_loop(1)
         except ValueError as error:
             raise InputError(f"{path}: MESH: has edges of more than two triangles, which --smooth cannot subdivide; "
-                             "leave that out") from error  # fmt: skip
+                             "leave it out") from error  # fmt: skip
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
         mesh.invert()
     middle = mesh.bounds.mean(0)
@@ -98,7 +98,7 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
 
 
 def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
-    """The object as a shape of Mitsuba with smooth normals."""
+    """The object as a Mitsuba shape with smooth normals. `colours`: (V, 3) linear, or None."""
     shape = mesh_of(mesh.vertices, mesh.faces, uv=None if pattern is None else pattern.uv)
     if colours is not None:
         shape.add_attribute(COLOURS, 3, colours.ravel().tolist())
@@ -107,7 +107,7 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, p
 
 
 def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
-    """XML of a table at `ground` (3,) with normal `up` (3,), and of the sheet on it. Writes textures to the folder."""
+    """XML of a table at `ground` (3,) with normal `up` (3,), and of the `sheet` on it. Writes their textures."""
     right = np.roll(up, 1)
     pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}
     if sheet:

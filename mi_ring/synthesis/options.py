@@ -15,26 +15,28 @@ from mi_ring.synthesis.viewpoints import CameraKind
 
 @dataclass(frozen=True)
 class SynthesizeConfig:
-    """Path trace a capture of a mesh: photographs, masks and scene file, with the truth beside them.
+    """Path trace a capture of a mesh: photographs, masks and scene file, and the ground truth.
 
-    The middle of the mesh's bounding box is moved to the origin, and its farthest vertex to --radius; its axes stay. A
-    material is one of these: a file .xml with one <bsdf>; a table .binary of MERL; FILE.npz:MATERIAL, networks fitted
-    to such tables; or a plugin of Mitsuba with its parameters, as in "principled base_color=0.6,0.2,0.1 roughness=0.3".
-    The value vertex_color means the colours of the mesh's file.
+    The middle of the mesh's bounding box is moved to the origin, and its farthest vertex is scaled to --radius. The
+    mesh is not rotated.
+
+    A material is one of these: a file .xml with one <bsdf>; a table .binary of MERL; FILE.npz:MATERIAL, networks fitted
+    to such tables; or a Mitsuba plugin with its parameters, as in "principled base_color=0.6,0.2,0.1 roughness=0.3".
+    The value vertex_color means the colours in the mesh's file.
 
     After an interruption the same command continues.
     """
 
     mesh: Positional[Annotated[Path, arg(metavar="MESH")]]
-    """Mesh to photograph: PLY, OBJ, GLB, STL or any other format of trimesh. It should be closed."""
+    """Mesh to render: PLY, OBJ, GLB, STL or any other format of trimesh. It should be closed."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder to write."""
 
     material: str | None = None
     """Material of the object.
-    Without it: principled, with the colours of the mesh's file or one colour."""
+    Without it: principled, with the colours in the mesh's file, or one colour if it has none."""
     second: str | None = None
-    """A second material, in the places that --pattern says."""
+    """Second material, where --pattern says."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
     """Where the second material is.
     stripes: in stripes across the object. checks: in a checkerboard.
@@ -52,46 +54,47 @@ class SynthesizeConfig:
     """Number of photographs."""
     novel: int = 10
     """Number of further photographs, in truth/images, to test a fit.
-    They are from other places, without noise and errors."""
+    They are from other viewpoints, without noise and errors."""
     size: tuple[int, int] = (512, 512)
     """Width and height of the photographs [px]."""
     fov: float = 60.0
     """Horizontal field of view [deg]."""
     cameras: CameraKind = "around"
     """Where the cameras are.
-    around: evenly around the object, aimed at its middle. free: as held by hand, tilted, at varying distances.
+    around: evenly around the object, aimed at its middle. free: as if hand-held, tilted, at varying distances.
     turntable: the object turns; camera and --room stand still."""
     elevations: tuple[float, ...] = (20.0, 55.0)
-    """Elevation of each ring of cameras of a turntable [deg]."""
+    """Elevation of each ring of cameras around a turntable [deg]."""
     distance: float | None = None
     """Distance of the cameras from the middle of the object [radii of the object].
-    Without it: such that the object just fills the photograph."""
+    Without it: the object just fills the photograph."""
 
     light: LightKind = "flash"
-    """The light of the photographs.
-    flash: a point light at the lens. point: a point light elsewhere, as far away. distant: parallel light.
-    lamp: a point light in one place for all photographs."""
+    """Light of each photograph.
+    flash: a point light at the lens. point: a point light elsewhere, at the camera's distance. distant: parallel light.
+    lamp: one point light for all photographs."""
     lamps: int = 1
     """Number of lamps, for --light lamp.
-    The first is the photographs' light, the others are emitters of the scene."""
+    The first one is the photographs' light; the others are emitters of the scene."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: left, up and forward.
     The unit is the distance from the camera to the object."""
     spread: float = 40.0
     """Largest angle between a point or distant light and the camera, seen from the object [deg]."""
     room: float = 0.0
-    """Light of the room: its irradiance, relative to that of the photographs' light on a surface that faces it."""
+    """Irradiance by the room's light, relative to that of a surface that faces the photograph's light. 0: dark room."""
     room_kind: RoomKind = "constant"
-    """constant: the same from all sides. harmonics: brighter from some sides, spherical harmonics of order 2."""
+    """Distribution of the room's light.
+    constant: the same from all sides. harmonics: brighter from some sides, by spherical harmonics of order 2."""
     pairs: bool = False
-    """Take each view a second time, by the light of --room alone.
+    """Render each view a second time, under the light of --room alone.
     A fit subtracts these photographs (`ambient`)."""
     environment: Path | None = None
-    """Environment map that lights the object in place of --light: EXR or HDR, latitude and longitude."""
+    """Environment map (EXR or HDR, latitude and longitude) that lights the object instead of --light."""
     table: Literal["none", "plain", "sheet"] = "none"
-    """What the object stands on.
-    none: nothing. plain: a table. sheet: a table with the sheet of mi-ring board, and --radius in millimetres.
-    No camera is below a table."""
+    """Table below the object.
+    none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres.
+    No camera is below the table."""
 
     format: Format = "exr"
     """Format of the photographs. exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits."""
@@ -99,38 +102,37 @@ class SynthesizeConfig:
     """Linear pixel value of a white surface at the object that faces the light.
     Without it: chosen by --clipped."""
     clipped: float = 0.02
-    """Chooses the exposure: this share of the object's pixels is overexposed. Not used with --exposure."""
+    """Share of the object's pixels that are overexposed, which determines the exposure. Not used with --exposure."""
     electrons: float = 0.0
-    """Electrons of a pixel at full scale. Fewer electrons give more shot noise.
-    0: no shot noise."""
+    """Electrons of a pixel at full scale. Fewer electrons give more shot noise. 0: no shot noise."""
     read: float = 0.0
     """Standard deviation of the read noise [electrons].
     Without --electrons the unit is 1/10,000 of full scale."""
 
     wrong_cameras: float = 0.0
-    """Error of the cameras in the scene file, standard deviation.
-    N turns each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
+    """Standard deviation of errors of the cameras in the scene file.
+    N rotates each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
     wrong_light: float = 0.0
     """Error of the positions of point lights in the scene file [% of the distance].
-    It is the same for all, in the axes of the cameras."""
+    It is the same for all lights, in the axes of their cameras."""
     wrong_power: float = 0.0
-    """Error of the power of each light in the scene file, standard deviation [%]."""
+    """Standard deviation of errors of each light's power in the scene file [%]."""
     wrong_exposure: float = 0.0
-    """Variation of the exposure of the photographs that the scene file does not mention, standard deviation [%].
+    """Standard deviation of the photographs' exposures, which are not in the scene file [%].
     A third of it varies the white balance."""
     wrong_room: bool = False
     """Leave --room, --environment and all --lamps but the first out of the scene file."""
 
     spp: int = 64
-    """Paths per pixel, rounded up to a square number. More give less noise."""
+    """Paths per pixel, rounded up to a square number. More paths give less noise."""
     depth: int = 5
-    """Longest path, `max_depth` of Mitsuba's path tracer. 2 is direct light alone."""
+    """Largest length of paths, `max_depth` of Mitsuba's path tracer. 2: direct light only."""
     seed: int = 0
     """Random seed of cameras, lights, noise and paths."""
 
     @property
     def exact(self) -> bool:
-        """Is all calibration in the scene file exact?"""
+        """Is the calibration in the scene file exact?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
@@ -141,12 +143,12 @@ class SynthesizeConfig:
 
     @property
     def camera_distance(self) -> float:
-        """From the cameras to the middle of the object [scene units]."""
+        """Distance from the cameras to the middle of the object [scene units]."""
         half = np.arctan(min(self.size) / self.size[0] * np.tan(np.radians(self.fov / 2)))
         return float(self.radius * (1.04 / np.sin(half) if self.distance is None else self.distance))
 
 
-#: Least and greatest value of numeric options.
+#: Least and greatest value of each numeric option.
 RANGES = {
     "views": (1, 10_000), "novel": (0, 10_000), "fov": (1, 150), "bands": (1, 1000), "radius": (1e-6, 1e6),
     "lamps": (1, 8), "spread": (0, 80), "room": (0, 10), "clipped": (0, 0.9), "electrons": (0, 1e7), "read": (0, 1e5),
@@ -167,8 +169,8 @@ def require_options(config: SynthesizeConfig) -> None:
     if config.table != "none" and config.cameras == "turntable" and min(config.elevations) < 1:
         raise InputError("--elevations: has cameras below the table; give 1 degree or more, or leave out --table")
     if config.cameras == "turntable" and (config.environment or config.light == "lamp"):
-        raise InputError("--cameras: is turntable, beside which an --environment or a --light lamp would turn with the "
-                         "object; give --room 0.2 --room-kind harmonics, which stands with the camera")  # fmt: skip
+        raise InputError("--cameras: is turntable; an --environment or a --light lamp would turn with the object; give "
+                         "--room 0.2 --room-kind harmonics, which stands still like the camera")  # fmt: skip
     if config.distance is not None and not 1.05 <= config.distance <= 1000:
         raise InputError(f"--distance: is {config.distance}, must be 1.05 to 1000 radii of the object")
     if config.pattern != "stripes" and not config.second:
@@ -180,14 +182,14 @@ def require_options(config: SynthesizeConfig) -> None:
     if config.exposure is not None and not 0 < config.exposure <= 1e6:
         raise InputError(f"--exposure: is {config.exposure}, must be above 0")
     if config.exposure is not None and config.clipped != SynthesizeConfig.clipped:
-        raise InputError("--clipped: is what the exposure is chosen by; leave it out, or --exposure")
+        raise InputError("--clipped: determines the exposure, as --exposure does; leave out one of them")
     if not np.linalg.norm(config.offset) < 1:
-        raise InputError("--offset: reaches the object; it is in distances from camera to object, for instance 0.1 0 0")
+        raise InputError("--offset: reaches the object; its unit is the camera's distance; give for instance 0.1 0 0")
     if config.environment:
         require_file(config.environment, "an EXR or HDR file of latitude and longitude", "--environment")
         given = [name for name in ("room", "wrong_light", "wrong_power") if getattr(config, name)]
         if config.light != "flash" or any(config.offset) or given:
-            raise InputError("--environment: is instead of the photographs' lights and the room; leave out --light, "
+            raise InputError("--environment: replaces the photographs' lights and the room; leave out --light, "
                              "--offset, --room, --wrong-light and --wrong-power")  # fmt: skip
     if config.pairs and (config.room == 0 or config.wrong_room):
         raise InputError("--pairs: need a room; give --room, for instance 0.2, and leave out --wrong-room")

@@ -1,4 +1,4 @@
-"""A synthetic capture of a known object, picture by picture: photographs, masks, scene file, and ground truth."""
+"""Path traces a synthetic capture of a known object: photographs, masks, scene file, and ground truth."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
 from mi_ring.synthesis import light_sources
-from mi_ring.synthesis.degradation import HALF_LIMIT, encoded, exposures, miscalibrated, noisy
+from mi_ring.synthesis.degradation import HALF_LIMIT, encode, exposures, miscalibrated, with_noise
 from mi_ring.synthesis.materials import COLOURED, PLAIN, load_material, pattern_of
 from mi_ring.synthesis.object_on_table import ObjectOnTable, load_object, shape_of, table_elements
 from mi_ring.synthesis.options import SynthesizeConfig
@@ -35,10 +35,10 @@ from mi_ring.synthesis.viewpoints import poses
 from mi_ring.system.files import quoted, read_json, write_file, writing
 from mi_ring.system.progress import progress
 
-LAMP_SEED_STEP = 100_003  #: between the seeds of pictures of one photograph by different lamps
-TRIALS, TRIAL_SCALE = 8, 8  #: number of photographs that determine the exposure, and how much smaller they are
-SETTINGS = "truth/settings.json"  #: the options of a capture, by which the same command continues it
-#: How files other than XML name further files that belong to them.
+LAMP_SEED_STEP = 100_003  #: between the seeds of one photograph's images under different lamps
+TRIALS, TRIAL_SCALE = 8, 8  #: number of photographs that determine the exposure, and factor by which they are smaller
+SETTINGS = "truth/settings.json"  #: the options of a capture, to recognise the command that continues it
+#: Patterns of the names of further files in files other than XML, by suffix.
 REFERENCES = {
     ".obj": rb"^mtllib\s+(.+?)\s*$", ".mtl": rb"^\s*(?i:map_kd)\s+(.+?)\s*$",
     ".gltf": rb"\"uri\"\s*:\s*\"([^\"]{1,500})\"", ".ply": rb"^comment (?i:texturefile) (.+?)\s*$",
@@ -46,10 +46,10 @@ REFERENCES = {
 
 
 class PlannedPhotograph(NamedTuple):
-    """A photograph to take."""
+    """A photograph to render."""
 
     camera: Camera
-    light: Light  #: irradiance 1 W/m² at the object
+    light: Light  #: brings 1 W/m² to the object
     name: str
     file: str  #: name of the image file
     seed: int
@@ -76,16 +76,16 @@ class Studio:
         self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
 
     def random(self, *purpose: int) -> np.random.Generator:
-        """A generator for one purpose, so that an option changes nothing but what it is for."""
+        """A generator for one purpose, so that an option does not change the random numbers of others."""
         return np.random.default_rng([self.config.seed, *purpose])
 
     @property
     def ground(self) -> np.ndarray:
-        """(3,) the point of the vertical axis at the height of the object's lowest point."""
+        """(3,) point on the vertical axis through the origin, as low as the object's lowest point."""
         return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
     def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:
-        """Photographs to take. `novel`: by a hand-held camera, from other places."""
+        """Photographs to render. `novel`: by a hand-held camera, from other viewpoints."""
         config = self.config
         pose = poses("free" if novel else config.cameras, count, config.radius, config.camera_distance, config.up_axis,
                      self.random(2, novel), config.elevations, config.table != "none")  # fmt: skip
@@ -100,7 +100,7 @@ class Studio:
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 
     def further_lamps(self, first: Light) -> list[Light]:
-        """The lamps that the scene has as emitters of its own, beside the `first`, which photographs name."""
+        """All lamps but the `first`, which is the photographs' own light."""
         return light_sources.further_lamps(self.config.lamps - 1, first, self.random(8))
 
     def environment_element(self, scale: float = 1.0) -> Element:
@@ -114,12 +114,12 @@ class Studio:
         scenefile.add_pose(element, upright)
         with reading(f"{file}: --environment", "an EXR or HDR file of latitude and longitude"):
             if file.suffix.lower() == ".exr":
-                read_image(file)  # refuses files that would need too much memory; Mitsuba does not
+                read_image(file)  # checks how much memory it needs; Mitsuba does not
             load_element(element)
         return element
 
     def build(self, folder: Path) -> ObjectOnTable:
-        """The object, and the table below it, whose pictures are written into the `folder`."""
+        """The object and its table, whose textures are written to the `folder`."""
         config, shapes = self.config, []
         if config.table != "none":
             self.tables = table_elements(folder, self.ground, config.up_axis, config.radius, config.table == "sheet")
@@ -129,7 +129,7 @@ class Studio:
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
     def radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Linear radiance (H, W, 3) by all lamps, of which the first brings 1 W/m². `scale`: times smaller."""
+        """Linear radiance (H, W, 3) under all lamps, of which the first brings 1 W/m². `scale`: how much smaller."""
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
         light = taken.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
@@ -138,7 +138,7 @@ class Studio:
         return picture
 
     def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """As `radiance`, by the room. It is a picture of its own: paths that choose between lights are noisier."""
+        """As `radiance`, under the room's light: less noise than by paths that choose between lights."""
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
             return np.zeros((*reversed(view.camera.size), 3))
@@ -147,7 +147,7 @@ class Studio:
         return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
-        """Pixel value of radiance 1: from --exposure, or such that a share --clipped of the object is clipped."""
+        """Pixel value of radiance 1, by --exposure, or so that the share --clipped of the object is overexposed."""
         config = self.config
         if config.exposure is not None:
             return config.exposure * (1.0 if self.environment is not None else np.pi)
@@ -157,16 +157,16 @@ class Studio:
             both = self.radiance(scene, photograph, 36, scale) + self.room_radiance(scene, photograph, 36, scale)
             values.append(both[inside].max(-1))
         if not np.concatenate(values).size:
-            raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows it alone, by which "
-                             "the exposure would be chosen; give --exposure, for instance 0.5")  # fmt: skip
+            raise InputError(f"{config.mesh}: MESH: is so thin or so far away that no pixel shows only the object, to "
+                             "determine the exposure; give --exposure, for instance 0.5")  # fmt: skip
         bright = float(np.quantile(np.concatenate(values), 1 - config.clipped))
         if not bright > 0:
-            raise InputError(f"{config.mesh}: MESH: is black, whatever the light; do its faces point inward?")
+            raise InputError(f"{config.mesh}: MESH: is black under all lights; do its faces point inward?")
         return 1 / bright
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write a capture or its missing part, the scene file last. Raises InputError, as `Studio` and `claim` do."""
+    """Write a capture, or its missing part, with the scene file last. Raises InputError as `Studio` and `claim` do."""
     out, studio = config.out, Studio(config)
     claim(out, config)
     for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):
@@ -195,9 +195,9 @@ def write_capture(config: SynthesizeConfig) -> None:
                     pictures[place] *= studio.gains[int(photograph.name)]
                     if config.electrons or config.read:
                         random = studio.random(purpose, int(photograph.name))
-                        pictures[place] = noisy(pictures[place], config.electrons, config.read, random)
+                        pictures[place] = with_noise(pictures[place], config.electrons, config.read, random)
         for place, linear in pictures.items():
-            write_image(encoded(linear, config.format), folder / place / photograph.file)
+            write_image(encode(linear, config.format), folder / place / photograph.file)
     write_scenes(studio, seen, novel, exposure)
 
 
@@ -250,7 +250,7 @@ def write_scenes(
 
 
 def digest(file: Path) -> str:
-    """Hash of a file and of the files that it names, such as the textures of a material or a mesh."""
+    """Hash of a file and of all files that it names, such as textures."""
     result, files = hashlib.blake2b(digest_size=16), [file]
     for each in files:  # the list grows in the loop
         content, kind = each.read_bytes(), each.suffix.lower()
@@ -264,12 +264,12 @@ def digest(file: Path) -> str:
 
 
 def settings_of(config: SynthesizeConfig) -> dict:
-    """The options that a capture depends on, and hashes of their files, as values of JSON."""
-    values = asdict(replace(config, out=Path())) | {"digests": {}}
+    """The options that affect a capture, and hashes of their files, as JSON values."""
+    values = asdict(config) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
         text = str(getattr(config, name)).partition(".npz:")[0]
-        # os.path.isfile, unlike Path.is_file, takes texts that are too long for a file name.
+        # os.path.isfile, unlike Path.is_file, accepts texts that are too long for a file name.
         file = next((file for file in (text, f"{text}.npz") if os.path.isfile(file)), None)
         if file:
             values["digests"][name] = digest(Path(file))
@@ -277,15 +277,15 @@ def settings_of(config: SynthesizeConfig) -> dict:
 
 
 def claim(out: Path, config: SynthesizeConfig) -> None:
-    """Raise InputError if a folder holds anything but the same capture, complete or not."""
+    """Raise InputError unless a folder is empty, missing, or has this capture, complete or not."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     found = read_json(out / SETTINGS)
     if not isinstance(found, dict):
-        raise InputError(f"{out}: OUT: is there already, and is no capture of mi-ring synthesize; give another name")
+        raise InputError(f"{out}: OUT: exists already, and is no capture of mi-ring synthesize; give another name")
     wanted = settings_of(config)
-    hashed = {"mesh", "environment"} & wanted["digests"].keys()  # only their content matters, not their place
+    hashed = {"mesh", "environment"} & wanted["digests"].keys()  # their content matters, not their path
     other = [name for name, value in wanted.items() if name not in hashed and found.get(name) != value]
     if other:
-        raise InputError(f"{out}: OUT: holds a capture that was made with other options ({', '.join(other)}); "
-                         "give another name, or remove it")  # fmt: skip
+        raise InputError(f"{out}: OUT: has a capture with other options ({', '.join(other)}); give another name, or "
+                         "remove it")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pictures by Mitsuba's stock path tracer along our own rays. They are independent of the renderer of a fit."""
+"""Renders images by Mitsuba's path tracer along our own rays, independently of the renderer of a fit."""
 
 import functools
 from collections.abc import Callable
@@ -11,12 +11,12 @@ import numpy as np
 
 from mi_ring.geometry.camera import Camera
 
-LANES = 1 << 22  #: most paths in one launch
+LANES = 1 << 22  #: largest number of paths in a launch
 SEED_STEP = 1_000_003  #: between the seeds of consecutive launches
 MARGIN = 4  #: around the object [px]
 
-Window = tuple[int, int, int, int]  #: part of a picture: left, top, right, bottom [px]
-Trace = Callable[[mi.RayDifferential3f, int], list]  #: (rays, seed) ↦ channels, with a value for each ray
+Window = tuple[int, int, int, int]  #: part of an image: left, top, right, bottom [px]
+Trace = Callable[[mi.RayDifferential3f, int], list]  #: (rays, seed) ↦ list of channels with a value per ray
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class LensCamera:
     """A camera with lens distortion and motion blur."""
 
     camera: Camera
-    distortion: tuple[float, float] = (0.0, 0.0)  #: k1, k2: x / z and y / z become 1 + k1 r² + k2 r⁴ times as large
-    motion: tuple[float, float] = (0.0, 0.0)  #: of the picture during the exposure [px]
+    distortion: tuple[float, float] = (0.0, 0.0)  #: k1, k2: x / z and y / z are multiplied by 1 + k1 r² + k2 r⁴
+    motion: tuple[float, float] = (0.0, 0.0)  #: shift of the image during the exposure [px]
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel coordinates (n, 2) of points (n, 3) in the middle of the exposure."""
@@ -36,7 +36,7 @@ class LensCamera:
         return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
 
     def around(self, points: np.ndarray) -> Window:
-        """The part of the picture that shows points (n, 3) in front of the camera, with a margin."""
+        """The part of the image with points (n, 3) in front of the camera, and `MARGIN` around them."""
         pixels, size = self.project(points), np.array(self.camera.size)
         left, top = np.clip(pixels.min(0) - MARGIN, 0, size - 1).astype(int).tolist()
         right, bottom = np.clip(pixels.max(0) + MARGIN + 1, [left + 1, top + 1], size).astype(int).tolist()
@@ -44,7 +44,7 @@ class LensCamera:
 
 
 def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
-    """`spp` rays through each pixel of a window, stratified. `spp` is a square; the rays of a pixel are consecutive."""
+    """`spp` (a square number) stratified rays through each pixel of a window. Those of a pixel are consecutive."""
     left, top, right, bottom = window
     side = round(spp**0.5)
     number = functools.partial(dr.opaque, mi.Float)  # not a literal: all views share one compiled kernel
@@ -78,7 +78,7 @@ def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth
 
 
 def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, limit: float) -> list:
-    """As `radiance_along`, but indirect light of a path is at most `limit`: rare bright paths leave white dots."""
+    """As `radiance_along`, with indirect radiance clipped to `limit`, because rare bright paths leave white dots."""
     direct = radiance_along(rays, seed, scene, 2)
     if depth == 2:
         return direct
@@ -86,7 +86,7 @@ def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scen
 
 
 def hits_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, shape: mi.Shape) -> list:
-    """[1 where a ray meets this shape first, else 0]."""
+    """[1 for rays whose first hit is this shape, otherwise 0]."""
     hit = scene.ray_intersect_preliminary(rays)
     return [dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), mi.Float(1), 0)]
 

@@ -1,4 +1,4 @@
-"""Camera poses: evenly around the object, as if held by hand, or beside a turntable."""
+"""Camera poses: evenly around the object, hand-held, or around a turntable."""
 
 from typing import Literal
 
@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 CameraKind = Literal["around", "free", "turntable"]
 
-LOWEST = 0.1  #: least height of a camera above the table, in units of its distance
-NEARER, FARTHER = 0.98, 1.2  #: range of distances of hand-held cameras, in units of `distance`
-AIM, ROLL = 0.06, 15.0  #: of hand-held cameras: error of the aim [object radii], standard deviation of the roll [deg]
-GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad]: points of a spiral with it are evenly spread over a sphere
+LOWEST = 0.1  #: least height of a camera above the table [its distance]
+NEARER, FARTHER = 0.98, 1.2  #: range of distances of hand-held cameras [`distance`]
+AIM, ROLL = 0.06, 15.0  #: of hand-held cameras: error of the aim [`radius`], standard deviation of the roll [deg]
+GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad] of a Fibonacci spiral, whose points are even on a sphere
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, roll: float = 0.0) -> np.ndarray:
@@ -30,9 +30,10 @@ def poses(
     kind: CameraKind, count: int, radius: float, distance: float, up: np.ndarray, random: np.random.Generator,
     elevations: tuple[float, ...] = (20.0, 55.0), standing: bool = False,
 ) -> list[np.ndarray]:  # fmt: skip
-    """Camera-to-world matrices (4, 4) around an object of this radius at the origin, at this distance from it.
+    """`count` camera-to-world matrices (4, 4) around an object at the origin. `distance`: of cameras from the origin.
 
-    `elevations`: of the rings of cameras around a turntable [deg]. `standing`: no camera is below the table.
+    `radius`: of the object; `elevations`: of the rings of cameras around a turntable [deg]; `standing`: no camera is
+    below the table.
     """
     upright = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])[0].as_matrix()
     low = LOWEST if standing else -1.0
