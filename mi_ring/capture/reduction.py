@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -287,5 +288,5 @@ def unpacked(key: str, make: Callable[[], Reduced]) -> Reduced:
             rgb = file["rgb"]
             clipped = np.unpackbits(file["clipped"], count=rgb.size).reshape(rgb.shape).astype(bool)
             return Reduced(LinearImage(rgb, clipped), *(file.get(name) for name in ("mask", "valid")))
-    except (OSError, ValueError, LookupError, EOFError):
+    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
         return make()

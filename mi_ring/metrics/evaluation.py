@@ -16,6 +16,7 @@ from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
+COMPARED = 1024  #: width at which photographs are compared, if they are larger [px]
 LINES = {  # of the table, by the beginnings of the names of numbers
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",

@@ -1,0 +1,261 @@
+"""Large photographs: reduced once, cropped to the object, and kept in the cache folder."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mi_ring
+from mi_ring.capture import arrays, reduction
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.loading import load_capture
+from mi_ring.geometry.camera import Camera
+from mi_ring.scene.shot import Shot, Window
+from mi_ring.synthesis.viewpoints import look_at
+from mi_ring.system import cache
+
+WIDTH, HEIGHT = 1300, 900
+BOXES = [(300, 200, 760, 560), (420, 310, 840, 700), (250, 260, 610, 590)]  #: of the object: left, top, right, bottom
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def camera(k, size=(WIDTH, HEIGHT)):
+    pose = look_at(np.array([4 * np.sin(k), 1.0, 4 * np.cos(k)]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    return Camera(pose, np.array([1400.0, 1380.0]), np.array([size[0] / 2 + 17, size[1] / 2 - 9]), size, -0.05)
+
+
+def photographs(count=3, seed=3):
+    """Noise, brighter to the right, and masks: the boxes."""
+    random = np.random.default_rng(seed)
+    images, masks = [], []
+    for k in range(count):
+        noise = random.integers(0, 90, (HEIGHT, WIDTH, 3)) + np.arange(WIDTH)[None, :, None] * 150 // WIDTH
+        images.append(noise.astype(np.uint8))
+        left, top, right, bottom = BOXES[k % 3]
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[top:bottom, left:right] = 255
+        masks.append(mask)
+    return images, masks
+
+
+def capture_of(folder, **options):
+    images, masks = photographs()
+    made = Capture.from_arrays(images, masks, cameras=[camera(k) for k in range(3)], **options)
+    return made.save(folder / "scene.xml").path
+
+
+def srgb_to_linear(v):
+    """By IEC 61966-2-1, in double precision."""
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+def test_a_window_is_the_same_camera():
+    shot = Shot("a", camera(1))
+    window = Window((310, 120), (800, 600), (400, 200), (WIDTH, HEIGHT))
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
+    whole, part = (s.camera.project(points)[0] for s in (shot, shot.through(window)))
+    np.testing.assert_allclose(part, (whole - [310, 120]) / [2, 3], atol=1e-9)
+    np.testing.assert_allclose(shot.through(window).frame, [[-155, -40], [(1300 - 310) / 2, (900 - 120) / 3]])
+    back = shot.through(window).whole
+    np.testing.assert_allclose(back.camera.project(points)[0], whole, atol=1e-9)
+    assert back.size == (WIDTH, HEIGHT) and back.window is None
+
+
+def test_windows_contain_the_masks_and_are_of_one_size(tmp_path):
+    capture = load_capture(capture_of(tmp_path), width=200)
+    assert {shot.size for shot in capture.shots} == {(200, capture.shots[0].size[1])}
+    for shot, (left, top, right, bottom) in zip(capture.shots, BOXES):
+        (x, y), (width, height) = shot.window.corner, shot.window.extent
+        assert x < left - 10 and y < top - 10 and x + width > right + 10 and y + height > bottom + 10
+        assert width < 0.5 * WIDTH
+    for mask, (left, top, right, bottom) in zip(capture.masks, BOXES):  # as many pixels as the scale says
+        area = (right - left) * (bottom - top) / np.prod(capture.shots[0].window.scale)
+        assert mask.sum() / 255 == pytest.approx(area, rel=1e-2)
+
+
+def test_pixels_are_means_of_linear_light(tmp_path):
+    """Twice as small, cropped: an independent mean; in several strips, as the photograph has 900 rows."""
+    path = capture_of(tmp_path, saturation=0.9)
+    whole = load_capture(path)
+    bounds = [np.array(box).reshape(2, 2) for box in BOXES]
+    size = reduction.crop_windows(whole.shots, bounds, 10**6)[0].extent
+    width = size[0] // 2
+    capture = load_capture(path, width=width)
+    images = photographs()[0]
+    for k, shot in enumerate(capture.shots):
+        (x, y), (columns, rows) = shot.window.corner, shot.window.extent
+        assert shot.window.size == (columns // 2, rows // 2)
+        encoded = images[k][y : y + rows, x : x + columns] / 255
+        blocks = encoded.reshape(rows // 2, 2, columns // 2, 2, 3)
+        seen = capture.observe([k])
+        np.testing.assert_allclose(seen.rgb[0], srgb_to_linear(blocks).mean((1, 3)), rtol=1e-3, atol=1e-6)
+        np.testing.assert_array_equal(seen.clipped[0], (blocks >= 0.9).any((1, 3)))
+
+
+def test_the_size_is_met_where_the_scale_is_no_whole_number(tmp_path):
+    """By areas: the sum of light stays."""
+    capture = load_capture(capture_of(tmp_path), width=173)
+    images = photographs()[0]
+    for k, shot in enumerate(capture.shots):
+        assert shot.size[0] == 173 and min(shot.window.scale) > 2
+        (x, y), (columns, rows) = shot.window.corner, shot.window.extent
+        expected = srgb_to_linear(images[k][y : y + rows, x : x + columns] / 255).mean((0, 1))
+        np.testing.assert_allclose(capture.observe([k]).rgb[0].mean((0, 1)), expected, rtol=2e-3)
+
+
+def test_pixels_that_are_not_valid_stay_so(tmp_path):
+    images, masks = photographs()
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:, 500:503] = 0
+    made = Capture.from_arrays(images, masks, cameras=[camera(k) for k in range(3)], valid=[valid, None, None])
+    capture = load_capture(made.save(tmp_path / "scene.xml").path, width=200)
+    shot, seen = capture.shots[0], capture.observe([0])
+    inside = ((np.arange(seen.valid.shape[2] + 1) * shot.window.scale[0]) + shot.window.corner[0])
+    touched = (inside[1:] > 500) & (inside[:-1] < 503)
+    np.testing.assert_array_equal(seen.valid[0].numpy(), np.broadcast_to(~touched, seen.valid.shape[1:]))
+
+
+def test_a_photograph_without_a_mask_is_not_cropped_and_one_that_its_object_fills_neither(tmp_path):
+    images, masks = photographs()
+    cameras = [camera(k) for k in range(3)]
+    for given in ([*masks[:2], None], [np.full_like(masks[0], 255), *masks[1:]]):
+        capture = reduction.reduced(Capture.from_arrays(images, given, cameras=cameras), 400)
+        assert {shot.window.extent for shot in capture.shots} == {(1299, 900)}  # 3 pixels are averaged first
+    small = Capture.from_arrays([i[:, :500] for i in images], [m[:, :500] for m in masks],
+                                cameras=[camera(k, (500, HEIGHT)) for k in range(3)])  # fmt: skip
+    assert reduction.reduced(small, 600) is small
+
+
+def test_the_second_time_no_photograph_is_decoded(tmp_path, monkeypatch, own_cache):
+    path = capture_of(tmp_path)
+    first = load_capture(path, width=200)
+    files = sorted(own_cache.rglob("*.*") or own_cache.rglob("*"))
+    assert len([f for f in own_cache.rglob("*") if f.is_file()]) == 3 + 3, files  # photographs, bounds of masks
+
+    def fail(*arguments):
+        raise AssertionError("decoded again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(reduction, "reduce", fail)
+        second = load_capture(path, width=200)
+        for k in range(3):
+            for a, b in zip(first.observe([k])[:4], second.observe([k])[:4]):
+                assert (a == b).all()
+    # Another photograph in the place of one is noticed, and so is a damaged file.
+    pixels = photographs(seed=8)[0][1]
+    Image.fromarray(pixels).save(tmp_path / "images/001.png")
+    for file in own_cache.rglob("*"):
+        if file.is_file() and file.stat().st_size > 100:
+            file.write_bytes(file.read_bytes()[:-30])
+    third = load_capture(path, width=200)
+    assert (third.observe([0]).rgb == first.observe([0]).rgb).all()
+    assert not (third.observe([1]).rgb == first.observe([1]).rgb).all()
+
+
+def test_where_the_cache_cannot_be_written_photographs_are_read_each_time(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file/cache"))
+    capture = load_capture(capture_of(tmp_path), width=200)
+    assert capture.observe([0, 2]).rgb.shape[2] == 200
+
+
+def test_what_was_not_used_for_the_longest_time_leaves_the_cache_first():
+    for k in range(5):
+        cache.store(f"{k}{k}key", bytes(1000))
+        os.utime(cache.place_of(f"{k}{k}key"), (k, k))
+    cache.cached("00key")
+    cache.prune(4000)
+    left = {path.name for _, _, path in cache.files()}
+    assert left == {"00key", "33key", "44key"} and cache.size() == 3000
+    cache.empty()
+    assert cache.size() == 0
+
+
+def test_masks_by_brightness_are_found_in_large_photographs(tmp_path):
+    images, masks = photographs()
+    dark = [np.where(m[..., None] > 0, np.maximum(i, 60), i % 3).astype(np.uint8) for i, m in zip(images, masks)]
+    made = Capture.from_arrays(dark, cameras=[camera(k) for k in range(3)])
+    capture = load_capture(made.save(tmp_path / "scene.xml").path, masks="auto", width=200)
+    assert capture.threshold is not None
+    for shot, mask, (left, top, right, bottom) in zip(capture.shots, capture.masks, BOXES):
+        rows, columns = np.nonzero(mask > 127)
+        found = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).reshape(2, 2)
+        there = found * shot.window.scale + shot.window.corner
+        np.testing.assert_allclose(there.ravel(), [left, top, right, bottom], atol=2 * max(shot.window.scale))
+
+
+def test_the_results_of_a_fit_are_of_whole_photographs(tmp_path):
+    """Sizes, cameras and masks; a refined focal length is in pixels of the photograph."""
+    path = capture_of(tmp_path)
+    config = mi_ring.Config.preset("fast", iterations=3, levels=(2,), widths=(64,), shares=(1,), subdivisions=2,
+                                    domain="sphere", refine=("focal",), indirect=False)  # fmt: skip
+    fit = mi_ring.Fit(load_capture(path), config)
+    assert max(shot.size[0] for shot in fit.capture.shots) == reduction.WIDTH < WIDTH
+    for _ in fit:
+        pass
+    fit.capture = replace(fit.capture)
+    fit.course.masks[0] = None  # its mask counts as found anew
+    fit.save(tmp_path / "run")
+    again = load_capture(tmp_path / "run/scene.xml")
+    given = load_capture(path)
+    for found, shot in zip(again.shots, given.shots):
+        assert found.size == shot.size and found.window is None
+        np.testing.assert_allclose(found.camera.centre, shot.camera.centre, atol=1e-3)
+        np.testing.assert_allclose(found.camera.focal, shot.camera.focal, rtol=0.01)
+        np.testing.assert_allclose(found.camera.to_world, shot.camera.to_world, atol=1e-5)
+    entry = fit.result().calibration["unknowns"]["focal"]
+    assert np.ravel(entry["before"])[0] == pytest.approx(1390)
+    overlap = (again.masks[0] > 127) == (given.masks[0] > 127)
+    assert again.masks[0].shape == (HEIGHT, WIDTH) and overlap.mean() > 0.99
+
+
+LARGE = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_DATA, (int(2.5 * 2**30),) * 2)
+from mi_ring.system.machine import keep_memory
+keep_memory()
+import mi_ring
+from mi_ring.capture.loading import load_capture
+capture = load_capture(sys.argv[1], width=512)
+config = mi_ring.Config.preset("fast", iterations=2, levels=(2,), widths=(64,), shares=(1,), domain="sphere",
+                                indirect=False)
+for it in mi_ring.Fit(capture, config):
+    pass
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_memory_does_not_grow_with_photographs(tmp_path):
+    """Of 16 megapixels, as many as would not fit if each kept what it takes as floats, 192 MB."""
+    small, masks = photographs()
+    size, cameras = (4000, 4000 * HEIGHT // WIDTH), []
+    (tmp_path / "images").mkdir()
+    (tmp_path / "masks").mkdir()
+    for k in range(3):
+        Image.fromarray(small[k]).resize(size).save(tmp_path / f"images/{k}.jpg", quality=80)
+        Image.fromarray(masks[k]).resize(size, Image.Resampling.NEAREST).save(tmp_path / f"masks/{k}.png")
+        scale = size[0] / WIDTH
+        shot = camera(k)
+        cameras.append(shot._replace(focal=scale * shot.focal, centre=scale * shot.centre, size=size))
+    shots, relative = [], []
+    for k in range(24):
+        files = arrays.Files(*(tmp_path.__class__(f) for f in (f"images/{k % 3}.jpg", f"masks/{k % 3}.png")))
+        shots.append(Shot(f"{k:02}", cameras[k % 3], files=files, saturation=1 - 0.001 * k))  # none is read for another
+        relative.append(files)
+    (tmp_path / "scene.xml").write_bytes(arrays.scene_xml(shots, relative, None, None, None))
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(LARGE), tmp_path / "scene.xml"], capture_output=True,
+                          text=True, env=os.environ | {cache.VARIABLE: str(tmp_path / "cache")})  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[-1]) < 1.6
