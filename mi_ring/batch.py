@@ -102,7 +102,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """The jobs to fit, with their fingerprints. Writes all records; a job fails here if its capture is wrong."""
+    """The jobs to fit, with their fingerprints. Writes the records of all jobs; a wrong capture is a failed job."""
     todo: dict[Job, str] = {}
     done = 0
     for job in progress(jobs, "comparing", unit="scene"):

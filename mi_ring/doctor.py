@@ -68,7 +68,7 @@ def computing() -> Iterator[Finding]:
     if torch.cuda.is_available() and dr.has_backend(dr.JitBackend.CUDA):
         yield Finding("ok", "GPU", f"{torch.cuda.get_device_name()}: --variant cuda_ad_rgb")
     else:
-        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: an NVIDIA one, and a PyTorch built for CUDA")
+        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: needs an NVIDIA GPU and a PyTorch built for CUDA")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""Pictures as arrays: sRGB, box filter, Gaussian blur, image files of any bit depth."""
+"""Images as arrays: sRGB, box filter, Gaussian blur, image files of any bit depth."""
 
 import contextlib
 import io
@@ -27,7 +27,7 @@ from mi_ring.system.machine import exr_threads
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FORMATS = "JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP"  #: formats in which Pillow may open a file
-EXR_CHUNK = 256  #: rows of an OpenEXR file's largest chunks: its reader allocates one even for a picture of one row
+EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; the reader allocates it even for one row
 
 # A phone's photographs have more pixels than Pillow allows; `require_plausible_size` compares with the file's size.
 Image.MAX_IMAGE_PIXELS = None
@@ -47,9 +47,9 @@ def linear_to_srgb(v: np.ndarray) -> np.ndarray:
 
 
 def contrasted(linear: Pictures, contrast: Any) -> Pictures:
-    """Linear values after an S-curve like that of film; values of 1 and above do not change.
+    """Linear values after an S-shaped response curve. Values of 1 and above do not change.
 
-    It maps an sRGB value v to vᶜ / (vᶜ + (1 − v)ᶜ), c = `contrast`. The inverse has the contrast 1 / c.
+    An sRGB value v becomes vᶜ / (vᶜ + (1 − v)ᶜ) with c = `contrast`. The inverse has the contrast 1 / c.
     """
     where: Any = torch.where if isinstance(linear, Tensor) else np.where
     x = linear.clip(1e-6, 1 - 1e-6)  # where the powers have finite derivatives
@@ -73,7 +73,7 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 
 
 class BoundedFile(io.BufferedReader):
-    """A file whose `read` allocates no more bytes than are left in it, whatever a damaged header requests."""
+    """A file whose `read` allocates at most the bytes that are left, even if a damaged header requests more."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         left = max(0, os.fstat(self.fileno()).st_size - self.tell())
@@ -84,7 +84,7 @@ class BoundedFile(io.BufferedReader):
 def open_image(path: Path) -> Iterator[Image.Image]:
     """An image file opened by Pillow.
 
-    Raises ValueError if it is no image or declares an implausible size, and other errors if it is damaged.
+    Raises ValueError if it is no image or its declared size is implausible, and other errors if it is damaged.
     """
     Image.init()
     formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF if its package is installed
@@ -92,7 +92,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         try:
             image = Image.open(file, formats=formats)
         except UnidentifiedImageError as error:  # its message does not name the file
-            raise ValueError("its content is that of no image") from error
+            raise ValueError("it is not an image") from error
         with image:
             require_plausible_size(path, 2 * len(image.getbands()) * math.prod(image.size))
             yield image
@@ -113,7 +113,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def exr_size(path: Path) -> tuple[int, int, int]:
     """Width [px], height [px] and number of channels that the header of an OpenEXR file declares.
 
-    By "OpenEXR File Layout" an attribute is its name and its type, each ending in a zero byte, its size and its value.
+    An attribute in the header is: name, type (both end with a zero byte), size, value ("OpenEXR File Layout").
     """
     found: dict[bytes, bytes] = {}
     with path.open("rb") as file:
@@ -143,14 +143,14 @@ def exr_size(path: Path) -> tuple[int, int, int]:
 def read_image(path: Path) -> np.ndarray:
     """The pixels (H, W, C) of an image file: uint8, uint16, or float32 for all other types.
 
-    Raises ValueError for CMYK and for an implausible size, before memory is allocated; other errors for damaged files.
+    Raises ValueError for CMYK and, before it allocates memory, for an implausible size; other errors for damaged files.
     """
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # Mitsuba does not read it
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
             if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
-                raise ValueError("its colours are those of inks, CMYK; save it as RGB")
+                raise ValueError("its colours are CMYK; save it as RGB")
             require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
             for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
                 if count > path.stat().st_size:  # the reader would request each of them
@@ -173,11 +173,11 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of images (..., H, W) by `sigma` > 0 [px]; outside they are zero."""
+    """Gaussian blur of images (..., H, W) with standard deviation `sigma` > 0 [px]; pixels outside are zero."""
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
-    def kernel(n: int) -> Tensor:  # as a matrix: two products take a tenth of the time of two convolutions
+    def kernel(n: int) -> Tensor:  # two matrix products take a tenth of the time of two convolutions
         distance = (torch.arange(n)[:, None] - torch.arange(n)).to(images)
         return torch.where(distance.abs() <= radius, torch.exp(-0.5 * (distance / sigma) ** 2) / total, 0)
 
@@ -185,7 +185,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def write_image(pixels: np.ndarray, path: Path) -> None:
-    """Write an image (H, W, C) as PNG, JPEG or EXR, by the file's suffix, by `write_file`."""
+    """Write an image (H, W, C) with `write_file`. The suffix chooses PNG or EXR; other suffixes give JPEG."""
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
@@ -195,7 +195,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """The content of a file with this picture; `kind` and `options` are those of Pillow's `save`."""
+    """An image as the bytes of a file. `kind`: Pillow's name of the format. `options`: of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -170,7 +170,7 @@ MISTAKES = [
     (["table1", "nowhere"], "nowhere: DATA: is not there; table1 takes folders of captures"),
     (["table1", "--seeds", "1", "1"], "--seeds: is 1 1, must be different"),
     (["table1", "--seeds", "x"], r"--seeds: is x, must be INT \[INT \.\.\.\]"),
-    (["table1", "--quick", "--preset", "fine"], "--preset: is fine, but --quick is by fast; leave one of the two out"),
+    (["table1", "--quick", "--preset", "fine"], "--preset: is fine, but --quick needs fast; leave one of the two out"),
     (["table1", "--threads", "-1"], "--threads: is -1, must be 0 to 1024"),
     (["table1", "EMPTY"], "scene.xml"),
     (["table1", "--only", "other"], "--only: has other, must be of"),

@@ -147,4 +147,4 @@ def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, ca
     for file in path.parent.glob("images/*.png"):
         mi.Bitmap(np.maximum(np.array(mi.Bitmap(str(file))), 90)).write(str(file))
     assert fit.main([str(path), "--out", str(tmp_path / "bright"), "--iterations", "1", *SPHERE]) == 0
-    assert "the room was not dark enough" in capsys.readouterr().out
+    assert "the room was too bright to find masks" in capsys.readouterr().out
