@@ -58,7 +58,7 @@ def require_options(config: RenderConfig) -> None:
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
         raise InputError("--turntable, --light-orbit, --flow: give only one of the three")
     if config.view is not None and not config.count:
-        raise InputError("--view: is for --turntable, --light-orbit and --flow; without them all photographs are rendered")
+        raise InputError("--view: is for --turntable, --light-orbit and --flow; otherwise all photographs are rendered")
     if config.flow and config.time != 1:
         raise InputError("--time: selects one time of the flow, --flow shows all; give one of the two")
     if config.width and not config.count:

@@ -50,7 +50,7 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     text = capsys.readouterr().out
     assert (
         f"Cameras: 20 of 20 photographs, as given by {folder / 'transforms.json'}" in text
-        and "Nothing to mend found" in text
+        and "No problems found" in text
     )
     capture = load_capture(out / "scene.xml")
     assert len(capture) == 20 and all(mask is not None for mask in capture.masks)
