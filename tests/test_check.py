@@ -121,7 +121,7 @@ def test_few_photographs(broken_capture, tmp_path, capsys):
     text = path.read_text()
     path.write_text(text[: text.index('  <sensor type="photograph" id="005"')] + "</scene>")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and "5 views are few" in text, text
+    assert status == 1 and "5 views are too few" in text, text
 
 
 def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):

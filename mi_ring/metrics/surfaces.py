@@ -32,9 +32,9 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """The rigid motion or `similarity` (4, 4) that moves a mesh onto another one nearby.
+    """The rigid motion or `similarity` (4, 4) that aligns a mesh with a mesh `onto` nearby.
 
-    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because the other mesh may lack a part.
+    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """
     middle, unit = onto.bounds.mean(0), onto.scale
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
@@ -59,7 +59,7 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """At the pixel centres of a photograph: hit (P,), distance (P,), normal (P, 3), and is it a face's back (P,)?"""
+    """At the pixel centres of a photograph: hit (P,) bool, distance (P,), normal (P, 3), back of a face (P,) bool."""
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
     to_world, focal, centre, distortion = photograph.camera(mi.UInt32(0))
@@ -75,7 +75,7 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Errors of all views, and of each: shading normals [deg], depths [% of `diagonal`], silhouettes.
+    """Errors of all views together, and by view: shading normals [deg], depths [% of `diagonal`], silhouettes.
 
     Normals and depths count at pixels that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of
     `guess` that see the back of a face.
@@ -98,7 +98,7 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Means and medians of errors (P,), if there are any."""
+    """Means and medians of errors (P,); empty if there are none."""
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -113,10 +113,10 @@ def compare_shapes(
 ) -> dict[str, float]:
     """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two surfaces.
 
-    They are computed from the exact distances of 100,000 random points of each surface to the other. `chamfer`: mean
-    of the two mean distances. `f_score_t`: harmonic mean of precision, the share of the fit's points within t % of the
-    diagonal, and recall, the same of the truth's (Knapitsch et al., Tanks and Temples, ACM TOG 2017). With `views` only
-    points that one of them shows count; `unseen` and `unseen_true` are the shares of the others.
+    They use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean of the
+    two mean distances. `f_score_t`: harmonic mean of precision (share of the fit's points with a distance of at most
+    t % of the diagonal) and recall (the same for the truth); Knapitsch et al., Tanks and Temples, ACM TOG 2017.
+    With `views`, only points that a view shows count; `unseen` and `unseen_true` are the shares of the others.
     """
     diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
@@ -132,7 +132,7 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (n,) from random points of a surface, or from those that one of the `views` shows, to another one."""
+    """Distances (n,) of random points of `start` to `end`. With `views`, only of points that a view shows."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]
