@@ -178,7 +178,7 @@ MISTAKES = [
     (["table2", "EMPTY"], "has no mvpmsData/bearPNG/Calib_Results.mat"),
     (["single"], "DATA: single needs .npz files"),
     (["single", "EMPTY"], "is a folder"),
-    (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
+    (["swap", "--materials", "diffuse"], "--materials: apply to meshes, which this experiment does not use"),
     (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
     (["timing", "KNOWN", "--seeds", "0", "1"], "--seeds: are several; timing takes one"),
     (["specularity", "--materials", ""], "--materials: one is empty"),
@@ -188,11 +188,11 @@ MISTAKES = [
     (["specularity", "--materials", "nowhere.binary"], "nowhere.binary: --materials: no such file"),
     (["specularity", "PLY", "--materials", "principled base_color=vertex_color"], "--materials: .* varies over the"),
     (["stripes", "PLY", "--materials", "diffuse", "TEXTURED"], "--materials: .*wood.xml: varies over the surface"),
-    (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
+    (["views", "--materials", "diffuse"], "--materials: apply to meshes only"),
     (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
     (["specularity", "EMPTY"], "DATA: must be one mesh"),
     (["swap", "KNOWN"], "DATA: is one capture; swap exchanges"),
-    (["table1", "KNOWN", "KNOWN"], "DATA: two runs would both be called egg; rename"),
+    (["table1", "KNOWN", "KNOWN"], "DATA: two runs would have the name egg; rename"),
 ]  # fmt: skip
 
 
@@ -214,9 +214,9 @@ def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
 def test_each_run_has_a_folder_of_its_own(known_capture):
     """Captures egg with seed 3 and egg-3, and one that would be among the records."""
     runs = [Run(name, datasets.given(known_capture), {"capture": name}) for name in ("egg", "egg-3", "batch")]
-    with pytest.raises(InputError, match="DATA: two runs would both be called egg-3; rename a capture, leave out what"):
+    with pytest.raises(InputError, match="DATA: two runs would have the name egg-3; rename a capture, or leave out"):
         trial(runs[:2]).runs(ExperimentOptions(seeds=(0, 3)))
-    with pytest.raises(InputError, match="DATA: a run would be called batch, as the folder of records is; rename"):
+    with pytest.raises(InputError, match="DATA: a run would have the name batch of another folder; rename"):
         trial(runs[2:]).runs(ExperimentOptions())
 
 
