@@ -51,7 +51,7 @@ def findings() -> Iterator[Finding]:
         if importlib.util.find_spec(package):
             yield Finding("ok", package, importlib.metadata.version(package))
         else:
-            yield Finding("without", package, f"for {use}: pip install {package}, where it is ready-made")
+            yield Finding("without", package, f"for {use}: pip install {package} (not available for all systems)")
     if llvm.has_atomic() and importlib.util.find_spec("torch"):  # otherwise Dr.Jit or torch cannot be imported
         yield from computing()
 

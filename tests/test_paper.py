@@ -565,7 +565,7 @@ def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsy
     two = [Slow.of(tmp_path / "cup", events) for _ in range(2)]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert events == ["begun", "done"] * 2
-    assert "cup, which another process makes" in capsys.readouterr().out
+    assert "cup: another process writes it" in capsys.readouterr().out
     barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
     two = [Slow.of(tmp_path / name, [], barrier.wait) for name in ("cup", "pot")]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
