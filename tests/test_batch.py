@@ -110,7 +110,7 @@ def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
         batch.main(arguments)
     assert command.exit_status(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
     said = capsys.readouterr()
-    assert "wrong: failed: " in said.out and said.err.endswith("interrupted; to continue, give the same command again\n")
+    assert "wrong: failed: " in said.out and said.err.endswith("give the same command again\n")
     page = (job.folder.parent / "index.html").read_text()
     assert "1 interrupted" in page and "1 failed" in page and "running</" not in page and "refresh" not in page
     monkeypatch.setattr(batch, "fit_all", lambda todo, *_: Script(monkeypatch, (0, 60, "")) and fitted(job, 0))

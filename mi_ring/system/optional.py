@@ -28,7 +28,7 @@ def need(package: str, what: str, distribution: str | None = None) -> ModuleType
         if error.name != package:
             raise
         raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install "
-                         f"{distribution or package}`; some systems, such as Linux on ARM, have no build") from error  # fmt: skip
+                         f"{distribution or package}`; it is not built for every system") from error  # fmt: skip
 
 
 @contextlib.contextmanager
