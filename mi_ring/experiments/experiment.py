@@ -56,7 +56,8 @@ class Run:
     name: str  #: of the results folder
     dataset: Dataset
     labels: Row  #: first columns of its rows in the table
-    changes: Mapping[str, Any] = field(default_factory=dict)  #: fields of `Config` that differ from the preset
+    #: Fields of `Config` that differ from the preset: numbers, words and tuples of these.
+    changes: Mapping[str, Any] = field(default_factory=dict)
     #: (run, results folder, options) ↦ rows of the table; None: `measures.evaluated`.
     measure: Callable[["Run", Path, ExperimentOptions], list[Row]] | None = None
     watched: bool = False  #: measure the surface during the fit, too; such a fit cannot be resumed
@@ -73,13 +74,7 @@ class Run:
         """The settings as options of `mi-ring fit`."""
         words = ["--preset", options.preset, "--variant", options.variant]
         for name, value in self.settings(options).items():
-            option = f"--{name.replace('_', '-')}"
-            if isinstance(value, bool):
-                words.append(option if value else f"--no-{option[2:]}")
-            elif isinstance(value, Mapping):
-                words += [w for key, item in value.items() for w in (f"{option}.{key.replace('_', '-')}", str(item))]
-            else:
-                words += [option, *map(str, value if isinstance(value, tuple | list) else [value])]
+            words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
         return tuple(words)
 
 

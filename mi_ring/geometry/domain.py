@@ -1,7 +1,5 @@
 """Domains: the surfaces from which Shape-Net's flow starts and on which BRDF-Net is defined."""
 
-from types import ModuleType
-
 import numpy as np
 import torch
 import trimesh
@@ -10,7 +8,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
+
+gpytoolbox = LazyPackage("gpytoolbox", "a start from another surface than the sphere")  # its import takes a second
 
 REMESHED = 5  #: the finest level that is made by remeshing; finer levels subdivide it
 CANDIDATES = 16  #: random positions for each vertex
@@ -31,18 +31,13 @@ def closed_domain(
     return Domain((mesh.vertices - center) / radius, mesh.faces), center, radius
 
 
-def gpytoolbox() -> ModuleType:
-    """The package, imported late because that takes a second. Raises InputError if it is not installed."""
-    return need("gpytoolbox", "a start from another surface than the sphere")
-
-
 def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Positions (N, 3) of `points` (N, 3) of a mesh after its `vertices` (V, 3) have moved to `others` (V, 3).
 
     Points beside the mesh are first projected to it.
     """
     mesh = vertices.astype(float), faces.astype(np.int32)
-    _, face, weights = gpytoolbox().squared_distance(points.astype(float), *mesh, use_cpp=True)
+    _, face, weights = gpytoolbox.squared_distance(points.astype(float), *mesh, use_cpp=True)
     return (others[faces[face]] * weights[..., None]).sum(1)
 
 
@@ -79,7 +74,7 @@ class Domain:
         inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
             mesh = self.points.astype(float), self.faces.astype(np.int32)
-            inside[inside] = gpytoolbox().fast_winding_number(points[inside], *mesh) > 0.5
+            inside[inside] = gpytoolbox.fast_winding_number(points[inside], *mesh) > 0.5
         return inside
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -95,9 +90,9 @@ class Domain:
         vertices, faces = (self.points, self.faces) if level == REMESHED else self.sample(level + 1)
         mesh = trimesh.Trimesh(np.asarray(vertices), faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
-        package = gpytoolbox()  # outside `try`: InputError is a ValueError
+        remesh = gpytoolbox.remesh_botsch  # outside `try`: InputError is a ValueError
         try:
-            points, faces = package.remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+            points, faces = remesh(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
             remeshed = trimesh.Trimesh(points, faces)
             if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
                 return self.project(points), faces

@@ -52,12 +52,12 @@ def sphere_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012): mean
     curvature flow with the Laplacian of the first surface in all steps. It pinches off no limb and ends on a sphere.
     """
-    laplacian = gpytoolbox().cotangent_laplacian(points, faces)
+    laplacian = gpytoolbox.cotangent_laplacian(points, faces)
     x = points
     for _ in range(STEPS):
         area = trimesh.Trimesh(x, faces, process=False).area
         x = x * np.sqrt(4 * np.pi / area)
-        mass = gpytoolbox().massmatrix(x, faces)
+        mass = gpytoolbox.massmatrix(x, faces)
         x = splu((mass + STEP * laplacian).tocsc()).solve(mass @ x)
         x = x - mass.diagonal() @ x / mass.diagonal().sum()
     return normalized(x)

@@ -1,5 +1,6 @@
 """Evaluation of a fit against ground truth."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +92,5 @@ def evaluation_table(numbers: dict[str, float]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """A value with all floats in its lists and dictionaries rounded to four decimals; more are not significant."""
-    if isinstance(value, dict):
-        return {key: rounded(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [rounded(v) for v in value]
-    return round(value, 4) if isinstance(value, float) else value
+    """A JSON value with all floats in it rounded to four decimals; more are not significant."""
+    return json.loads(json.dumps(value), parse_float=lambda digits: round(float(digits), 4))

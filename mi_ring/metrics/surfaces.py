@@ -16,7 +16,9 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.pinhole import camera_ray
 from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.visibility import MaskedCamera, Visibility
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
+
+gpytoolbox = LazyPackage("gpytoolbox", "the distance of surfaces")
 
 POINTS = 100_000  #: on each of two surfaces, to measure their distance
 ALIGNED, ALIGNMENTS = 20_000, 20  #: number of points and of steps of the alignment of two surfaces
@@ -40,11 +42,10 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
     end = np.asarray((onto.vertices - middle) / unit), np.asarray(onto.faces, np.int32)
     start = trimesh.transform_points(trimesh.sample.sample_surface(mesh, ALIGNED, seed=0)[0], normalise)
-    squared_distance = need("gpytoolbox", "the distance of surfaces").squared_distance
     total = np.eye(4)
     for _ in range(ALIGNMENTS):
         points = trimesh.transform_points(start, total)
-        squared, nearest, _ = squared_distance(points, *end, use_cpp=True)
+        squared, nearest, _ = gpytoolbox.squared_distance(points, *end, use_cpp=True)
         normals = onto.face_normals[nearest]
         gaps = np.einsum("ij,ij->i", end[0][end[1][nearest, 0]] - points, normals)
         weights = 1 / (np.sqrt(squared) + np.sqrt(np.median(squared)) + 1e-9)
@@ -106,11 +107,9 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
 
 
 def compare_shapes(
-    guess: trimesh.Trimesh,
-    truth: trimesh.Trimesh,
-    views: Sequence[MaskedCamera] | None = None,
+    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[MaskedCamera] | None = None,
     diagonal: float | None = None,
-) -> dict[str, float]:
+) -> dict[str, float]:  # fmt: skip
     """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two surfaces.
 
     They use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean of the
@@ -140,5 +139,4 @@ def distances(
             raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
                              "same frame, and do the faces of both point outwards?")  # fmt: skip
     mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)  # near 0, for precision
-    squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
-    return np.sqrt(squared)
+    return np.sqrt(gpytoolbox.squared_distance(points - middle, *mesh, use_cpp=True)[0])

@@ -147,8 +147,8 @@ def fit_findings(
         scatter = np.hypot(*scatter)
         if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(shifts))):
             found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx and cy "
-                         "or to_world) or masks seem off by this shift or more. If cameras were measured, check "
-                         "that the first pixel is centred at (0.5, 0.5); else fit with --refine auto cameras.")  # fmt: skip
+                         "or to_world) or masks seem off by this shift or more. Measured cameras need the first "
+                         "pixel's centre at (0.5, 0.5); correct others with --refine auto cameras.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):

@@ -152,20 +152,15 @@ def set_threads(count: int = 0) -> None:
     dr.set_thread_count(count or cores())
 
 
-def processor() -> str:
-    """The model of the processor and the number of `cores`."""
+def computer() -> str:
+    """The GPU, if the current variant uses one, the model of the processor and the number of `cores`."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {cores()} core{'s' * (cores() > 1)}"
-
-
-def computer() -> str:
-    """The GPU, if the current variant computes on one, and the processor."""
     gpu = f"{torch.cuda.get_device_name()}, " if device().type == "cuda" else ""
-    return gpu + processor()
+    return f"{gpu}{model}, {cores()} core{'s' * (cores() > 1)}"
 
 
 @contextlib.contextmanager
