@@ -72,9 +72,9 @@ def main(arguments: Sequence[str]) -> int:
     if not config.seeds or len({*config.seeds}) < len(config.seeds):
         raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
     if experiment.one_seed and len(config.seeds) > 1:
-        raise InputError(f"--seeds: are several; {config.name} takes one; give one")
+        raise InputError(f"--seeds: {config.name} takes only one seed")
     if missing := next((path for path in config.data if not path.exists()), None):
-        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {experiment.data}")
+        raise InputError(f"{missing}: DATA: no such file or folder; {config.name} takes {experiment.data}")
     if config.quick and config.preset not in (None, "fast"):
         raise InputError(f"--preset: is {config.preset}, but --quick needs fast; leave one of the two out")
     if not all(material.strip() for material in config.materials):

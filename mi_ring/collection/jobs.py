@@ -122,8 +122,8 @@ def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list
         if name in jobs and jobs[name].scene == scene.resolve():
             raise InputError(f"{scene}: is given twice; give it once")
         if name in jobs or name == RECORDS:
-            other = f"{jobs[name].scene} is" if name in jobs else "records of batches are"
-            raise InputError(f"{scene}: its results would be in {out / name}, where {other} to be; rename it, or "
+            other = f"those of {jobs[name].scene}" if name in jobs else "the records of the batch"
+            raise InputError(f"{scene}: its results would go to {out / name}, as do {other}; rename it, or "
                              "fit it in another batch with another --out")  # fmt: skip
         folder = out.resolve() / name
         if folder in scene.resolve().parents:

@@ -58,12 +58,11 @@ def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Subdivide every triangle into four. New vertices are on the domain; `uv` and `more` (V, n) are interpolated."""
-    columns = [s, uv, *more]
-    ends = np.cumsum([c.shape[1] for c in columns])[:-1]
-    finer, faces = trimesh.remesh.subdivide(np.hstack(columns).astype(np.float64), faces)
-    s, *rest = np.split(finer, ends, axis=1)
-    s = np.concatenate([s[: len(columns[0])], ring.domain.project(s[len(columns[0]) :])])
-    return (s.astype(np.float32), rest[0], faces, *rest[1:])
+    attributes = dict(enumerate((uv, *more)))
+    finer, faces, attributes = trimesh.remesh.subdivide(s.astype(float), faces, vertex_attributes=attributes)
+    finer[len(s) :] = ring.domain.project(finer[len(s) :])
+    uv, *more = attributes.values()
+    return finer.astype(np.float32), uv, faces, *more
 
 
 def assemble(

@@ -85,7 +85,7 @@ class RenderConfig(MaterialOptions):
 
     @property
     def film(self) -> bool:
-        """Is the output one film, instead of a folder of pictures?"""
+        """Whether the output is one film, not a folder of pictures."""
         return self.out.suffix.lower() == ".mp4"
 
 
