@@ -214,7 +214,7 @@ def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_
     (["a.xml", "--", "--out", "there"], "--out: is set by the batch; leave it out"),
     (["a.xml", "--", "--iteration", "3"], "options of fits, after --: Unrecognized options: --iteration, 3; perhaps"),
     (["a.xml", "--preset", "fast"], "Unrecognized options: --preset, fast; options of fits come after --, as in"),
-    (["a.xml", "--", "--minutes", "-1"], "--minutes: is -1, must be 0 to 10000"),
+    (["a.xml", "--", "--minutes", "-1"], "--minutes: is -1.0, must be 0 to 10000"),
     ([], "is missing"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):

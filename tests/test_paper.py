@@ -175,7 +175,7 @@ MISTAKES = [
     (["table1", "EMPTY"], "scene.xml"),
     (["table1", "--only", "other"], "--only: has other, must be of"),
     (["table2"], "DATA: table2 needs one folder, that of DiLiGenT-MV"),
-    (["table2", "EMPTY"], "has no mvpmsData/bearPNG/Calib_Results.mat"),
+    (["table2", "EMPTY"], "has no file like mvpmsData/bearPNG/Calib_Results.mat"),
     (["single"], "DATA: single needs .npz files"),
     (["single", "EMPTY"], "is a folder"),
     (["swap", "--materials", "diffuse"], "--materials: apply to meshes, which this experiment does not use"),

@@ -109,7 +109,7 @@ class Tuning:
     rgb: colours of the photographs.
     mask: silhouettes.
     velocity: smoothness of the flow, the paper's lambda.
-    calibration: keeps the calibration near that of the scene file (see --refine).
+    calibration: keeps refined calibration near that of the scene file.
     settling: variation of the material in the last stage, under an unknown environment.
     normal_variation: total variation of normals; for objects with flat faces and sharp edges.
     material_rank: low rank of the material; for objects that mix a few materials."""
