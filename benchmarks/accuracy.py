@@ -48,7 +48,7 @@ def processor() -> str:
     """Model of the processor and number of cores."""
     from mi_ring.system import machine
 
-    return machine.processor()
+    return machine.computer()
 
 
 def product_speed(rows: int, width: int, dtype) -> float:

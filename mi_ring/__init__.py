@@ -1,11 +1,10 @@
 """From photographs to a watertight mesh with a spatially varying material, inside Mitsuba 3.
 
-`import mi_ring` registers the plugins `photograph`, `shapenet`, `cooktorrance` and `photometric` for the current
-variant of Mitsuba and for every one switched to later, and the emitter `flash` through which other integrators see a
-photograph's light. It selects `llvm_ad_rgb` if no variant is selected yet; where there is no LLVM, `scalar_rgb`, and
-warns: that is enough to look at a fit, slowly, and not enough to make one.
+`import mi_ring` registers its plugins (`photograph`, `shapenet`, `cooktorrance`, `photometric`, `flash` and others) for
+the current variant of Mitsuba and for every variant that is selected later. If no variant is selected yet, it selects
+`llvm_ad_rgb`. Without LLVM it selects `scalar_rgb` and warns: this variant can show a fit, slowly, but cannot make one.
 
-What it offers beyond that is read when first asked for:
+The names of the Python API are imported when they are first used:
 
     capture = mi_ring.load_capture("pot2.xml")
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast"))
@@ -85,14 +84,14 @@ def __dir__() -> list[str]:
 
 
 def _command_looked_for() -> str | None:
-    """The command, of which Python is about to import the module: `python -m mi_ring.fit …`."""
+    """The module that `python -m` is about to run, such as `mi_ring.fit`; None if it is no command of ours."""
     names = sys.orig_argv if sys.argv[:1] == ["-m"] else ()
     return next(filter(re.compile(r"mi_ring\.\w+").fullmatch, names), None)
 
 
 def _prepare_mitsuba() -> None:
     """Choose LLVM, register the plugins, select a variant."""
-    # Torch's workers would spin after each operation and steal the cores from Dr.Jit. Read when torch is loaded.
+    # Otherwise torch's idle workers spin and take the cores from Dr.Jit. Torch reads this when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     choose_gpu()
     llvm.prepare()
@@ -116,10 +115,10 @@ def _prepare_mitsuba() -> None:
             register(None, str(mi.variant()))
         else:
             mi.set_variant("scalar_rgb" if problem else "llvm_ad_rgb")
-    elif command and command != "mi_ring.doctor":  # which could not even be imported
+    elif command and command != "mi_ring.doctor":  # its module cannot be imported
         print(f"{command}: {problem}", file=sys.stderr)
         sys.exit(2)
-    if problem and not command and Path(sys.argv[0]).stem != "mi-ring":  # commands say so themselves
+    if problem and not command and Path(sys.argv[0]).stem != "mi-ring":  # commands print it themselves
         warnings.warn(problem, stacklevel=3)
 
 

@@ -13,7 +13,7 @@ from mi_ring.system import llvm
 from mi_ring.system.command import run
 from mi_ring.version import __version__
 
-#: Modules of the package. The first line of each says what the command does and ends in how to call it.
+#: Modules of the package. The first line of each docstring says what the command does and how to call it.
 COMMANDS = (
     "example", "synthesize", "board", "photos", "convert", "check", "fit", "batch", "render", "export", "evaluate",
     "paper", "validate", "doctor",
@@ -21,7 +21,7 @@ COMMANDS = (
 
 
 def summary(name: str) -> tuple[str, str]:
-    """How to call a command and what it does, from the first line of its module, without importing that."""
+    """Usage and description of a command, from the docstring of its module. The module is not imported."""
     source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
     sentence, _, call = (ast.get_docstring(ast.parse(source)) or "").split("\n")[0].partition("`python -m mi_ring.")
     return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")

@@ -46,8 +46,7 @@ class BatchConfig:
     """GPUs for each fit. 0.5 lets two fits share one.
     Give --variant cuda_ad_rgb after -- as well."""
     memory: float = 0
-    """Memory that a fit needs [GiB]. A machine gets no more fits than it has memory for.
-    0: no limit."""
+    """Memory that a fit needs [GiB]. A machine runs only as many fits at a time as its memory allows. 0: no limit."""
     retries: int = 3
     """How many times in a row a fit may die without progress before it counts as failed."""
     address: str | None = None
@@ -73,7 +72,7 @@ def main(arguments: Sequence[str]) -> int:
             raise InputError(f"{error}; options of fits come after --, as in -- --preset fast") from None
         raise
     if wrong := [option for option in options if option.split("=")[0] in RESERVED]:
-        raise InputError(f"{wrong[0]}: is what the batch itself gives each fit; leave it out")
+        raise InputError(f"{wrong[0]}: is set by the batch; leave it out")
     jobs = make_jobs(config.scenes, config.out, options)
     try:
         fit = parse_options([str(jobs[0].scene), *options])  # a wrong option is wrong for every fit
@@ -102,7 +101,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """The jobs to fit, with their fingerprints. Writes all records; a job fails here if its capture is wrong."""
+    """The jobs to fit, with their fingerprints. Writes the records of all jobs; a wrong capture is a failed job."""
     todo: dict[Job, str] = {}
     done = 0
     for job in progress(jobs, "comparing", unit="scene"):
@@ -140,7 +139,7 @@ def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchCo
                     start = record.iteration, record.tries
                     if starts.setdefault(job.name, start) != start:
                         starts[job.name] = start
-                        bar.write(f"{job.name}: has died, goes on from iteration {record.iteration} or a little before")
+                        bar.write(f"{job.name}: died; continues at or shortly before iteration {record.iteration}")
             running = [f"{job.name} {job.progress}" for job in todo if states[job.name] == "running"]
             bar.set_postfix_str("; ".join(running))
             if changed:

@@ -16,7 +16,7 @@ from mi_ring.system.files import require_place, write_file
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Write a sheet of markers to print and put under the object. In photographs it shows scale, cameras and white."""
+    """Write a sheet of markers to print and put under the object. With it, mi-ring photos finds scale and light."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write: .pdf or .png."""

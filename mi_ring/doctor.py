@@ -51,7 +51,7 @@ def findings() -> Iterator[Finding]:
         if importlib.util.find_spec(package):
             yield Finding("ok", package, importlib.metadata.version(package))
         else:
-            yield Finding("without", package, f"for {use}: pip install {package}, where it is ready-made")
+            yield Finding("without", package, f"for {use}: pip install {package} (not available for all systems)")
     if llvm.has_atomic() and importlib.util.find_spec("torch"):  # otherwise Dr.Jit or torch cannot be imported
         yield from computing()
 
@@ -68,7 +68,7 @@ def computing() -> Iterator[Finding]:
     if torch.cuda.is_available() and dr.has_backend(dr.JitBackend.CUDA):
         yield Finding("ok", "GPU", f"{torch.cuda.get_device_name()}: --variant cuda_ad_rgb")
     else:
-        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: an NVIDIA one, and a PyTorch built for CUDA")
+        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: needs an NVIDIA GPU and a PyTorch built for CUDA")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""The errors for bad input, and the most frequent cause: a file that does not exist."""
+"""The errors for bad input, and checks that raise them."""
 
 import math
 import os
@@ -21,19 +21,19 @@ class SceneError(ValueError):
 
 
 def is_file(path: Path) -> bool:
-    """Is there such a file? Unlike `Path.is_file`, this is False for a name that is too long."""
+    """Whether a file exists. False for a name that is too long, for which `Path.is_file` raises an error."""
     return os.path.isfile(path)
 
 
 def require_file(path: Path, wanted: str, field: str = "") -> None:
-    """Raise InputError if there is no such file; the message says which file is `wanted` and names the `field`."""
+    """Raise InputError if a file does not exist. The message names the `field` and says which file is `wanted`."""
     if not is_file(path):
         what = "is a folder" if os.path.isdir(path) else "no such file"
         raise InputError(f"{path}: {field}{': ' if field else ''}{what}; give {wanted}")
 
 
 def require_range(options: Any, name: str, low: float, high: float = math.inf) -> None:
-    """Raise InputError unless the option of this name is within these limits or None."""
+    """Raise InputError unless the option of this name is in [low, high] or None."""
     value = getattr(options, name)
     if value is not None and not low <= value <= high:
         limits = f"{low} to {high}" if high < math.inf else f"at least {low}"

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_range
 from mi_ring.metrics.evaluation import evaluate, evaluation_table, rounded
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.output.ambiguity import ambiguity_of
@@ -21,14 +21,14 @@ MISPLACED = 0.3  #: below this IoU of the silhouettes the true mesh is probably 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Compare a finished fit with the truth: a table on standard error, one line of JSON on standard output.
+    """Compare a finished fit with the truth. Prints a table to standard error and a line of JSON to standard output.
 
-    Where both surfaces are seen: errors of normals [deg] and depths [% of the diagonal of the true bounding box];
-    overlap of the silhouettes; share of the seen faces that point away from the camera. Of the whole surfaces, or of
-    their seen parts with --seen: Chamfer distance [% of the diagonal] and F-score. Of the fitted mesh: genus, triangles
-    that cross another, and triangles that Shape-Net turned inside out. Of the photographs that mi_ring.render predicts:
-    PSNR [dB] and SSIM, over all pixels, or over the object alone if there is a background and a mask. A file has the
-    same for every photograph.
+    Pixels that see both surfaces: errors of normals [deg] and depths [% of the diagonal of the true bounding box].
+    Silhouettes: intersection over union. Visible faces: share that points away from the camera.
+    Surfaces, or their visible parts with --seen: Chamfer distance [% of the diagonal] and F-score.
+    Fitted mesh: genus, triangles that cross another, triangles that Shape-Net turned inside out.
+    Predicted photographs: PSNR [dB] and SSIM, of all pixels; of the object's pixels if there is a mask and a visible
+    background. The JSON file has the numbers of every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -38,11 +38,11 @@ class EvaluateConfig:
     novel: Path | None = None
     """Scene file of photographs that the fit has not seen."""
     seen: bool = False
-    """Leave out of Chamfer distance and F-score the parts of both surfaces that no photograph of the fit shows."""
+    """Compute Chamfer distance and F-score only of parts that a photograph of the fit shows."""
     align: Literal["rigid", "similarity"] | None = None
-    """Move the true surface and the photographs of --novel onto the fit before comparing.
-    rigid: turn and shift it. similarity: scale it, too. Numbers of the fit's own photographs do not change.
-    Use it after --refine cameras, which lets the object as a whole drift."""
+    """Align the true surface and the photographs of --novel with the fit before the comparison.
+    rigid: by rotation and translation. similarity: also by scale. Numbers of the fit's own photographs do not change.
+    Use it after a fit with --refine cameras, in which the whole object may move."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs. More give less noise."""
     out: Path | None = None
@@ -52,8 +52,7 @@ class EvaluateConfig:
 def main(arguments: Sequence[str]) -> None:
     """Run the command."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
-    if config.spp < 1:
-        raise InputError(f"--spp: is {config.spp}, must be at least 1")
+    require_range(config, "spp", 1)
     for name in ("scene.xml", "mesh.ply", "ring.pt"):
         if not (config.run / name).is_file():
             raise InputError(f"{config.run}: has no {name}; give the results folder of a finished fit")
@@ -66,8 +65,8 @@ def main(arguments: Sequence[str]) -> None:
     totals = {key: value for key, value in numbers.items() if not isinstance(value, list)}
     print(evaluation_table(totals), f"Every photograph: {out}", sep="\n", file=sys.stderr)
     if totals["iou"] < MISPLACED:
-        print(f"{config.mesh}: is not where the fit is: is it in the frame of the scene? The true mesh of a capture by "
-              "mi-ring synthesize is its truth/mesh.ply", file=sys.stderr)  # fmt: skip
+        print(f"{config.mesh}: hardly overlaps with the fit: is it in the frame of the scene? The true mesh of a "
+              "capture of mi-ring synthesize is its truth/mesh.ply", file=sys.stderr)  # fmt: skip
     if config.novel and (ambiguity := ambiguity_of(config.run)):
         print(f"{ambiguity} Novel views in a known light may be too bright or have another colour", file=sys.stderr)
     print(json.dumps(totals))

@@ -1,4 +1,4 @@
-"""Write a small capture to try everything with, of a pot: `python -m mi_ring.example DIR`."""
+"""Write a small capture of a pot, to try all commands with: `python -m mi_ring.example DIR`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

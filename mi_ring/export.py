@@ -23,32 +23,33 @@ from mi_ring.system import command
 class ExportConfig(MaterialOptions):
     """Write the object of a finished fit for other programs. The suffix of the file chooses the format.
 
-    .ply: the mesh; vertex attributes are the parameters of its BSDF, and whether any photograph shows the vertex.
-    .glb: the mesh with a normal map and glTF's metallic-roughness material. .obj: the same as OBJ, MTL and PNG files.
-    .xml: a Mitsuba scene with bitmap textures and a stock BSDF, which needs no mi_ring.
+    .ply: the mesh. Vertex attributes: the parameters of its BSDF, and whether a photograph shows the vertex.
+    .glb: the mesh with a normal map and glTF's metallic-roughness material.
+    .obj: the same in OBJ, MTL and PNG files.
+    .xml: a Mitsuba scene with textures and Mitsuba's own BSDFs. It can be rendered without mi_ring.
 
-    Positions are in the units and the frame of the scene. A GLB has a node that converts to metres and puts the object
-    upright, if the capture says how.
+    Positions are in the units and the frame of the scene. In a GLB, a node converts them to metres and turns the object
+    upright, if the capture gives the unit and the up direction.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write. OBJ and XML files come with further files of the same name."""
+    """File to write. OBJ and XML need further files, which are written beside it."""
     subdivisions: int | None = None
     """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
-    Without it: that of the fit, and 5 for .glb, whose normal map has the finer detail."""
+    Without it: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
     resolution: int = RESOLUTION
     """Width and height of the textures [texels]."""
     time: float = 1.0
     """Time of the flow: 0 is the surface where the fit started, 1 the object."""
     metres: float | None = None
-    """Length of a scene unit [m], for .glb, whose unit is the metre.
-    Without it: as the capture says; captures with the printed sheet are in millimetres."""
+    """Length of a scene unit [m]; only for .glb. Without it: as the capture says.
+    Captures of mi-ring photos with the printed sheet are in millimetres."""
 
 
 def require_options(config: ExportConfig) -> None:
-    """Raise InputError for options out of range, and for a file that must not be overwritten."""
+    """Raise InputError if an option is out of range, or if the output would overwrite the fit or a capture."""
     kind = require_exportable(config.file, config.subdivisions, config.resolution, config.time, config.metres)
     run = config.run if config.run.is_dir() else config.run.parent
     capture = kind == ".xml" and config.file.is_file() and b'"photograph"' in config.file.read_bytes()
@@ -64,7 +65,7 @@ def seen_from(run: Path) -> list[MaskedCamera] | None:
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
     except InputError as error:
-        print(f"The file goes without what the photographs show: {error}", file=sys.stderr)
+        print(f"The file will not say what the photographs show: {error}", file=sys.stderr)
         return None
 
 
@@ -78,11 +79,11 @@ def main(arguments: Sequence[str]) -> None:
     photograph = first_photograph(config.run) if kind == ".xml" else None
     views = seen_from(config.run) if kind in (".ply", ".glb") else None
     if kind != ".ply":
-        print("Cutting the surface open and baking its material", flush=True)
+        print("Unwrapping the surface and baking its textures", flush=True)
     files = export(ring, config.file, config.subdivisions, config.resolution, config.time, config.metres, views,
                    photograph)  # fmt: skip
     if kind == ".glb" and not (config.metres or ring.metres):
-        print("The length of a scene unit is not known: the GLB is as large as if it were a metre; see --metres",
+        print("The length of a scene unit is not known: the GLB takes it for one metre; see --metres",
               file=sys.stderr)  # fmt: skip
     if unknown := ambiguity_of(config.material or config.run):
         print(unknown, file=sys.stderr)

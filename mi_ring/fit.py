@@ -26,18 +26,18 @@ from mi_ring.system import command
 from mi_ring.system.files import locked, read_json
 from mi_ring.system.machine import keep_memory, set_variant, threads_of
 
-MARGIN = 1.2  #: by which a time that is said to be enough is more than was measured: machines are shared
+MARGIN = 1.2  #: factor of the --minutes that an error message suggests over the measured time, which may vary
 PLANNED = "fast", "default", "fine"  #: presets that --minutes chooses from
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 0, or 128 and the signal that it was interrupted by: 130 is Ctrl-C."""
+    """Run the command. Returns its exit status: 0, or 128 + the number of the signal that stopped it (130: Ctrl-C)."""
     with joined() as processes:
         return run(arguments, processes)
 
 
 def run(arguments: Sequence[str], processes: Processes) -> int:
-    """The command, in each of the processes that it is run by."""
+    """Run the command in one of its `processes`."""
     started = time.monotonic()
     config, choice, state = processes.on_first(lambda: asked(arguments))
     folder = config.folder
@@ -45,17 +45,17 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
     keep_memory()
     capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks, width=max(WIDTH, *config.widths)))
     if capture.shape.ring is not None:
-        print(f"{config.scene}: surface and material of the fit that it holds are not taken, but found anew")
+        print(f"{config.scene}: contains a fitted object. The fit ignores it and starts anew")
     if capture.threshold is not None:
-        print("Masks: found by brightness, for the room was dark")
+        print("No masks given. The room was dark, so masks are found by brightness")
     elif config.masks != "given" and not any(capture.masks.given):
-        print("No masks, and the room was not dark enough to find the object by its brightness: going on without")
+        print("No masks given, and the room was too bright to find masks by brightness: the fit has no masks")
     with threads_of(config.thread_count or processes.threads), contextlib.ExitStack() as held:
         if state:
             fit = processes.agreed(lambda: resumed(state, capture, config, folder))
         else:
             fit = started_fit(capture, config, processes)
-        processes.on_first(lambda: results.fitted_scene(capture, fit.ring, folder))  # refuses what cannot be written
+        processes.on_first(lambda: results.fitted_scene(capture, fit.ring, folder))  # raises InputError early
         processes.on_first(lambda: held.enter_context(locked(folder)))
         costs = None
         if config.minutes and not state:
@@ -71,7 +71,7 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
 
 
 def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fit:
-    """A new fit. Its time includes that of the coarse fits which find an unknown light."""
+    """A new fit. Its time includes the coarse fits that find the kind of an unknown light."""
     began = time.perf_counter()
     lighting = processes.broadcast(processes.agreed(lambda: choose_lighting(capture, config)))
     seconds = time.perf_counter() - began
@@ -81,7 +81,7 @@ def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fi
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
-    """The configuration, what --minutes chooses from, and with --resume the state to go on from."""
+    """The configuration; the configurations that --minutes chooses from; with --resume, the state of the checkpoint."""
     config = parse_options(arguments)
     choice = choice_of(config, arguments)
     require_scene(config.scene)
@@ -93,13 +93,13 @@ def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | 
 
 
 def same_variant(variant: str) -> None:
-    """Switch to the variant of the first process. Raises InputError if this one cannot."""
+    """Switch to the variant of the first process. Raises InputError if this process cannot use it."""
     if set_variant(variant) != variant:
         raise InputError(f"--variant {variant}: this process has no GPU to use; give llvm_ad_rgb")
 
 
 def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
-    """What --minutes chooses from: the preset that is given, else all that the other options go with."""
+    """The configurations that --minutes chooses from: the given preset, or all presets that fit the other options."""
     if config.minutes and given(arguments, "--iterations"):
         raise InputError("--minutes: chooses --iterations; give one of the two")
     choice = []
@@ -111,7 +111,10 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
-    """Of these settings those that --minutes allows, and what iterations take. `started`: when the command was."""
+    """The configuration of `choice` that --minutes allows, and the measured costs of iterations.
+
+    `started`: start of the command, by `time.monotonic`. Raises InputError if none can be done in that time.
+    """
     minutes, processes = choice[0].minutes, fit.problem.processes
     spent = processes.broadcast(time.monotonic() - started)
     if spent > 60 * minutes:
@@ -127,12 +130,12 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
 
 
 def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path) -> FitConfig:
-    """The settings that --minutes has led to before, by the folder's config.json, if there is one."""
+    """The configuration that --minutes chose when the fit was started, by config.json in the results folder."""
     try:
         before = read_json(folder / "config.json")
         minutes, preset, iterations = float(before["minutes"]), before["preset"], int(before["iterations"])
     except (ValueError, LookupError, TypeError, OverflowError):
-        return config  # its checkpoint tells what is wrong
+        return config  # reading the checkpoint reports what is wrong
     if minutes != config.minutes:
         said = [f"{value:g}" if value else "not given" for value in (minutes, config.minutes)]
         raise InputError(f"{folder}: --minutes: was {said[0]} before, is {said[1]} now; give the same")
@@ -143,7 +146,7 @@ def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path)
 
 
 def given(arguments: Sequence[str], option: str) -> bool:
-    """Is it among the arguments?"""
+    """Whether an option is among the arguments."""
     return any(argument.split("=")[0] == option for argument in arguments)
 
 

@@ -1,4 +1,4 @@
-"""The options of a fit: its settings, what it is of, where its results go and what computes it."""
+"""The options of `mi-ring fit`: the settings of `Config`, and input, output and computing resources."""
 
 import argparse
 import dataclasses
@@ -10,36 +10,35 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, Suppress, arg
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_range
 from mi_ring.fitting.config import PRESETS, WEIGHTS, Ablation, Common, Config, Tuning, as_typed
 from mi_ring.output import results
 from mi_ring.system import command
 
-MOST_THREADS = 1024  #: of a fit
-MOST_MINUTES = 10_000  #: a week
-#: Groups of options that only --help-all shows, and how many options they have.
+MOST_THREADS, MOST_MINUTES = 1024, 10_000  #: upper limits of the options; 10,000 minutes are a week
+#: Groups of options that only --help-all shows, and the number of these options.
 GROUPS = {"tuning": Tuning, "ablation": Ablation}
 MORE = sum(len(dataclasses.fields(part)) for part in GROUPS.values()) - 1 + len(WEIGHTS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a fit is of, where its results go, and what computes it."""
+    """Input, output and computing resources."""
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file with the photographs."""
     out: Path | None = None
-    """Folder for the results.
-    Without it: out/NAME, where NAME is that of the scene file, or of its folder if the file is called scene.xml."""
+    """Folder for the results. Without it: out/NAME.
+    NAME is the name of the scene file, or of its folder if the file is called scene.xml."""
     resume: bool = False
     """Continue the fit in the results folder from its checkpoint. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
-    """Options that go together. Options that you give override them. Times are for two processor cores.
+    """A set of values for the other options. Options that you give override it. Times are for two processor cores.
     fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
-    """About how long the whole command may take [min]. 0: no limit.
-    It chooses --iterations, by the speed of this machine, and also --preset if you do not give one."""
+    """Time for the whole command, approximately [min]. 0: no limit.
+    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
     threads: int = 0
@@ -52,14 +51,12 @@ class FitConfig(Config, Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.threads <= MOST_THREADS:
-            raise InputError(f"--threads: is {self.threads}, must be 0 to {MOST_THREADS}")
-        if not 0 <= self.minutes <= MOST_MINUTES:
-            raise InputError(f"--minutes: is {self.minutes:g}, must be 0 to {MOST_MINUTES}")
+        require_range(self, "threads", 0, MOST_THREADS)
+        require_range(self, "minutes", 0, MOST_MINUTES)
         if self.minutes and self.deterministic:
-            raise InputError("--deterministic: does not go with --minutes, by which the machine's speed decides")
+            raise InputError("--deterministic: does not go with --minutes, which depends on the speed of the machine")
         if self.deterministic and self.variant != "llvm_ad_rgb":
-            raise InputError("--deterministic: needs --variant llvm_ad_rgb; a GPU adds numbers in an order of its own")
+            raise InputError("--deterministic: needs --variant llvm_ad_rgb; on a GPU the order of sums varies")
         if not set(self.weights) <= set(WEIGHTS):
             raise InputError(f"--weights: is {as_typed(self.weights)}, must be of {', '.join(WEIGHTS)}")
 
@@ -77,8 +74,8 @@ class FitConfig(Config, Task):
 def parse_options(arguments: Sequence[str]) -> FitConfig:
     """The configuration: the preset's settings, changed by those on the command line.
 
-    Raises InputError for an option that cannot be used, and SystemExit after printing the help: --help shows the first
-    group of options, --help-all all of them.
+    Raises InputError for wrong options. After printing the help it raises SystemExit: --help shows the options that
+    users set, --help-all shows all options.
     """
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     early.add_argument("--preset", nargs="?", default="default")
@@ -101,10 +98,9 @@ def parse_options(arguments: Sequence[str]) -> FitConfig:
 
 
 def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
-    """The dataclass that tyro parses, and its nested ones by field, one for each group of options.
+    """The dataclass that tyro parses, and the dataclasses nested in it by field, one for each group of `GROUPS`.
 
-    The nested options keep their names: --levels, not --tuning.levels. `brief`: tyro leaves the groups out, of the help
-    and of what it parses.
+    Nested options keep their names: --levels, not --tuning.levels. With `brief`, tyro neither shows nor parses them.
     """
     parts, nested, hidden = {}, {}, Suppress
     for name, group in GROUPS.items():
@@ -120,5 +116,5 @@ def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
 
 
 def built(kind: Any, values: dict[str, Any]) -> Any:
-    """A dataclass of this kind from the values of its fields, and of others."""
+    """An instance of the dataclass `kind`. `values` may have further names, which are ignored."""
     return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

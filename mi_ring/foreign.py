@@ -1,4 +1,4 @@
-"""Files of other programs: damage is an InputError of one line, and memory is bounded by the file's size."""
+"""Readers for files of other programs: a damaged file raises InputError and cannot exhaust the memory."""
 
 import contextlib
 import io
@@ -13,12 +13,12 @@ import numpy as np
 
 from mi_ring.errors import InputError
 
-#: A file may declare to hold this number of bytes, or this multiple of its size if that is more. PNG and zip compress
-#: 1032 times at most; a much larger ratio is an attack on the memory.
+#: A file may declare a content of `SMALL` bytes, or of `EXPANSION` times its size if that is more. PNG and zip compress
+#: at most 1032 times; a much larger ratio is an attack on the memory.
 SMALL, EXPANSION = 2**28, 2**12
 
-READ_SECONDS, READ_SPEED = 30.0, 2e6  #: time limit of a native reader: seconds, plus one for this number of bytes
-#: Begins the script of a child process: limits its memory where the system can do that.
+READ_SECONDS, READ_SPEED = 30.0, 2e6  #: time limit of a native reader: a constant [s], plus size / speed [B/s]
+#: First lines of the script of a child process: limit its memory, if the system can.
 LIMIT_MEMORY = """
 import sys
 try:
@@ -31,7 +31,10 @@ except (ImportError, OSError, ValueError):
 
 @contextlib.contextmanager
 def reading(where: Path | str, what: str) -> Iterator[None]:
-    """Turns every error of a reader into an InputError: `where` is the file, `what` its expected content."""
+    """A context manager that turns every error of a reader into an InputError.
+
+    `where` is the file, `what` its expected content.
+    """
     try:
         yield
     except InputError:
@@ -42,16 +45,16 @@ def reading(where: Path | str, what: str) -> Iterator[None]:
 
 
 def require_plausible_size(path: Path, size: int) -> None:
-    """Raise ValueError if a file declares to hold more bytes than a file of its size can."""
+    """Raise ValueError if a file declares a content of more bytes than a file of its size can hold."""
     if size > max(SMALL, EXPANSION * path.stat().st_size):
         raise ValueError(f"declares {size:,} bytes, in a file of {path.stat().st_size:,}")
 
 
 def require_readable(read: str, path: Path, size: int, what: str) -> None:
-    """Raise InputError if a native reader crashes, does not return or exhausts the memory on these files.
+    """Raise InputError if a native reader crashes, hangs or exhausts the memory on a file.
 
-    Nothing stops such a reader, not even Ctrl-C, so a child process tries it first. `read` is its call in Python, with
-    the path as sys.argv[1]; `size` is the number of bytes in the files; `what` is their expected content.
+    Not even Ctrl-C stops a native reader that hangs, so a child process tries it first. `read`: Python code that calls
+    the reader, with the path in sys.argv[1]. `size`: number of bytes to read. `what`: the expected content.
     """
     try:
         trial = [sys.executable, "-c", LIMIT_MEMORY + read, str(path), str(2**31 + 40 * size)]
@@ -77,7 +80,7 @@ def load_npy(path: Path) -> np.ndarray:
 
 
 def parse_npy(content: bytes) -> np.ndarray:
-    """The array in the content of a .npy file. Raises ValueError if that is incomplete or something else."""
+    """The array in the content of a .npy file. Raises ValueError if the content is damaged."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -90,5 +93,5 @@ def parse_npy(content: bytes) -> np.ndarray:
     if kind.kind == "U" and array.nbytes:
         codes = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(array.dtype.byteorder))
         if codes.max() > sys.maxunicode:  # Python would fail at each access
-            raise ValueError("has characters that are none")
+            raise ValueError("has invalid characters")
     return array

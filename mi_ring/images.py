@@ -96,7 +96,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         try:
             image = Image.open(file, formats=formats)
         except UnidentifiedImageError as error:  # its message does not name the file
-            raise ValueError("its content is that of no image") from error
+            raise ValueError("it is not an image") from error
         with image:
             require_plausible_size(path, 2 * len(image.getbands()) * math.prod(image.size))
             yield image
@@ -147,14 +147,14 @@ def exr_size(path: Path) -> tuple[int, int, int]:
 def read_image(path: Path) -> np.ndarray:
     """The pixels (H, W, C) of an image file: uint8, uint16, or float32 for all other types.
 
-    Raises ValueError for CMYK and for an implausible size, before memory is allocated; other errors for damaged files.
+    Raises ValueError for CMYK and, before it allocates memory, for an implausible size; other errors for damaged files.
     """
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):  # Mitsuba does not read it
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
             if page.photometric == tifffile.PHOTOMETRIC.SEPARATED:
-                raise ValueError("its colours are those of inks, CMYK; save it as RGB")
+                raise ValueError("its colours are CMYK; save it as RGB")
             require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
             for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
                 if count > path.stat().st_size:  # the reader would request each of them

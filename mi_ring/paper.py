@@ -1,4 +1,4 @@
-"""Reproduce a table or figure of the paper, ours beside it: `python -m mi_ring.paper NAME`."""
+"""Reproduce a table or figure of the paper, beside the published numbers: `python -m mi_ring.paper NAME`."""
 
 import shlex
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_range
 from mi_ring.experiments.catalogue import EXPERIMENTS
 from mi_ring.experiments.engine import run_experiment
 from mi_ring.experiments.experiment import ExperimentOptions
@@ -23,11 +23,11 @@ Name: Any = Literal[tuple(EXPERIMENTS)]
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Reproduce a table or figure of the paper: fits, a table with ours beside what was published, and a figure.
+    """Reproduce a table or figure of the paper: fits, a table of our results and the published ones, and a figure.
 
-    Each run is a fit with its results in OUT/NAME/runs/, or in OUT/NAME-PRESET/runs/ for another preset than default.
-    table.csv, table.md and figure.png are written after each run. The same command again continues where it stopped. A
-    run that fails is shown as failed, and the others continue; the exit status is then 1.
+    Each run is a fit. Its results are in OUT/NAME/runs/, or in OUT/NAME-PRESET/runs/ for another preset than default.
+    table.csv, table.md and figure.png are written after each run. To continue after an interruption, give the same
+    command again. If a run fails, the others continue, and the exit status is 1.
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
@@ -68,18 +68,17 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command. Returns its exit status: 1 if a run has failed."""
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
     experiment = EXPERIMENTS[config.name]
-    if not 0 <= config.threads <= MOST_THREADS:
-        raise InputError(f"--threads: is {config.threads}, must be 0 to {MOST_THREADS}")
+    require_range(config, "threads", 0, MOST_THREADS)
     if not config.seeds or len({*config.seeds}) < len(config.seeds):
         raise InputError(f"--seeds: is {as_typed(config.seeds)}, must be different numbers")
     if experiment.one_seed and len(config.seeds) > 1:
-        raise InputError(f"--seeds: are several; {config.name} takes one; give one")
+        raise InputError(f"--seeds: {config.name} takes only one seed")
     if missing := next((path for path in config.data if not path.exists()), None):
-        raise InputError(f"{missing}: DATA: is not there; {config.name} takes {experiment.data}")
+        raise InputError(f"{missing}: DATA: no such file or folder; {config.name} takes {experiment.data}")
     if config.quick and config.preset not in (None, "fast"):
-        raise InputError(f"--preset: is {config.preset}, but --quick is by fast; leave one of the two out")
+        raise InputError(f"--preset: is {config.preset}, but --quick needs fast; leave one of the two out")
     if not all(material.strip() for material in config.materials):
-        raise InputError("--materials: one is empty; give a plugin of Mitsuba's, a file .binary, or FILE.npz:MATERIAL")
+        raise InputError("--materials: one is empty; give a BSDF of Mitsuba, a .binary file, or FILE.npz:MATERIAL")
     preset = config.preset or ("fast" if config.quick else "default")
     options = ExperimentOptions(config.data, config.materials, preset, config.seeds, config.quick, config.threads,
                                 set_variant(config.variant), config.out)  # fmt: skip

@@ -56,11 +56,11 @@ def require_options(config: RenderConfig) -> None:
     require_range(config, "spp", 1)
     require_range(config, "time", 0, 1)
     if (config.turntable > 0) + (config.light_orbit > 0) + (config.flow > 0) > 1:
-        raise InputError("--turntable, --light-orbit, --flow: give one of the three at a time")
+        raise InputError("--turntable, --light-orbit, --flow: give only one of the three")
     if config.view is not None and not config.count:
-        raise InputError("--view: is for --turntable, --light-orbit and --flow; without them every photograph is taken")
+        raise InputError("--view: is for --turntable, --light-orbit and --flow; otherwise all photographs are rendered")
     if config.flow and config.time != 1:
-        raise InputError("--time: is one moment of the flow, --flow shows all of them; give one of the two")
+        raise InputError("--time: selects one time of the flow, --flow shows all; give one of the two")
     if config.width and not config.count:
         raise InputError("--width: is for --turntable, --light-orbit and --flow; photographs have their own size")
     if not 0 < config.fps <= 240:
@@ -68,9 +68,9 @@ def require_options(config: RenderConfig) -> None:
     if config.up is not None and not 0 < np.linalg.norm(config.up) < np.inf:
         raise InputError(f"--up: is {config.up}, must be a direction")
     if config.envmap and config.integrator == "photometric":
-        raise InputError("--integrator: photometric is for photographs' own lights; with --envmap give path or direct")
+        raise InputError("--integrator: photometric does not support --envmap; give path or direct")
     if config.envmap and config.light_orbit:
-        raise InputError("--light-orbit: moves a photograph's light, which --envmap switches off; give one of the two")
+        raise InputError("--light-orbit: moves the photograph's light, but --envmap removes it; give one of the two")
     if config.out.suffix.lower() in (".gif", ".mov", ".avi", ".mkv", ".webm", ".png", ".jpg", ".jpeg", ".exr"):
         raise InputError(f"{config.out}: must be a folder for the pictures, or a film that ends in .mp4")
     if config.film and config.format:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_range
 from mi_ring.metrics.path_tracing import BATCHES, open_lit_scene, render_both
 from mi_ring.metrics.renderer_agreement import all_as_one, compare_renderers, comparison_table, verdict
 from mi_ring.output.validation_sheet import strip, validation_sheet
@@ -23,11 +23,12 @@ from mi_ring.system.progress import progress
 class ValidateConfig:
     """Compare `photometric` with Mitsuba's path tracer on every photograph.
 
-    Prints a line for each photograph and one for all, in % of the path tracer's mean radiance: the mean difference and
-    the mean absolute difference; how much of it Monte Carlo noise explains; what shadows remove; what interreflection
-    adds; the difference of direct light, which is left unexplained. "p direct" is the probability of so large a
-    difference if both renderers' direct light is the same. "p path" is the same for photometric and all light of the
-    path tracer; it is tiny where there is interreflection.
+    Prints a line for each photograph and one for all. Numbers are in % of the path tracer's mean radiance:
+    difference: mean difference. absolute: mean absolute difference. noise: part of it that Monte Carlo noise explains.
+    shadows: light that shadows remove. interreflection: light that interreflection adds.
+    unexplained: difference of direct light.
+    p direct: probability of so large a difference if the direct light of both renderers is the same.
+    p path: the same for all light of the path tracer; tiny if there is interreflection.
 
     Writes validate.png, a contact sheet, and validate.json, all numbers. The exit status is 1 if the direct light
     differs by more than Monte Carlo noise, and 2 if there is nothing to compare.
@@ -42,25 +43,22 @@ class ValidateConfig:
     width: int = 128
     """Largest width and height of the pictures [px]."""
     spp: int = 64
-    """Samples per pixel, rounded up to a multiple of 16. More find smaller differences."""
+    """Samples per pixel, rounded up to a multiple of 16. With more, smaller differences are found."""
     depth: int = 6
-    """Longest paths, `max_depth` of the path tracer. 2 is direct light, so it is 3 or more.
-    -1: no limit."""
+    """Maximum path length of the path tracer, Mitsuba's max_depth: 3 or more (2 is direct light). -1: no limit."""
     significance: float = 0.01
-    """Probability of a false alarm: that two renderers which agree are reported to differ."""
+    """Probability of a false alarm: a reported difference although both renderers agree."""
     seed: int = 0
     """Random seed of all samples."""
 
     def __post_init__(self) -> None:
         for name in ("width", "spp"):
-            if getattr(self, name) < 1:
-                raise InputError(f"--{name}: is {getattr(self, name)}, must be at least 1")
+            require_range(self, name, 1)
         if self.depth < 3 and self.depth != -1:
             raise InputError(f"--depth: is {self.depth}, must be at least 3, or -1 for no limit")
         if not 0 < self.significance < 1:
             raise InputError(f"--significance: is {self.significance}, must be between 0 and 1")
-        if not 0 <= self.seed < 1 << 31:
-            raise InputError(f"--seed: is {self.seed}, must be 0 to {(1 << 31) - 1}")
+        require_range(self, "seed", 0, 2**31 - 1)
 
 
 def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:

@@ -202,7 +202,7 @@ def test_networks_that_are_not_registered_here_are_told_by_name(capture, tmp_pat
     class Unknown(Siren):
         pass
 
-    with pytest.raises(ValueError, match=r"Unknown: has no name to be saved by; put @mi_ring.register_network"):
+    with pytest.raises(ValueError, match="Unknown: is not registered, so it cannot be saved; put @mi_ring.reg"):
         mi_ring.Fit(capture, config(), networks=(Unknown(), Grey())).state()
     with pytest.raises(ValueError, match="is registered already"):
         mi_ring.register_network("siren of the tests")(Unknown)

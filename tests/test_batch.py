@@ -110,7 +110,7 @@ def test_an_interrupt_is_on_the_page_and_goes_on(job, monkeypatch, capsys):
         batch.main(arguments)
     assert command.exit_status(stop.value) == 128 + signal.SIGTERM and signal.getsignal(signal.SIGTERM) is handler
     said = capsys.readouterr()
-    assert "wrong: failed: " in said.out and said.err.endswith("interrupted; the same command goes on\n")
+    assert "wrong: failed: " in said.out and said.err.endswith("give the same command again\n")
     page = (job.folder.parent / "index.html").read_text()
     assert "1 interrupted" in page and "1 failed" in page and "running</" not in page and "refresh" not in page
     monkeypatch.setattr(batch, "fit_all", lambda todo, *_: Script(monkeypatch, (0, 60, "")) and fitted(job, 0))
@@ -132,7 +132,7 @@ def test_a_worker_that_is_killed_again_and_again_does_not_try_for_ever(job, monk
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             fitted(job, 2)
-    assert fitted(job, 2).message == "was killed again and again"
+    assert fitted(job, 2).message == "was killed repeatedly"
 
 
 def test_what_is_done_is_done_until_an_input_or_an_option_changes(broken_capture, tmp_path, monkeypatch):
@@ -205,16 +205,16 @@ def test_a_fit_ends_with_who_waits_for_it(small_capture, tmp_path):
 def test_scenes_of_the_same_name_are_refused(small_capture, broken_capture, tmp_path):
     with pytest.raises(InputError, match=r"small\.xml: is given twice"):
         make_jobs([small_capture, small_capture], tmp_path, [])
-    with pytest.raises(InputError, match=r"small\.xml: its results would go to .*small, where .*small\.xml is to be"):
+    with pytest.raises(InputError, match=r"small\.xml: its results would go to .*small, as do those of .*small\.xml"):
         make_jobs([small_capture, broken_capture[0]], tmp_path, [])
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["a.xml", "--workers", "0"], "--workers: is 0, must be 1 or more"),
-    (["a.xml", "--", "--out", "there"], "--out: is what the batch itself gives each fit; leave it out"),
+    (["a.xml", "--", "--out", "there"], "--out: is set by the batch; leave it out"),
     (["a.xml", "--", "--iteration", "3"], "options of fits, after --: Unrecognized options: --iteration, 3; perhaps"),
     (["a.xml", "--preset", "fast"], "Unrecognized options: --preset, fast; options of fits come after --, as in"),
-    (["a.xml", "--", "--minutes", "-1"], "--minutes: is -1, must be 0 to 10000"),
+    (["a.xml", "--", "--minutes", "-1"], "--minutes: is -1.0, must be 0 to 10000"),
     ([], "is missing"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
@@ -280,7 +280,7 @@ def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, t
     assassin.join()
     said = capsys.readouterr().out
     assert killed == ["fit", "worker"] and status == 1, said
-    assert said.count("small: has died, goes on from iteration ") == 2
+    assert said.count("small: died; continues at or shortly before iteration ") == 2
     assert "1 of 2 done, not wrong" in said and re.search(r"wrong: failed: .*damaged\.png", said)
     records = {name: Record(**json.loads((out / f"batch/{name}.json").read_text())) for name in ("small", "wrong")}
     assert records["small"].state == "done" and results.read_log(out / "small")[-1]["iteration"] == 60

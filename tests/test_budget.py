@@ -130,7 +130,7 @@ def test_presets_that_do_not_go_with_the_other_options_are_no_choice(small_captu
 
 
 @pytest.mark.parametrize(("options", "complaint"), [
-    (["--minutes", "-1"], "--minutes: is -1, must be 0 to 10000"),
+    (["--minutes", "-1"], "--minutes: is -1.0, must be 0 to 10000"),
     (["--minutes", "1e307"], "--minutes: is 1e+307, must be 0 to 10000"),
     (["--threads", "20000"], "--threads: is 20000, must be 0 to 1024"),
     (["--minutes", "1", "--deterministic"], "--deterministic: does not go with --minutes"),

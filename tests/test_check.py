@@ -37,7 +37,7 @@ def edit_images(path, change, folder="images", which="*"):
 
 def test_a_good_capture_passes(small_capture, tmp_path, capsys):
     status, text = run(small_capture, tmp_path, capsys)
-    assert status == 0 and "Nothing to mend found" in text, text
+    assert status == 0 and "No problems found" in text, text
     rows = [line.split() for line in text.splitlines() if line.split()[:1] and line.split()[0].endswith(".png")]
     assert len(rows) == 12 and {row[-1] for row in rows} <= {"98%", "99%", "100%"}
     sheet = Image.open(tmp_path / "sheet.png")
@@ -63,7 +63,7 @@ def test_wrong_conventions_are_recognised(case, broken_capture, tmp_path, capsys
     change, words = MATRICES[case]
     edit_matrices(path, change)
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and re.search(f"To mend: The masks agree to .*{words}", text), text
+    assert status == 1 and re.search(f"Problem: The masks agree to .*{words}", text), text
 
 
 def test_exchanged_principal_point(broken_capture, tmp_path, capsys):
@@ -113,7 +113,7 @@ def test_an_empty_mask_is_named_and_the_rest_is_looked_at(broken_capture, tmp_pa
     path, _ = broken_capture
     edit_images(path, np.zeros_like, "masks", "005")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and text.count("To mend") == 1 and "To mend: 005.png: its mask is empty" in text, text
+    assert status == 1 and text.count("Problem") == 1 and "Problem: 005.png: its mask is empty" in text, text
 
 
 def test_few_photographs(broken_capture, tmp_path, capsys):
@@ -121,7 +121,7 @@ def test_few_photographs(broken_capture, tmp_path, capsys):
     text = path.read_text()
     path.write_text(text[: text.index('  <sensor type="photograph" id="005"')] + "</scene>")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and "5 views are few" in text, text
+    assert status == 1 and "5 views are too few" in text, text
 
 
 def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
@@ -130,7 +130,7 @@ def test_one_wrong_pose_is_named(broken_capture, tmp_path, capsys):
     turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     edit_matrices(path, lambda m: m @ turn if next(count) == 4 else m)  # the camera upright
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and "To mend: 004.png: the others agree to" in text and text.count("To mend") <= 2, text
+    assert status == 1 and "Problem: 004.png: the others agree to" in text and text.count("Problem") <= 2, text
 
 
 def test_one_wrong_place_is_named(broken_capture, tmp_path, capsys):
@@ -141,7 +141,7 @@ def test_one_wrong_place_is_named(broken_capture, tmp_path, capsys):
     move[:3, 3] = 25, -10, 20
     edit_matrices(path, lambda m: m + move if next(count) == 4 else m)
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and re.findall("To mend: (.*): the others agree to", text) == ["004.png"], text
+    assert status == 1 and re.findall("Problem: (.*): the others agree to", text) == ["004.png"], text
 
 
 def test_cameras_that_look_away(broken_capture, tmp_path, capsys):
@@ -157,7 +157,7 @@ def test_more_photographs_than_the_hull_is_made_of(broken_capture, tmp_path, cap
     monkeypatch.setattr(hull, "MAX_MASKS", 5)
     edit_images(path, lambda mask: np.roll(mask, 9, 1), "masks", "008")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and "To mend: 008.png: the others agree to" in text, text
+    assert status == 1 and "Problem: 008.png: the others agree to" in text, text
     assert all(line.endswith("%") for line in text.splitlines() if re.match(r"0\d\d.png", line.strip()))
 
 
@@ -176,7 +176,7 @@ def test_one_exposure_that_is_wrong(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     edit_images(path, lambda image: image // 4, which="007")
     status, text = run(path, tmp_path, capsys)
-    assert status == 1 and re.search(r"To mend: 007.png: is 0.0\d+ times as bright as the others", text), text
+    assert status == 1 and re.search(r"Problem: 007.png: is 0.0\d+ times as bright as the others", text), text
 
 
 def test_over_exposed(broken_capture, tmp_path, capsys):
@@ -194,7 +194,7 @@ def test_a_bright_background_harms_nothing_with_masks_and_is_an_error_without(br
     for masks in ("none", "given"):
         path.write_text(re.sub(r'<string name="mask"[^>]*>', "", path.read_text()))
         status, text = run(path, tmp_path, capsys, "--masks", masks)
-        assert status == 1 and "To mend: no masks, and the background is not dark" in text and "mi-ring photos" in text
+        assert status == 1 and "Problem: no masks, and the background is not dark" in text and "mi-ring photos" in text
 
 
 def test_light_of_the_room_is_told_from_the_falloff():

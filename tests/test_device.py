@@ -83,7 +83,7 @@ def test_bfloat16_is_for_processors_that_are_faster_with_it(amx, bf16, name, tol
 def test_without_a_gpu_the_fit_says_so_and_goes_on(small_capture, tmp_path, capsys):
     assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--variant", "cuda_ad_rgb", *TINY]) == 0
     said = capsys.readouterr().out
-    assert "--variant cuda_ad_rgb: no GPU to use (" in said and "going on with llvm_ad_rgb, on the processor" in said
+    assert "--variant cuda_ad_rgb: no usable GPU (" in said and "using llvm_ad_rgb on the processor" in said
     assert '"variant": "llvm_ad_rgb"' in (tmp_path / "run" / "config.json").read_text()
 
 

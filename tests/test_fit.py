@@ -166,7 +166,7 @@ def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatc
 
 def test_a_finished_fit_is_fitted_anew_and_not_silently(finished, tmp_path, capsys):
     assert fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE]) == 0
-    said = "surface and material of the fit that it holds are not taken, but found anew"
+    said = "contains a fitted object. The fit ignores it and starts anew"
     assert f"{finished / 'scene.xml'}: {said}" in capsys.readouterr().out
     weights = ElementTree.parse(tmp_path / "run" / "scene.xml").findall("shape/string[@name='weights']")
     assert [element.get("value") for element in weights] == ["ring.pt"]

@@ -160,7 +160,7 @@ def test_an_interrupt_ends_native_work_in_one_line(number, photographs, tmp_path
     listener.join()
     os.close(ours)
     last = text.decode().replace("\r", "\n").split("\n")
-    assert [line for line in last if line.strip()][-1] == "interrupted; the same command goes on"
+    assert [line for line in last if line.strip()][-1] == "interrupted; to continue, give the same command again"
     assert b"Traceback" not in text and (tmp_path / "capture/work/sheet.json").exists()
 
 

@@ -85,7 +85,7 @@ def test_what_photographs_do_not_show_is_not_cut_off():
 
 def test_mistakes():
     views = list(silhouettes(ball(4.0)))
-    with pytest.raises(InputError, match="mask 3: mask: nothing in it"):
+    with pytest.raises(InputError, match="mask 3: mask: is empty, or nearly"):
         Hull([*views[:3], views[3]._replace(mask=np.zeros_like(views[3].mask))], "scene.xml")
     with pytest.raises(InputError, match="scene.xml: to_world: all cameras are in one place or look along one l"):
         Hull(views[:1], "scene.xml")

@@ -94,9 +94,9 @@ def test_light_that_turns_with_the_camera_is_written_so(in_an_environment, tmp_p
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert frames_of(again.scene) == {"camera"}
-    assert "cannot be told from the object" in html.unescape((tmp_path / "report.html").read_text())
+    assert "cannot be separated from those of the object" in html.unescape((tmp_path / "report.html").read_text())
     export.main([str(tmp_path / "ring.pt"), str(tmp_path / "object.ply")])
-    assert "slow changes of light and of reflectance can hardly be told apart" in capsys.readouterr().err
+    assert "smooth variations of light and reflectance can hardly be separated" in capsys.readouterr().err
     np.testing.assert_allclose(again.photographs.room, fit.calibrated().photographs.room, atol=1e-5)
 
     # Found anew as fixed in the world, nothing is left in the camera's axes.

@@ -271,7 +271,7 @@ def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, ca
         except KeyboardInterrupt as error:
             raise InputError("scene.xml: failed to instantiate a plugin") from error
     assert command.exit_status(stop.value) == 128 + number and signal.getsignal(number) is handler
-    assert capsys.readouterr().err == "interrupted; the same command goes on\n"
+    assert capsys.readouterr().err == "interrupted; to continue, give the same command again\n"
     with pytest.raises(InputError, match="no signal"), command.resumable():
         raise InputError("no signal")
     assert not command.interrupted()

@@ -167,20 +167,20 @@ def test_published_figures():
 MISTAKES = [
     (["tabel1"], "NAME: is tabel1; must be one of table1, table2.*; perhaps you meant table1"),
     ([], "NAME: is missing"),
-    (["table1", "nowhere"], "nowhere: DATA: is not there; table1 takes folders of captures"),
+    (["table1", "nowhere"], "nowhere: DATA: no such file or folder; table1 takes folders of captures"),
     (["table1", "--seeds", "1", "1"], "--seeds: is 1 1, must be different"),
     (["table1", "--seeds", "x"], r"--seeds: is x, must be INT \[INT \.\.\.\]"),
-    (["table1", "--quick", "--preset", "fine"], "--preset: is fine, but --quick is by fast; leave one of the two out"),
+    (["table1", "--quick", "--preset", "fine"], "--preset: is fine, but --quick needs fast; leave one of the two out"),
     (["table1", "--threads", "-1"], "--threads: is -1, must be 0 to 1024"),
     (["table1", "EMPTY"], "scene.xml"),
     (["table1", "--only", "other"], "--only: has other, must be of"),
     (["table2"], "DATA: table2 needs one folder, that of DiLiGenT-MV"),
-    (["table2", "EMPTY"], "has no mvpmsData/bearPNG/Calib_Results.mat"),
+    (["table2", "EMPTY"], "has no file like mvpmsData/bearPNG/Calib_Results.mat"),
     (["single"], "DATA: single needs .npz files"),
     (["single", "EMPTY"], "is a folder"),
-    (["swap", "--materials", "diffuse"], "--materials: are what meshes are made of, and this experiment takes none"),
-    (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: are several; swap takes one"),
-    (["timing", "KNOWN", "--seeds", "0", "1"], "--seeds: are several; timing takes one"),
+    (["swap", "--materials", "diffuse"], "--materials: apply to meshes, which this experiment does not use"),
+    (["swap", "KNOWN", "KNOWN", "--seeds", "1", "2"], "--seeds: swap takes only one seed"),
+    (["timing", "KNOWN", "--seeds", "0", "1"], "--seeds: timing takes only one seed"),
     (["specularity", "--materials", ""], "--materials: one is empty"),
     (["table1", "PLY", "--materials", " "], "--materials: one is empty"),
     (["table1", "PLY", "--materials", "diffuse", "plastic"], "--materials: are 2 for 1 meshes"),
@@ -188,11 +188,11 @@ MISTAKES = [
     (["specularity", "--materials", "nowhere.binary"], "nowhere.binary: --materials: no such file"),
     (["specularity", "PLY", "--materials", "principled base_color=vertex_color"], "--materials: .* varies over the"),
     (["stripes", "PLY", "--materials", "diffuse", "TEXTURED"], "--materials: .*wood.xml: varies over the surface"),
-    (["views", "--materials", "diffuse"], "--materials: are what meshes are made of"),
+    (["views", "--materials", "diffuse"], "--materials: apply to meshes only"),
     (["stripes", "--materials", "diffuse"], "--materials: are 1, stripes need two"),
     (["specularity", "EMPTY"], "DATA: must be one mesh"),
     (["swap", "KNOWN"], "DATA: is one capture; swap exchanges"),
-    (["table1", "KNOWN", "KNOWN"], "DATA: two runs would both be called egg; rename"),
+    (["table1", "KNOWN", "KNOWN"], "DATA: two runs would have the name egg; rename"),
 ]  # fmt: skip
 
 
@@ -214,9 +214,9 @@ def test_wrong_arguments_give_one_clear_error(known_capture, tmp_path):
 def test_each_run_has_a_folder_of_its_own(known_capture):
     """Captures egg with seed 3 and egg-3, and one that would be among the records."""
     runs = [Run(name, datasets.given(known_capture), {"capture": name}) for name in ("egg", "egg-3", "batch")]
-    with pytest.raises(InputError, match="DATA: two runs would both be called egg-3; rename a capture, leave out what"):
+    with pytest.raises(InputError, match="DATA: two runs would have the name egg-3; rename a capture, or leave out"):
         trial(runs[:2]).runs(ExperimentOptions(seeds=(0, 3)))
-    with pytest.raises(InputError, match="DATA: a run would be called batch, as the folder of records is; rename"):
+    with pytest.raises(InputError, match="DATA: a run would have the name batch of another folder; rename"):
         trial(runs[2:]).runs(ExperimentOptions())
 
 
@@ -565,7 +565,7 @@ def test_one_capture_is_made_in_turn_and_others_at_the_same_time(tmp_path, capsy
     two = [Slow.of(tmp_path / "cup", events) for _ in range(2)]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2
     assert events == ["begun", "done"] * 2
-    assert "cup, which another process makes" in capsys.readouterr().out
+    assert "cup: another process writes it" in capsys.readouterr().out
     barrier = threading.Barrier(2, timeout=10)  # broken unless both get there
     two = [Slow.of(tmp_path / name, [], barrier.wait) for name in ("cup", "pot")]
     assert both_tried(*two, tmp_path / "out") == ["there is none"] * 2

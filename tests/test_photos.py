@@ -50,7 +50,7 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     text = capsys.readouterr().out
     assert (
         f"Cameras: 20 of 20 photographs, as given by {folder / 'transforms.json'}" in text
-        and "Nothing to mend found" in text
+        and "No problems found" in text
     )
     capture = load_capture(out / "scene.xml")
     assert len(capture) == 20 and all(mask is not None for mask in capture.masks)
@@ -254,6 +254,6 @@ def test_inks_are_not_taken_for_light(tmp_path):
     inks = Image.new("CMYK", (9, 7), (20, 90, 200, 10))
     inks.save(tmp_path / "a.tif")
     inks.save(tmp_path / "a.jpg")
-    with pytest.raises(InputError, match=r"a.tif: cannot be read as image \(its colours are those of inks, CMYK; save"):
+    with pytest.raises(InputError, match=r"a.tif: cannot be read as image \(its colours are CMYK; save"):
         _ = Picture(tmp_path / "a.tif").pixels
     assert Picture(tmp_path / "a.jpg").pixels.shape == (7, 9, 3)  # Pillow converts these

@@ -212,7 +212,7 @@ def test_scenes_of_the_same_name_do_not_share_a_folder_by_default(small_capture,
     assert fit.main([str(small_capture), *quick]) == 0
     assert fit.main([str(small_capture), *quick]) == 0  # the same scene: the first result is moved aside
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["small", "small.1"]
-    with pytest.raises(InputError, match="out/small: holds the results of another scene, .*small.xml; say with --out"):
+    with pytest.raises(InputError, match="out/small: holds the results of another scene, .*small.xml; give another"):
         fit.main([str(broken_capture[0]), *quick])
     assert fit.main([str(broken_capture[0]), "--out", "out/mine", *quick]) == 0
 

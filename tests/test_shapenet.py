@@ -201,7 +201,7 @@ def test_saved_fit_of_another_domain_loads(torus, tmp_path):
         ({"weights": "garbage.pt"}, "garbage.pt: not a saved fit"),
         ({"weights": "list.pt"}, "list.pt: not a saved fit"),
         ({"weights": "older.pt"}, "older.pt: format version 0"),
-        ({"weights": "half.pt"}, "half.pt: damaged, or of other networks than it says"),
+        ({"weights": "half.pt"}, "half.pt: damaged, or its networks do not match their names"),
         ({"domain": "open.ply"}, "open.ply.* is not a closed surface"),
         ({"domain": "missing.ply"}, "missing.ply"),
         ({"subdivisions": "fine"}, "subdivisions is fine, must be 0 to 8"),
@@ -344,5 +344,5 @@ def test_what_no_fit_has_is_refused(change, tmp_path):
     load_fit(path)
     change(state)
     write_state(state, path)
-    with pytest.raises(InputError, match=r"ring\.pt: damaged, or of other networks than it says"):
+    with pytest.raises(InputError, match=r"ring\.pt: damaged, or its networks do not match their names"):
         load_fit(path)

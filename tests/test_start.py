@@ -116,14 +116,14 @@ def test_auto_takes_the_hull(small_capture):
 def test_where_the_scene_says_where_the_object_is_bad_masks_do_not_stop_a_fit(broken_capture):
     path, _ = broken_capture
     mi.Bitmap(np.zeros((40, 56, 1), np.uint8)).write(str(path.parent / "masks/004.png"))
-    with pytest.raises(InputError, match="nothing in it"):
+    with pytest.raises(InputError, match="mask: is empty"):
         start.starting_surface(load_capture(path), "auto")
     bsdf = '<bsdf type="cooktorrance"/>'
     place = '<point name="center" x="400" y="-150" z="90"/><float name="radius" value="30"/>'
     path.write_text(path.read_text().replace(bsdf, bsdf + place))
     domain, center, radius = start.starting_surface(load_capture(path), "auto")
     assert type(domain) is Sphere and center.tolist() == CENTER.tolist() and radius == 30
-    with pytest.raises(InputError, match="nothing in it"):
+    with pytest.raises(InputError, match="mask: is empty"):
         start.starting_surface(load_capture(path), "hull")
 
 
@@ -147,4 +147,4 @@ def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, ca
     for file in path.parent.glob("images/*.png"):
         mi.Bitmap(np.maximum(np.array(mi.Bitmap(str(file))), 90)).write(str(file))
     assert fit.main([str(path), "--out", str(tmp_path / "bright"), "--iterations", "1", *SPHERE]) == 0
-    assert "the room was not dark enough" in capsys.readouterr().out
+    assert "the room was too bright to find masks" in capsys.readouterr().out

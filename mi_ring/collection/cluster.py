@@ -11,13 +11,13 @@ from mi_ring.collection.jobs import Job
 from mi_ring.errors import InputError
 from mi_ring.system.optional import keeping_handlers, need
 
-OBJECT_STORE = 80 * 2**20  #: bytes of Ray's object store, about the least that Ray takes: fits share no data
-POLL = 1.0  #: seconds between looks at the fits
+OBJECT_STORE = 80 * 2**20  #: size of Ray's object store [bytes], about the minimum: fits share no data
+POLL = 1.0  #: interval between checks of the fits [s]
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What each fit gets, and how many fits run at a time."""
+    """The resources of each fit, and the number of fits at a time."""
 
     workers: int
     cpus: int  #: cores and threads of each fit
@@ -28,7 +28,7 @@ class Resources:
 
 @contextlib.contextmanager
 def ray_cluster(resources: Resources) -> Iterator[Any]:
-    """Ray, started or connected. Raises InputError if it is missing or unreachable, or if no machine has room."""
+    """A context manager that starts Ray or connects to it. Raises InputError if Ray or the resources are missing."""
     ray = need("ray", "mi-ring batch")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"address": resources.address, "log_to_driver": False, "logging_level": "ERROR"}
@@ -46,7 +46,7 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if not any(all(node.get(name, 0) >= amount for name, amount in needed.items()) for node in nodes):
             most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in needed}
-            raise InputError(f"--cpus, --gpus, --memory: no machine has room for a fit; they have {most['CPU']:g} "
+            raise InputError(f"--cpus, --gpus, --memory: no machine has enough for a fit: at most {most['CPU']:g} "
                              f"processor cores, {most['GPU']:g} GPUs, {most['memory'] / 2**30:.3g} GiB")  # fmt: skip
         yield ray
     finally:
@@ -54,10 +54,10 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
 
 
 def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, on_poll: Callable[[], None]) -> None:
-    """Fit all jobs on Ray and return when all have ended; the record of each then has its outcome.
+    """Fit all jobs on Ray. Returns when all have ended; their records then have the outcomes.
 
-    `jobs`: with their fingerprints. `retries`: as `fit_to_the_end` has it.
-    `on_poll` is called about once a second. Ray replaces a worker that dies; its fit resumes from the last checkpoint.
+    `jobs`: fingerprints by job. `retries`: as in `fit_to_the_end`. `on_poll` is called about once a second. Ray
+    replaces a worker that dies; its fit resumes from the last checkpoint.
     """
     with ray_cluster(resources) as ray:
         fit = ray.remote(fit_to_the_end).options(

@@ -1,4 +1,4 @@
-"""One fit of many. It runs in its own process, which is started again from the last checkpoint if it dies."""
+"""One fit in a process of its own. If the process dies, it is started again from the last checkpoint."""
 
 import contextlib
 import ctypes
@@ -13,30 +13,30 @@ from typing import Any
 
 from mi_ring.collection.jobs import Job, Record, modified
 
-USER_ERROR = 2  #: exit status of a fit whose input is wrong; another try would fail, too
+USER_ERROR = 2  #: exit status of a fit with wrong input; a retry would fail too
 DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
 
 
 def fit_to_the_end(
     job: Job, fingerprint: str, retries: int, extra: tuple[str, ...] = (), on_line: Callable[[str], None] | None = None
 ) -> Record:
-    """Fit a scene, or continue its fit. Returns a record whose state is done or failed.
+    """Fit a scene, or continue its fit. Returns a record with the state done or failed.
 
-    A fit that dies is started again, at most `retries` times without progress. `fingerprint`: that of the job.
-    `extra`: options that do not change the result. `on_line` gets each line that the fit prints. If this process is
+    A fit that dies is restarted, at most `retries` times in a row without progress. `fingerprint`: of the job.
+    `extra`: options that do not change the result. `on_line` is called with each printed line. After this process was
     killed, call the function again.
     """
     record = job.record
     if record.fingerprint != fingerprint:  # the fit itself moves the results of the other fit aside
         record = Record(fingerprint=fingerprint, since=time.time(), done=record.done, written=record.written)
-    if record.state in ("failed", "done"):  # that was an earlier batch: count from 0
+    if record.state in ("failed", "done"):  # of an earlier batch: count from 0
         record = replace(record, tries=0)
     complaint = record.message
     while True:
         iteration = job.iteration(record.since)
         tries = 1 if iteration > record.iteration else record.tries + 1
         if tries > retries + 1:
-            return job.save(replace(record, state="failed", message=complaint or "was killed again and again"))
+            return job.save(replace(record, state="failed", message=complaint or "was killed repeatedly"))
         record = job.save(replace(record, state="running", message="", tries=tries, iteration=iteration))
         resume = ["--resume"] if job.has_checkpoint(record.since) else []
         command = [sys.executable, "-m", "mi_ring.fit", str(job.scene), "--out", str(job.folder), *extra, *job.options]
@@ -51,7 +51,10 @@ def fit_to_the_end(
 
 
 def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = None) -> tuple[int, str]:
-    """Run a fit, which ends with this process, and write its output. Returns its exit status and its last line."""
+    """Run a fit and write its output to `job.output`. Returns its exit status and its last line.
+
+    The fit ends if this process ends.
+    """
     cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     options |= {"encoding": "utf-8", "errors": "replace", **die_with_parent()}
@@ -76,7 +79,7 @@ def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = No
 
 
 def die_with_parent() -> dict[str, Any]:
-    """Options of `Popen` for a process that the kernel kills when this one ends. Only Linux can do so."""
+    """Options of `Popen` that let the kernel kill the process when this process ends; only on Linux."""
     if not sys.platform.startswith("linux"):
         return {}
     prctl: Callable[..., int] = ctypes.CDLL(None).prctl

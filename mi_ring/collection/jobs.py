@@ -1,4 +1,4 @@
-"""Jobs: scenes to fit. A record beside the results says how far the fit of each is."""
+"""Jobs: scenes to fit. A record beside the results has the state of each fit."""
 
 import contextlib
 import hashlib
@@ -19,15 +19,15 @@ CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
 
 @dataclass(frozen=True)
 class Record:
-    """How far the fit of a job is."""
+    """The state of the fit of a job."""
 
     state: str = "waiting"  #: waiting, running, interrupted, failed or done
     fingerprint: str = ""  #: of the job that is being fitted
     message: str = ""  #: why the fit failed
     tries: int = 0  #: starts since the fit last made progress
     iteration: int = 0  #: at the start of the last try
-    since: float = 0.0  #: time of the first start for this fingerprint; older files in the folder are of another fit
-    done: str = ""  #: fingerprint of the results in the folder; a later fit that fails leaves them there
+    since: float = 0.0  #: time of the first start for this fingerprint; older files in the folder are of other fits
+    done: str = ""  #: fingerprint of the results in the folder; a later failed fit keeps them
     written: int = 0  #: modification time of their ring.pt [ns]
 
 
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def record(self) -> Record:
-        """The last record; that of a waiting job if there is none or if it cannot be read."""
+        """The last record. If it is missing or damaged: the record of a waiting job."""
         with contextlib.suppress(TypeError):
             return Record(**read_json(self.output.with_suffix(".json")))
         return Record()
@@ -65,7 +65,7 @@ class Job:
         return record
 
     def fingerprint(self) -> str:
-        """Hash of the options, the scene file, and all files that either of them names."""
+        """Hash of the options, the scene file, and all files that they name."""
         result = hashlib.blake2b(repr(self.options).encode(), digest_size=16)
         with contextlib.suppress(OSError):  # the fit reports what is wrong with the scene file
             text = self.scene.read_bytes()
@@ -79,11 +79,11 @@ class Job:
         return result.hexdigest()
 
     def has_checkpoint(self, since: float) -> bool:
-        """Is there a checkpoint that is not older than a time `since`?"""
+        """Whether there is a checkpoint that is not older than the time `since`."""
         return any(modified(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
 
     def iteration(self, since: float = 0.0) -> int:
-        """Last iteration in log.jsonl; 0 if the log is missing or older than a time `since`."""
+        """Last iteration in log.jsonl; 0 if the log is missing or older than the time `since`."""
         with contextlib.suppress(OSError, KeyError, TypeError):
             if modified(self.folder / "log.jsonl") / 1e9 >= since:
                 return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
@@ -91,7 +91,7 @@ class Job:
 
     @property
     def progress(self) -> str:
-        """How far a running fit is, as text."""
+        """The progress of a running fit, as text."""
         planned = ""
         with contextlib.suppress(OSError, IndexError):
             planned = re.findall(r"iteration \d+/(\d+)", self.output.read_text(errors="replace"))[-1]
@@ -99,7 +99,7 @@ class Job:
         return f"iteration {iteration}{' of ' * bool(planned)}{planned}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
-        """Are there complete results for this fingerprint?"""
+        """Whether there are complete results for this fingerprint."""
         record, ring = self.record, modified(self.folder / "ring.pt")
         there = ring and (self.folder / "report.html").is_file()
         return bool(there) and (record.done, record.written) == (fingerprint, ring)
@@ -114,7 +114,7 @@ def modified(path: Path) -> int:
 
 
 def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene. Raises InputError for a missing file, equal names, and results that overwrite a scene."""
+    """A job for each scene. Raises InputError for missing files, equal names, and results that overwrite a scene."""
     jobs: dict[str, Job] = {}
     for scene in scenes:
         require_file(scene, "the XML file of a scene")
@@ -122,9 +122,9 @@ def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list
         if name in jobs and jobs[name].scene == scene.resolve():
             raise InputError(f"{scene}: is given twice; give it once")
         if name in jobs or name == RECORDS:
-            other = f"{jobs[name].scene} is" if name in jobs else "records of batches are"
-            raise InputError(f"{scene}: its results would go to {out / name}, where {other} to be; rename it, or "
-                             "fit it in a batch of its own with another --out")  # fmt: skip
+            other = f"those of {jobs[name].scene}" if name in jobs else "the records of the batch"
+            raise InputError(f"{scene}: its results would go to {out / name}, as do {other}; rename it, or "
+                             "fit it in another batch with another --out")  # fmt: skip
         folder = out.resolve() / name
         if folder in scene.resolve().parents:
             raise InputError(f"{folder}: --out: holds the scene file {scene.name} itself; choose another folder")

@@ -1,4 +1,4 @@
-"""Slices of BRDFs for light and camera in the same direction, as Mitsuba evaluates them."""
+"""BRDF slices: values for light and camera in the same direction, evaluated by Mitsuba."""
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +20,7 @@ def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
 
 
 def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """BRDFs (count, angles, 3) [1/sr] at the `ANGLES`, of the `count` materials of `bsdf_of`, or of one material."""
+    """BRDFs (count, angles, 3) [1/sr] at the `ANGLES` for a BSDF of `count` materials, as `bsdf_of` makes it."""
     angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
     si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
     si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)
@@ -31,7 +31,7 @@ def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
 
 
 def is_second_material(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(P,) bool: where the true object with these bounds (2, 3) has the second material at points (P, 3) near it."""
+    """Which points (P, 3) near the true object have the second material: (P,) bool. `bounds` (2, 3): of the object."""
     edge = 1e-4 * (bounds[1] - bounds[0])  # outside the bounds the pattern would repeat
     inside = np.clip(points, bounds[0] + edge, bounds[1] - edge)
     pattern = pattern_of(config.pattern, np.concatenate([bounds, inside]), config.bands, "xyz".index(config.up), "")

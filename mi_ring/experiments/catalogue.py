@@ -1,4 +1,4 @@
-"""The experiments: the runs of each, and the columns and the figure that are made of them."""
+"""The experiments: their runs, columns and figures."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from mi_ring.experiments.selection import datasets, one_mesh, path_traced, requi
 from mi_ring.experiments.single_view import SingleView
 
 DILIGENT = "https://sites.google.com/site/photometricstereodata"  #: site of the two data sets
-POSE_ERROR = 0.5  #: of cameras in table 3 [deg], and [% of the distance]
+POSE_ERROR = 0.5  #: of cameras in table 3: rotation [deg] and position [% of the distance]
 VIEWS = 5, 10, 15, 25, 35, 50
 BANDS = 6  #: number of stripes
 #: Default materials of `specularity`, by rising gloss, and of `stripes`.
@@ -49,7 +49,7 @@ def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequenc
 
 
 def table2(options: ExperimentOptions) -> list[Run]:
-    """Each object of DiLiGenT-MV that the paper has or that DATA has. Those that are not in DATA fail."""
+    """Each object of DiLiGenT-MV that is in the paper or in DATA. Runs of objects that are not in DATA fail."""
     require_no_materials(options)
     if len(options.data) != 1:
         raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
@@ -57,8 +57,8 @@ def table2(options: ExperimentOptions) -> list[Run]:
     root = options.data[0] / "mvpmsData" if (options.data[0] / "mvpmsData").is_dir() else options.data[0]
     folders = {folder.name.removesuffix("PNG"): folder for folder in sorted(root.glob("*PNG"))}
     if not any((folder / "Calib_Results.mat").is_file() for folder in folders.values()):
-        raise InputError(f"{options.data[0]}: has no mvpmsData/bearPNG/Calib_Results.mat or the like; give the folder "
-                         "of DiLiGenT-MV as it is unpacked")  # fmt: skip
+        raise InputError(f"{options.data[0]}: has no file like mvpmsData/bearPNG/Calib_Results.mat; give the folder of "
+                         "DiLiGenT-MV as it was unpacked")  # fmt: skip
     runs = []
     for name in sorted({*(str(row["object"]) for row in published.TABLE2), *folders}):
         source = folders.get(name, root / f"{name}PNG")
@@ -68,7 +68,7 @@ def table2(options: ExperimentOptions) -> list[Run]:
 
 
 def table3(options: ExperimentOptions) -> list[Run]:
-    """Each dataset with exact cameras, with wrong ones, and with wrong ones that are refined."""
+    """Each dataset with exact cameras, with wrong cameras, and with wrong cameras that are refined."""
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:
@@ -84,11 +84,11 @@ def table3(options: ExperimentOptions) -> list[Run]:
 
 
 def specularity(options: ExperimentOptions) -> list[Run]:
-    """One mesh of each material."""
+    """One mesh with each of the materials."""
     mesh = one_mesh(options)
     materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
     names = [short_name(material) for material in materials]
-    if len({*names}) < len(names):  # they differ in parameters that short names leave out
+    if len({*names}) < len(names):  # they differ in parameters that are not in short names
         names = list(materials)
     traced = [path_traced(options, mesh, m, f"gloss-{mesh.stem if mesh else 'pot'}-{short_name(m)}")
               for m in materials]  # fmt: skip
@@ -97,7 +97,7 @@ def specularity(options: ExperimentOptions) -> list[Run]:
 
 
 def stripes(options: ExperimentOptions) -> list[Run]:
-    """One mesh of two materials."""
+    """One mesh with stripes of two materials."""
     mesh, materials = one_mesh(options), options.materials or STRIPED
     if len(materials) != 2:
         raise InputError(f"--materials: are {len(materials)}, stripes need two")
@@ -120,7 +120,7 @@ def views(options: ExperimentOptions) -> list[Run]:
 
 
 def swap(options: ExperimentOptions) -> list[Run]:
-    """Two datasets or more, from a sphere."""
+    """Two or more datasets, each fitted from a sphere."""
     if not options.data:
         require_no_materials(options)
     found = datasets(options)
@@ -132,7 +132,7 @@ def swap(options: ExperimentOptions) -> list[Run]:
 
 
 def single(options: ExperimentOptions) -> list[Run]:
-    """Each object of DiLiGenT, seen from one side."""
+    """Each object of DiLiGenT, with photographs of one camera."""
     require_no_materials(options)
     if not options.data:
         raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "
@@ -176,7 +176,7 @@ EXPERIMENTS = {
         table3, {**NORMALS, **DEPTH, **PHOTOGRAPHS, "turned": Column("cameras turned °", 3), **TIME},
         plots.bars(NORMAL_ERROR, ("turned", "rotation error of the cameras [°]")), published=published.TABLE3),
     "specularity": Experiment(
-        "Materials of rising gloss on one shape: normals, and slices of the BRDF with light and camera at one place.",
+        "Materials of increasing gloss on one shape: normals, and BRDF slices with light and camera at one place.",
         specularity, {**ACCURACY, **MATERIAL}, plots.slices, "one mesh"),
     "stripes": Experiment(
         "Two materials in stripes: normals, and whether each place has the right one.", stripes,
@@ -184,7 +184,7 @@ EXPERIMENTS = {
     "views": Experiment(
         "Accuracy by number of photographs.", views, ACCURACY, plots.curves(("views", "photographs"), NORMAL_ERROR)),
     "ablation": Experiment(
-        "The ring against plain ResNets: triangles turned inside out, and crossing others, in % of all.",
+        "The ring and plain ResNets: triangles that are inside out or cross others, in % of all.",
         each_setting("network", NETWORKS, quick=list(NETWORKS)[:2]), SHAPE,
         plots.bars(("inside_out", "inside out [%]"), ("crossing", "crossing [%]"), NORMAL_ERROR)),
     "encoding": Experiment(
@@ -199,10 +199,10 @@ EXPERIMENTS = {
         each_setting("start", {name: {"domain": name} for name in ("sphere", "hull")}),
         {**SHAPE, "genus": Column("genus"), "genus_true": Column("true genus")}, plots.pictures),
     "swap": Experiment(
-        "Materials exchanged between fits from one domain, the sphere.", swap, ACCURACY, plots.swapped,
+        "Materials exchanged between fits that start from the sphere.", swap, ACCURACY, plots.swapped,
         f"two or more {Experiment.data}", one_seed=True),
     "resolution": Experiment(
-        "One fit, sampled at several levels: the networks are functions.", each_dataset(measure=measures.by_level),
+        "One fit, sampled at several levels of the mesh.", each_dataset(measure=measures.by_level),
         {"level": Column("level", 0), "vertices": Column("vertices", 0), **NORMALS, **DEPTHS, **FLAWS},
         plots.curves(("vertices", "vertices"), NORMAL_ERROR, logarithmic=True), one_seed=True),
     "timing": Experiment(

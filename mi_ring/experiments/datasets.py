@@ -1,4 +1,4 @@
-"""Datasets of experiments: captures with ground truth, given by the user, path traced, converted or derived."""
+"""Datasets of experiments: captures with ground truth, from the user, path traced, converted or derived."""
 
 import json
 import shutil
@@ -30,14 +30,14 @@ WANTED = "the folder of a capture with scene.xml and truth/mesh.ply, or its scen
 
 @dataclass(frozen=True)
 class Dataset:
-    """A capture with ground truth. Subclasses are written when they are first needed."""
+    """A capture with ground truth. `prepare` of the subclasses writes its files."""
 
     name: str
     scene: Path  #: scene file
     truth: Path  #: folder with mesh.ply and, perhaps, scene.xml of novel views
 
     def prepare(self) -> None:
-        """Write what is missing or outdated, one process at a time. Raises InputError if that is impossible."""
+        """Write files that are missing or outdated, one process at a time. Raises InputError if that fails."""
         require_file(self.scene, WANTED)
 
     @property
@@ -53,19 +53,19 @@ class Dataset:
 
 
 def given(path: Path) -> Dataset:
-    """The user's capture, by its folder or scene file. Raises InputError if scene file or truth are missing."""
+    """The user's capture, from its folder or scene file. Raises InputError if scene file or truth are missing."""
     scene = path / "scene.xml" if path.is_dir() else path
     require_file(scene, WANTED)
     folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
     for folder in folders:
         if (folder / "mesh.ply").is_file():
             return Dataset(scene_name(scene), scene, folder)
-    raise InputError(f"{scene}: has no truth, neither {folders[0]}/mesh.ply nor {folders[1]}/mesh.ply; an experiment "
-                     "compares with it, and mi-ring synthesize writes it")  # fmt: skip
+    raise InputError(f"{scene}: has no true surface, neither {folders[0]}/mesh.ply nor {folders[1]}/mesh.ply; "
+                     "mi-ring synthesize makes captures that have one")  # fmt: skip
 
 
 def default_dataset(captures: Path) -> Dataset:
-    """The dataset that needs no other data: pot2 in a checkout of the repository, else the example's pot."""
+    """The default dataset: pot2 in a checkout of the repository, otherwise the pot of `mi-ring example`."""
     return given(POT2) if POT2.is_file() else ExamplePot.of(captures / "example")
 
 
@@ -74,7 +74,7 @@ Cached = TypeVar("Cached", bound="CachedDataset")
 
 @dataclass(frozen=True)
 class CachedDataset(Dataset):
-    """A dataset in a folder of its own. It is written again when what it is made from has changed."""
+    """A dataset in a folder of its own. It is written again if its sources have changed."""
 
     @classmethod
     def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
@@ -89,14 +89,14 @@ class CachedDataset(Dataset):
                 with whole_folder(folder) as growing:
                     self.write(growing)
                     write_file(growing / ORIGIN, json.dumps(origin))
-                    shutil.rmtree(folder, ignore_errors=True)  # outdated, or its scene file is missing
+                    shutil.rmtree(folder, ignore_errors=True)  # outdated or incomplete
 
     def origin(self) -> dict[str, Any]:
-        """What it is made from, as values of JSON."""
+        """Its sources and their modification times, as JSON values."""
         raise NotImplementedError
 
     def write(self, folder: Path) -> None:
-        """Write it into an empty folder, which is then renamed to `self.scene.parent`."""
+        """Write the dataset into an empty folder, which is then renamed to `self.scene.parent`."""
         raise NotImplementedError
 
 
@@ -118,7 +118,7 @@ class Synthetic(Dataset):
     """A capture of `mi-ring synthesize`."""
 
     config: SynthesizeConfig
-    of_pot: bool  #: of the example's pot, whose mesh is written, too
+    of_pot: bool  #: whether it shows the example's pot, whose mesh is then written too
 
     @property
     def photographs(self) -> int:
@@ -166,13 +166,13 @@ class Derived(CachedDataset):
         write_file(folder / "scene.xml", self.changed(root))
 
     def changed(self, root: ElementTree.Element) -> bytes:
-        """Its scene file, from the source's XML with adjusted file names."""
+        """The content of its scene file. `root`: the source's XML with adjusted file names; it may be changed."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Subset(Derived):
-    """Some of the photographs, evenly from the first to the last."""
+    """Some photographs of a capture, evenly spaced from the first to the last."""
 
     count: int
 
@@ -187,9 +187,9 @@ class Subset(Derived):
 
 @dataclass(frozen=True)
 class PerturbedCameras(Derived):
-    """A capture with wrong cameras, by `mi_ring.synthesis.degradation.miscalibrated`, not marked as calibrated."""
+    """A capture with wrong cameras (see `miscalibrated`), which are not marked as calibrated."""
 
-    degrees: float  #: standard deviation of the rotations, and per cent of the distance
+    degrees: float  #: standard deviation of rotations [deg] and of positions [% of the distance]
     seed: int
 
     def changed(self, root: ElementTree.Element) -> bytes:
@@ -212,7 +212,7 @@ class DiligentObject(CachedDataset):
     def origin(self) -> dict[str, Any]:
         truth = DiligentMV(self.source, self.scene).truth
         if truth is None:
-            raise InputError(f"{self.source}: has no mesh_Gt.ply, the true surface; fetch DiLiGenT-MV as it is")
+            raise InputError(f"{self.source}: has no mesh_Gt.ply, the true surface; download DiLiGenT-MV again")
         files = [truth, self.source / "Calib_Results.mat"]
         files += [file for kind in ("*.png", "light_*.txt") for file in self.source.glob(f"view_*/{kind}")]
         return {"folder": str(self.source.resolve()), "fill_holes": self.fill_holes,

@@ -25,17 +25,17 @@ from mi_ring.system.machine import threads_of
 from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress
 
-NUMBERS = "numbers.json"  #: in the results folder of a run: the rows, and what they were measured from
+NUMBERS = "numbers.json"  #: in the results folder of a run: the rows, and the files that they were measured from
 RETRIES = 1  #: of a fit that is killed without making progress
 
 
 def run_experiment(
     experiment: Experiment, options: ExperimentOptions, out: Path, only: Collection[str] = (), command_line: str = ""
 ) -> int:
-    """Perform all runs, or `only` those with these names. Returns how many failed; the others do not stop for them.
+    """Perform all runs, or the runs named in `only`. Returns the number of failed runs; the others continue.
 
-    Results are in out/runs/; table.csv, table.md and figure.png are written after each run. Results of the same files
-    and settings are not computed again. Raises InputError before any work if options are wrong for all runs.
+    Results are in out/runs/. table.csv, table.md and figure.png are written after each run. Results of unchanged files
+    and settings are kept. Raises InputError before the first run if options are wrong.
     """
     runs = experiment.runs(options)
     if unknown := set(only) - {run.name for run in runs}:
@@ -56,7 +56,7 @@ def run_experiment(
 
 
 def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True) -> Outcome:
-    """Fit and measure one run. An error is its outcome. A run that is not `wanted` is measured if its fit exists."""
+    """Fit and measure a run. An error gives a failed outcome. If not `wanted`, only an existing fit is measured."""
     try:
         if wanted:
             run.dataset.prepare()
@@ -68,7 +68,7 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
             if not wanted:
                 return Outcome(run)
             print(f"fitting: {folder}", flush=True)
-            job.save(replace(job.record, tries=0))  # a user may interrupt as often as he likes
+            job.save(replace(job.record, tries=0))  # interruptions by the user do not count as failures
             if run.watched:
                 record = fit_and_watch(run, job, fingerprint, options)
             else:
@@ -79,7 +79,7 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
             if record.state != "done":
                 return Outcome(run, failed=record.message)
         return Outcome(run, folder, measure_run(run, folder, options), "", done)
-    except Exception as error:  # of libraries, too: the other runs go on
+    except Exception as error:  # also errors of libraries: the other runs continue
         if interrupted():
             raise
         if not wanted:
@@ -90,7 +90,7 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
 
 
 def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """The rows of a finished fit. They are read from `NUMBERS` if nothing has changed since they were measured."""
+    """The rows of a finished fit. They are read from `NUMBERS` if the files have not changed since."""
     measure = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": options.spp, "written": modified(folder / "ring.pt"),
           "compared": [[str(file.resolve()), modified(file)] for file in run.dataset.truth_files],
@@ -103,7 +103,7 @@ def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
-    """Fit in this process. Writes the errors of normals and depth at `POINTS` times during the fit."""
+    """Fit in this process and write the errors of normals and depth at `POINTS` times during the fit."""
     rows: list[Row] = []
 
     def measure(it: Iteration) -> None:
@@ -124,7 +124,7 @@ def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptio
 
 
 def write_table_and_figure(experiment: Experiment, outcomes: list[Outcome], out: Path, command_line: str) -> None:
-    """Write table.csv, table.md and figure.png. If no run is done, or if drawing fails, there is no figure."""
+    """Write table.csv, table.md and figure.png. Without a finished run, or if drawing fails, there is no figure."""
     rows = table_of(experiment, outcomes)
     names = headings(experiment, outcomes, rows)
     out.mkdir(parents=True, exist_ok=True)
@@ -136,7 +136,7 @@ def write_table_and_figure(experiment: Experiment, outcomes: list[Outcome], out:
             figure = experiment.figure([outcome for outcome in outcomes if outcome.failed != NOT_RUN])
             figure.savefig(buffer, format="png", dpi=120)
             content = buffer.getvalue()
-        except Exception as error:  # the results of one run may be broken: the other runs go on
+        except Exception as error:  # the results of one run may be damaged: the other runs continue
             if interrupted():
                 raise
             print(f"{file}: cannot be drawn: {one_line(str(error)) or type(error).__name__}", flush=True)

@@ -1,4 +1,4 @@
-"""What an experiment is: a list of runs, each a fit of a dataset, and the table and figure of their results."""
+"""An experiment: a list of runs, each a fit of a dataset, and the table and figure of their results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,11 +12,11 @@ from mi_ring.errors import InputError
 from mi_ring.experiments.datasets import Dataset
 from mi_ring.fitting.config import Config
 
-NOT_RUN = "not run"  #: why a run that --only leaves out has no results
+NOT_RUN = "not run"  #: `Outcome.failed` of a run that --only leaves out
 
 Row = dict[str, Any]  #: of a table: labels and numbers, by name
 
-#: What --quick changes of the preset `fast`. A fit then takes little longer than its start and its report.
+#: Changes of the preset `fast` by --quick. A fit then takes little longer than its start and its report.
 QUICK = {"iterations": 60, "levels": (3, 4), "widths": (64, 128), "shares": (0.7, 0.3), "subdivisions": 4}
 
 
@@ -56,7 +56,8 @@ class Run:
     name: str  #: of the results folder
     dataset: Dataset
     labels: Row  #: first columns of its rows in the table
-    changes: Mapping[str, Any] = field(default_factory=dict)  #: fields of `Config` that differ from the preset
+    #: Fields of `Config` that differ from the preset: numbers, words and tuples of these.
+    changes: Mapping[str, Any] = field(default_factory=dict)
     #: (run, results folder, options) ↦ rows of the table; None: `measures.evaluated`.
     measure: Callable[["Run", Path, ExperimentOptions], list[Row]] | None = None
     watched: bool = False  #: measure the surface during the fit, too; such a fit cannot be resumed
@@ -73,13 +74,7 @@ class Run:
         """The settings as options of `mi-ring fit`."""
         words = ["--preset", options.preset, "--variant", options.variant]
         for name, value in self.settings(options).items():
-            option = f"--{name.replace('_', '-')}"
-            if isinstance(value, bool):
-                words.append(option if value else f"--no-{option[2:]}")
-            elif isinstance(value, Mapping):
-                words += [w for key, item in value.items() for w in (f"{option}.{key.replace('_', '-')}", str(item))]
-            else:
-                words += [option, *map(str, value if isinstance(value, tuple | list) else [value])]
+            words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
         return tuple(words)
 
 
@@ -90,8 +85,8 @@ class Outcome:
     run: Run
     folder: Path = Path()  #: of the results
     rows: Sequence[Row] = ()
-    failed: str = NOT_RUN  #: why there are no rows; empty if there are
-    old: bool = False  #: was the fit there before?
+    failed: str = NOT_RUN  #: reason why there are no rows; empty if there are rows
+    old: bool = False  #: whether the fit was finished before
 
 
 @dataclass(frozen=True)
@@ -104,31 +99,31 @@ class Column:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table and a figure, of the paper or like those of the paper."""
+    """The description of a table and a figure."""
 
     about: str  #: one sentence
     list_runs: Callable[[ExperimentOptions], list[Run]]  #: without seeds, unless a run sets its own
-    columns: Mapping[str, Column]  #: by names of numbers; all other entries of rows are labels
+    columns: Mapping[str, Column]  #: by the names of numbers in rows; all other entries of rows are labels
     figure: Callable[[list[Outcome]], Figure]  #: of all runs that are done or have failed
     data: str = "folders of captures with scene.xml and truth/mesh.ply, or meshes"  #: what DATA must be
     published: Sequence[Row] = ()
     mean_over: str = "seed"  #: label; the table has means over it, beside those over seeds
-    one_seed: bool = False  #: are several seeds refused, because no row could be a mean?
+    one_seed: bool = False  #: whether only one seed is allowed, because its rows have no mean
 
     def runs(self, options: ExperimentOptions) -> list[Run]:
         """All runs, one for each seed. Raises InputError if DATA or --materials are wrong, or for equal names."""
         runs = seeded(self.list_runs(options), options.seeds)
         names = [run.name for run in runs]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise InputError(f"DATA: two runs would both be called {twice}; rename a capture, leave out what is given "
-                             "twice, or give them one by one")  # fmt: skip
+            raise InputError(f"DATA: two runs would have the name {twice}; rename a capture, or leave out the "
+                             "duplicate")  # fmt: skip
         if RECORDS in names:
-            raise InputError(f"DATA: a run would be called {RECORDS}, as the folder of records is; rename the capture")
+            raise InputError(f"DATA: a run would have the name {RECORDS} of another folder; rename the capture")
         return runs
 
 
 def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
-    """Each run with each seed, unless it sets its own. Names do not depend on which other seeds there are."""
+    """Each run with each seed; a run that sets its own seed once. Names do not depend on the other seeds."""
     result = []
     for run in runs:
         for seed in [None] if "seed" in run.changes else seeds:

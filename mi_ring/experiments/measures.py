@@ -1,4 +1,4 @@
-"""Measures of the fits of experiments: functions (run, results folder, options) ↦ rows of the table."""
+"""Measures of fits: functions (run, results folder, options) ↦ rows of the table."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 
 
 def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str = "", seen: bool = False) -> list[Row]:
-    """The numbers of `mi-ring evaluate`, crossing and inverted triangles in % of all, and the time of the fit [s]."""
+    """The numbers of `mi-ring evaluate`, but crossing and inverted triangles in % of all; and the fit time [s]."""
     truth, novel = run.dataset.truth / "mesh.ply", run.dataset.truth / "scene.xml"
     numbers = evaluate(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
     row = {key: value for key, value in numbers.items() if not isinstance(value, list)}
@@ -53,7 +53,7 @@ def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
 def surface_errors(
     run: Run, capture: Capture, ring: FittedObject, s: Tensor, faces: np.ndarray
 ) -> tuple[np.ndarray, Row]:
-    """Vertices (V, 3) of an object, sampled at points `s` (V, 3) of its domain, and the errors of this surface."""
+    """The surface (V, 3) of an object at domain points `s` (V, 3), and its errors."""
     mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     with torch.no_grad():
         vertices = ring.surface(s.to(ring.center.device)).cpu().numpy()
@@ -61,21 +61,21 @@ def surface_errors(
 
 
 def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """As `evaluated`, only of what photographs show; and depth and Chamfer distance in scene units, which are mm."""
+    """`evaluated` only where photographs show the surface; depth and Chamfer distance also in mm, the scene unit."""
     percent = load_true_mesh(run.dataset.truth / "mesh.ply")[0].scale / 100
     (row,) = evaluated(run, folder, options, seen=True)
     return [row | {"depth_mm": row["depth_mean"] * percent, "chamfer_mm": row["chamfer"] * percent}]
 
 
 def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """As `evaluated` after rigid alignment; `turned`: rotation error of the cameras, root mean square [°]."""
+    """`evaluated` after rigid alignment; `turned`: root mean square of the cameras' rotation errors [°]."""
     (row,) = evaluated(run, folder, options, align="rigid")
     exact = run.dataset.source if isinstance(run.dataset, PerturbedCameras) else run.dataset
     return [row | {"turned": rotation_error(exact.scene, folder / "scene.xml")}]
 
 
 def rotation_error(a: Path, b: Path) -> float:
-    """Root mean square angle [°] between the cameras of two scenes, apart from a rotation that all share."""
+    """Root mean square angle [°] between the cameras of two scenes, after removing a common rotation."""
     first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).shots] for x in (a, b))
     between = Rotation.from_matrix([x @ y.T for x, y in zip(first, second, strict=True)])
     return float(np.degrees(np.sqrt(np.mean((between * between.mean().inv()).magnitude() ** 2))))
@@ -94,7 +94,7 @@ def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
 
 
 def course(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """A row for each time at which a watched fit was measured."""
+    """The rows that `fit_and_watch` wrote."""
     return json.loads((folder / COURSE).read_text())
 
 
@@ -109,7 +109,7 @@ def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> l
 
 
 def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Normal errors (H, W) [°] of a `SingleView`, NaN where no truth is known; which pixels (H, W) miss the surface."""
+    """Normal errors (H, W) [°] of a `SingleView`, NaN without known truth; pixels (H, W) bool that miss the surface."""
     assert isinstance(run.dataset, SingleView)
     data = run.dataset.read()
     shape = data["mask"].shape
@@ -122,7 +122,7 @@ def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """As `evaluated`, and the numbers of `compare_slices`. Slices of one material go to slices.npz for a figure."""
+    """`evaluated` and the numbers of `compare_slices`. For one material, writes slices.npz for the figure."""
     (row,) = evaluated(run, folder, options)
     found, truth, other = slices_of(run, folder)
     if other is None:
@@ -134,8 +134,8 @@ def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | Non
     """Errors of BRDF slices (V, angles, 3) at points of the surface.
 
     `slice_error`: abs(found − truth) / max(truth, `BLACK`), mean over angles and channels, median over points [%].
-    `right_material`: share of points [%] whose slice, in logarithms, is nearer to the true one than to that of the
-    `other` material.
+    `right_material`: share of points [%] whose slice is nearer to the true slice than to that of the `other` material.
+    Distances are those of logarithms.
     """
     error = (np.abs(found - truth) / np.maximum(truth, BLACK)).mean((1, 2))
     row = {"slice_error": 100 * float(np.median(error))}

@@ -28,12 +28,12 @@ Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """The labels of a run, except the label `but`. Numbers stand behind the names of their labels."""
+    """The labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 
 def of_finished(plot: Plot) -> Plot:
-    """A plot of the runs that are done, with a line that names those that have failed."""
+    """A decorator: the plot gets only finished runs, and a line below it names the failed runs."""
 
     @functools.wraps(plot)
     def annotated(outcomes: list[Outcome]) -> Figure:
@@ -46,7 +46,7 @@ def of_finished(plot: Plot) -> Plot:
 
 
 def bars(*columns: tuple[str, str]) -> Plot:
-    """Bar charts of columns (name, heading), a bar for each run. Instead of a missing number there is a word."""
+    """Bar charts of columns (name, heading), with a bar for each run. A word replaces a missing number."""
 
     def plot(outcomes: list[Outcome]) -> Figure:
         figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(outcomes)), layout="constrained")
@@ -65,7 +65,7 @@ def bars(*columns: tuple[str, str]) -> Plot:
 
 
 def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Plot:
-    """Column y over column x, (name, heading) each. Runs whose other labels are equal share a line."""
+    """Curves of column y over column x, each (name, heading). Runs that differ only in x share a curve."""
 
     @of_finished
     def plot(outcomes: list[Outcome]) -> Figure:
@@ -87,7 +87,7 @@ def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) ->
 
 @of_finished
 def slices(outcomes: list[Outcome]) -> Figure:
-    """For each run the median BRDF by the angle from the normal, true and fitted, light and camera at one place."""
+    """For each run, the true and the fitted median BRDF over the angle of light and camera from the normal."""
     figure = Figure(figsize=(4 * len(outcomes), 3.6), layout="constrained")
     for axes, outcome in zip(np.ravel(figure.subplots(1, len(outcomes), squeeze=False)), outcomes):
         with np.load(outcome.folder / "slices.npz") as arrays:

@@ -21,10 +21,10 @@ SIZES: dict[str, dict[str, Any]] = {
 
 
 def datasets(options: ExperimentOptions) -> list[Dataset]:
-    """The captures and meshes of DATA, by default one that is at hand. Meshes are path traced, materials in turn."""
+    """The captures and meshes of DATA; without DATA, the default dataset. Meshes are path traced, materials in turn."""
     meshes = [path for path in options.data if path.suffix.lower() in MESHES]
     if options.materials and not meshes:
-        raise InputError("--materials: are what meshes are made of; give meshes as DATA")
+        raise InputError("--materials: apply to meshes only; give meshes as DATA")
     if len(options.materials) > max(1, len(meshes)):
         raise InputError(f"--materials: are {len(options.materials)} for {len(meshes)} meshes; give one each, or "
                          "fewer, which are taken in turn")  # fmt: skip
@@ -55,9 +55,9 @@ def path_traced(
 
 
 def require_no_materials(options: ExperimentOptions) -> None:
-    """Raise InputError if --materials is given to an experiment that has no use for it."""
+    """Raise InputError if --materials is given. For experiments that do not use it."""
     if options.materials:
-        raise InputError("--materials: are what meshes are made of, and this experiment takes none; leave them out")
+        raise InputError("--materials: apply to meshes, which this experiment does not use; leave them out")
 
 
 def one_mesh(options: ExperimentOptions) -> Path | None:
@@ -66,15 +66,15 @@ def one_mesh(options: ExperimentOptions) -> Path | None:
         load_material(material, "--materials", coloured=True)
         text = Path(material).read_text(errors="replace") if material.lower().endswith(".xml") else material
         if "<texture" in text or f"={COLOURS}" in text:
-            raise InputError(f"--materials: {material}: varies over the surface, and slices are of one BRDF; give one "
-                             "that is the same everywhere")  # fmt: skip
+            raise InputError(f"--materials: {material}: varies over the surface; give a material that is the same "
+                             "everywhere")  # fmt: skip
     if len(options.data) > 1 or any(path.suffix.lower() not in MESHES for path in options.data):
-        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot that is at hand")
+        raise InputError(f"DATA: must be one mesh ({', '.join(MESHES)}), or nothing for the pot of mi-ring example")
     return options.data[0] if options.data else None
 
 
 def short_name(material: str) -> str:
-    """A name of a material that can be part of a file name."""
+    """A short name of a material for file names: its plugin or file, and its roughness."""
     if ".npz:" in material:
         return material.rpartition(":")[2]
     words = material.split()

@@ -18,7 +18,7 @@ from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import write_file
 
 DISTANCE = 1500.0  #: assumed, from the camera to the object [mm]; one camera does not determine it
-TO_MITSUBA = np.array([-1.0, 1.0, -1.0])  #: factors of x right, y up, z back that make them Mitsuba's camera axes
+TO_MITSUBA = np.array([-1.0, 1.0, -1.0])  #: factors that convert axes x right, y up, z back to Mitsuba's camera axes
 DIMENSIONS = {"mask": 2, "pixels_uint16": 3, "light_dir": 2, "light_int": 2, "normal_gt": 3, "K": 2}  #: of the arrays
 MANUAL = "docs/how-to/paper.md"  #: describes these arrays
 

@@ -1,4 +1,4 @@
-"""Tables of experiments: our rows beside published ones, as CSV and Markdown."""
+"""Tables of our results and published ones, as CSV and Markdown."""
 
 import csv
 import datetime
@@ -13,7 +13,10 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Our rows, their means, and published rows below ours of the same labels. `state`: why a run has no numbers."""
+    """Our rows, their means, and published rows below our rows of the same labels.
+
+    The entry `state` says why a run has no numbers.
+    """
     rows: list[Row] = []
     for outcome in outcomes:
         state = f"failed: {outcome.failed}" if outcome.failed not in ("", NOT_RUN) else outcome.failed
@@ -27,7 +30,7 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Means over seeds, and over seeds and `mean_over`: over the runs that are done, of the numbers that all have."""
+    """Mean rows over seeds, and over seeds and `mean_over`: of finished runs, and of numbers that all these have."""
     result = []
     for over in dict.fromkeys(("seed", experiment.mean_over)):
         groups = dict[tuple, list[Outcome]]()
@@ -46,7 +49,7 @@ def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence[Row]) -> dict[str, str]:
-    """Headings by names: labels, `by`, the numbers that some row has, and `state` if some row has one."""
+    """Headings of the columns by name: labels, `by`, numbers, `state`. Empty columns are left out."""
     labels = [label for labelled in (*(o.run.labels for o in outcomes), *experiment.published) for label in labelled]
     own = {label: label for label in labels if label not in experiment.columns and label != "by"}
     numbers = {name: column.heading for name, column in experiment.columns.items() if any(name in row for row in rows)}
@@ -54,7 +57,7 @@ def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence
 
 
 def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
-    """The table as CSV with all digits. `names`: from `headings`."""
+    """The table as CSV, with all digits. `names`: from `headings`."""
     box = io.StringIO()
     writer = csv.DictWriter(box, list(names), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()

@@ -1,6 +1,6 @@
-"""The settings of a fit: what a user sets, tuning and ablation, three frozen dataclasses that `Config` unites.
+"""The settings of a fit. `Config` joins three frozen dataclasses: common settings, tuning and ablation.
 
-The docstrings of the fields are the help of `mi-ring fit`. In them each line of the source is a line of the help.
+The docstrings of the fields are the help texts of `mi-ring fit`. The help keeps their line breaks.
 """
 
 import contextlib
@@ -29,60 +29,60 @@ Unknown = Literal[
     "curve", "contrast", "scale", "ambient", "lamps", "masks",
 ]  # fmt: skip
 
-#: Entries of config.json that are no settings of a fit: what it is of, where its results go, what computes it.
+#: Entries of config.json that are no settings of a fit: input, output and computing resources.
 TASK = {"scene", "out", "resume", "preset", "minutes", "variant", "threads"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Common:
-    """What a user sets."""
+    """Settings for every user."""
 
     light: Literal["capture", "environment", "turntable", "lamps", "auto"] = "capture"
-    """Which light the object was photographed in.
-    capture: the light that the scene file says.
+    """The kind of light in the photographs. Set it if the light is unknown.
+    capture: the lights of the scene file.
     environment: unknown light from all sides, fixed in the world. turntable: the same, but fixed to the camera.
     lamps: one to three unknown lamps, fixed in the world.
-    auto: coarse fits choose the one that explains the photographs best."""
+    auto: coarse fits try all kinds and choose the one that explains the photographs best."""
     refine: tuple[Unknown, ...] = ("auto",)
-    """What the fit corrects besides surface and material, starting from what the scene file says.
-    auto: light, power and ambient, and scale if it is needed; gain and ambient if the light is unknown.
+    """Calibration that the fit corrects, in addition to surface and material. It starts from the scene file.
+    auto: light, power and ambient, and scale if it is needed. If the light is unknown: gain and ambient.
     none: nothing.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.
-    light: position of a flash that moves with the camera; else position or direction of each light.
-    power: strength and colour of the light of each photograph.
-    gain: exposure and white balance of each photograph; not together with power.
-    falloff: how much weaker a flash is to its sides.
-    vignetting: how much darker a lens is towards its borders.
-    curve, contrast: exponent of the camera's response curve, and steepness of its S.
-    scale: strength of all lights together, from interreflection.
+    light: position of a flash that moves with the camera. For other lights: position or direction of each.
+    power: intensity and colour of the light of each photograph.
+    gain: exposure and white balance of each photograph. It excludes power.
+    falloff: decrease of the flash away from its axis.
+    vignetting: decrease of the lens towards the corners of the image.
+    curve, contrast: exponent of the camera's response curve, and steepness of its S shape.
+    scale: one factor for all light intensities, found by interreflection.
     ambient: light of the room.
-    lamps: position and strength of the scene's own point and directional emitters.
-    masks: outlines of the object, found again in the middle of the fit and at three quarters."""
+    lamps: position and intensity of the scene's own point and directional emitters.
+    masks: outlines of the object. They are found again after a half and after three quarters of the fit."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """Which masks are used.
-    given: those of the scene, if it has any. auto: the same, otherwise what is brighter than a dark room.
-    none: the scene's masks are ignored, the object is what is brighter than a dark room.
-    Use --weights.mask 0 to fit without any mask."""
+    """The masks that the fit uses.
+    given: the masks of the scene file. auto: the same; without any, masks by brightness if the room was dark.
+    none: masks by brightness; the masks of the scene file are ignored.
+    --weights.mask 0 fits without any mask."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
-    """The surface that the fit deforms. The result has as many handles as this surface.
+    """The surface that the fit deforms. The result has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
-    auto: the domain that the scene names, otherwise the hull, otherwise a sphere."""
+    auto: the domain that the scene file names; without one, the hull; without masks, a sphere."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Which parameters of the scene's BSDF are predicted, each with its lowest and highest value (inf: no limit).
-    Use it for another BSDF than cooktorrance, for example: base_color 0 1 roughness 0.05 1"""
+    """Parameters of the BSDF that the fit finds, each with its lowest and highest value (inf: no limit).
+    Set it if the BSDF of the scene is not cooktorrance, for example: base_color 0 1 roughness 0.05 1"""
     holdout: int = 0
-    """Keep every n-th photograph out of the fit, to test the result on them. 0: fit all.
-    For example, 8 keeps out the fifth, the thirteenth, and so on.
-    If what --refine finds for all photographs together explains them no better, it is undone."""
+    """Leave every n-th photograph out of the fit and test the result on them. 0: use all photographs.
+    For example, 8 leaves out the fifth, the thirteenth, and so on.
+    Calibration that all photographs share is reset if its correction by --refine does not improve this test."""
     iterations: int = 460
     """Number of iterations, all stages together. More iterations take longer and give finer detail.
-    A fit from a hull or a mesh takes fewer, a fit under an unknown environment 15 % more."""
+    A fit from a hull or a mesh does fewer, a fit under an unknown environment 15 % more."""
     seed: int = 0
-    """Random seed. Use several to see how much results vary by chance."""
+    """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False
-    """Give the same result bit for bit, on the same machine. The fit then has one thread."""
+    """Make fits on one machine equal bit for bit. The fit then uses one thread and takes longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,14 +94,14 @@ class Tuning:
     widths: tuple[int, ...] = (128, 256, 512)
     """Largest width of the photographs in each stage [px]. Wider photographs are reduced."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
-    """Share of the iterations that each stage gets.
-    A fit from a hull or a mesh skips two thirds of the first stage, and gives the second 40 % of what is skipped."""
+    """Share of the iterations in each stage.
+    A fit from a hull or a mesh skips two thirds of the first stage and adds 40 % of them to the second."""
     subdivisions: int = 6
-    """Level of the mesh that is written at the end. mi-ring export writes other levels later."""
+    """Level of the mesh in the results. mi-ring export can write other levels later."""
     batch: int = 8
     """Photographs per iteration. More make an iteration slower and less noisy."""
     steps: int = 3
-    """Euler steps of the flow, the paper's T. Time and memory of the flow grow with it."""
+    """Euler steps of the flow, the paper's T. Time and memory grow with it."""
     spp: int = 1
     """Samples per pixel of predicted photographs. More make an iteration slower and less noisy."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
@@ -109,41 +109,42 @@ class Tuning:
     rgb: colours of the photographs.
     mask: silhouettes.
     velocity: smoothness of the flow, the paper's lambda.
-    calibration: distance of what --refine finds from what the scene file says.
+    calibration: keeps refined calibration near that of the scene file.
     settling: variation of the material in the last stage, under an unknown environment.
-    normal_variation: prior for flat faces and sharp edges.
-    material_rank: prior for mixtures of few basis materials."""
+    normal_variation: total variation of normals; for objects with flat faces and sharp edges.
+    material_rank: low rank of the material; for objects that mix a few materials."""
     velocity_decay: float = 0.03
     """Share of --weights.velocity that is left at the end of the fit.
-    A small share gives finer detail. In a short fit it lets the surface fold over."""
+    A small share gives finer detail, but the surface may fold over if the fit is short."""
     laplacian_scale: float = 0.01
-    """How much the term velocity penalises high frequencies of the flow, the paper's alpha."""
+    """Penalty of high frequencies of the flow in the term velocity, the paper's alpha."""
     learning_rate: float = 3e-3
     """Learning rate of Adam at the start."""
     muon_rate: float = 3e-2
     """Learning rate at the start of Muon, which trains the hidden layers (see --optimizer)."""
     decay: float = 0.1
-    """Share of the learning rates that is left at the end. Those of cameras fall to a half."""
+    """Share of the learning rates that is left at the end. Learning rates of cameras fall to a half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Number format of matrix products. auto: bfloat16 where this machine computes it faster than float32.
-    Use float32 to compare results of different machines."""
+    """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
+    Set float32 to compare results of different machines."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Parts of the method that can be replaced or left out, to measure what they are worth."""
+    """Parts of the method to replace or leave out, to measure their effect."""
 
     shadows: bool = True
     """Trace shadows of the photographs' lights during the fit.
-    Without them the surface is wrong where lights are not at their cameras."""
+    Without shadows the surface is wrong, unless each light is at its camera."""
     indirect: bool = True
-    """Predict light that bounces between surfaces. Leave it out if the intensities of the lights are wrong."""
+    """Predict interreflection. Leave it out if the intensities of the lights are wrong."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
-    """How predicted and observed colours are compared.
-    l2: squared differences, as in the paper. l1: absolute differences, less sensitive to outliers.
-    log: differences of logarithms, for dark surfaces. l1+log: the mean of both."""
+    """Difference of predicted and observed colours.
+    l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
+    log: difference of logarithms, for dark surfaces. l1+log: the mean of both."""
     optimizer: Literal["muon", "adam"] = "muon"
-    """muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all, as in the paper."""
+    """Optimiser of the networks.
+    muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
     """The network that deforms the domain. ring: the paper's flow; all steps share one network.
     resnet: each step has its own, narrower network, with about as many weights in total.
@@ -154,7 +155,7 @@ class Ablation:
     frequencies: int = 16
     """Number of frequencies of the encoding."""
     resample: bool = True
-    """Move the vertices to other points of the domain in each iteration, so that the networks see all of it."""
+    """Sample other points of the domain in each iteration, so that the networks are trained everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +180,7 @@ class Config(Ablation, Tuning, Common):
         both = {"power", "gain"} <= set(self.refine)
         require(not both, "refine", "without power or without gain, for they look alike")
 
-        for f in dataclasses.fields(Config):  # from Python nobody else has checked them
+        for f in dataclasses.fields(Config):  # settings from Python are not checked by tyro
             if get_origin(f.type) is Literal:
                 allowed = get_args(f.type)
                 require(getattr(self, f.name) in allowed, f.name, f"one of {', '.join(allowed)}")
@@ -224,8 +225,8 @@ class Config(Ablation, Tuning, Common):
     def load(path: str | Path) -> "Config":
         """The settings of an earlier fit, from its results folder or from the config.json in it.
 
-        A setting without an entry has its default. Raises InputError, which names file and field, for an entry that is
-        no setting, and for a value that the setting cannot have.
+        Settings without an entry have their defaults. Raises InputError, which names file and field, for an unknown
+        setting or a wrong value.
         """
         path = Path(path)
         path = path / "config.json" if path.is_dir() else path
@@ -246,7 +247,7 @@ class Config(Ablation, Tuning, Common):
                 raise InputError(f"{path}: {name}: is no setting of mi_ring {__version__}; remove it")
             try:
                 settings[name] = of_type(kinds[name], value)
-            except (ValueError, OverflowError):  # a whole number beyond what a float can be
+            except (ValueError, OverflowError):  # OverflowError: an integer beyond the range of floats
                 raise InputError(f"{path}: {name}: is {reprlib.repr(value)}, which this setting cannot be; see "
                                  "mi-ring fit --help-all") from None  # fmt: skip
         try:
@@ -282,7 +283,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """A setting's value about as one types it on the command line."""
+    """The value of a setting as on the command line, for messages."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

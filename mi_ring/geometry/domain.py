@@ -1,7 +1,5 @@
 """Domains: the surfaces from which Shape-Net's flow starts and on which BRDF-Net is defined."""
 
-from types import ModuleType
-
 import numpy as np
 import torch
 import trimesh
@@ -10,19 +8,21 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
+
+gpytoolbox = LazyPackage("gpytoolbox", "a start from another surface than the sphere")  # its import takes a second
 
 REMESHED = 5  #: the finest level that is made by remeshing; finer levels subdivide it
 CANDIDATES = 16  #: random positions for each vertex
-MAX_SAMPLES = 2**20  #: points of the surface from which candidates are taken: from level 6 on, some vertices have fewer
+MAX_SAMPLES = 2**20  #: most points to take candidates from; from level 6 on, some vertices have fewer candidates
 
 
 def closed_domain(
     mesh: trimesh.Trimesh, center: ArrayLike | None = None, radius: float | None = None
 ) -> tuple["Domain", np.ndarray, float]:
-    """A closed mesh as a domain, with the centre and the radius of the normalising sphere.
+    """A closed mesh as a domain, and the centre (3,) and radius of the normalising sphere [units of the mesh].
 
-    Default: the centre of the mesh's bounding box, and the mean distance of its vertices from there.
+    Default: the centre of the bounding box, and the mean distance of the vertices from it.
     """
     if mesh.volume < 0:
         mesh.invert()
@@ -31,15 +31,13 @@ def closed_domain(
     return Domain((mesh.vertices - center) / radius, mesh.faces), center, radius
 
 
-def gpytoolbox() -> ModuleType:
-    """The package, imported when it is needed: that takes a second. Raises InputError if it is not installed."""
-    return need("gpytoolbox", "a start from another surface than the sphere")
-
-
 def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a mesh, or its nearest points, after its `vertices` (V, 3) have moved to `others` (V, 3)."""
+    """Positions (N, 3) of `points` (N, 3) of a mesh after its `vertices` (V, 3) have moved to `others` (V, 3).
+
+    Points beside the mesh are first projected to it.
+    """
     mesh = vertices.astype(float), faces.astype(np.int32)
-    _, face, weights = gpytoolbox().squared_distance(points.astype(float), *mesh, use_cpp=True)
+    _, face, weights = gpytoolbox.squared_distance(points.astype(float), *mesh, use_cpp=True)
     return (others[faces[face]] * weights[..., None]).sum(1)
 
 
@@ -61,9 +59,9 @@ class Domain:
         self.candidates: dict[int, Tensor] = {}
 
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
-        """Vertices (V, 3) and faces (F, 3), about 20 · 4^level, as many as an icosphere of this level has.
+        """Vertices (V, 3) and faces (F, 3): about 20 · 4^level faces, as in an icosphere of this level.
 
-        With `random` the vertices move on the surface each time, so that a fit sees all of it. The faces stay the same.
+        With `random`, each call moves the vertices to other points of the surface. The faces stay the same.
         """
         if level not in self.levels:
             vertices, triangles = self.triangulate(level)
@@ -72,11 +70,11 @@ class Domain:
         return (points if random is None else self.resample(level, points, random)), faces
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N, 3) are inside: (N,) bool."""
+        """Which points (N, 3) are inside the surface: (N,) bool."""
         inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
             mesh = self.points.astype(float), self.faces.astype(np.int32)
-            inside[inside] = gpytoolbox().fast_winding_number(points[inside], *mesh) > 0.5
+            inside[inside] = gpytoolbox.fast_winding_number(points[inside], *mesh) > 0.5
         return inside
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -84,7 +82,7 @@ class Domain:
         return transfer_points(points, self.points, self.faces, self.points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of the surface, in about 20 · 4^level triangles."""
+        """Vertices and faces of a mesh of the surface with about 20 · 4^level triangles."""
         if level > REMESHED:
             points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
             return self.project(points), faces
@@ -92,28 +90,28 @@ class Domain:
         vertices, faces = (self.points, self.faces) if level == REMESHED else self.sample(level + 1)
         mesh = trimesh.Trimesh(np.asarray(vertices), faces)
         edge = np.sqrt(4 / np.sqrt(3) * mesh.area / (20 * 4**level))
-        package = gpytoolbox()  # outside `try`: InputError is a ValueError
+        remesh = gpytoolbox.remesh_botsch  # outside `try`: InputError is a ValueError
         try:
-            points, faces = package.remesh_botsch(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
+            points, faces = remesh(mesh.vertices, mesh.faces.astype(np.int32), h=edge)
             remeshed = trimesh.Trimesh(points, faces)
             if remeshed.is_watertight and remeshed.euler_number == mesh.euler_number:
                 return self.project(points), faces
         except ValueError:  # the surface touches itself along an edge
             pass
-        points, faces = self.points, self.faces  # remeshed triangles would be too large for the surface's handles
+        points, faces = self.points, self.faces  # remeshed triangles are too large for the handles of the surface
         while len(faces) < 20 * 4**level:
             points, faces = trimesh.remesh.subdivide(points, faces)
         return points, faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Each vertex (V, 3) at one of its candidates."""
+        """Each vertex (V, 3) at a random one of its candidates."""
         if level not in self.candidates:
             self.candidates[level] = self.find_candidates(level)
         chosen = torch.randint(CANDIDATES, (len(points),), generator=random)
         return self.candidates[level][torch.arange(len(points)), chosen]
 
     def find_candidates(self, level: int) -> Tensor:
-        """Random points (V, CANDIDATES, 3) of the surface near each vertex of a level."""
+        """Random points (V, CANDIDATES, 3) of the surface near each vertex of a level's mesh."""
         points, faces = self.sample(level)
         coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
         fine = trimesh.Trimesh(self.points, self.faces, process=False)
@@ -122,7 +120,7 @@ class Domain:
         longest = coarse.edges_unique_length[coarse.faces_unique_edges].max(1)
         height = 2 * coarse.area_faces / longest
         reach = np.full(len(points), np.inf)
-        np.minimum.at(reach, faces, 0.45 * height[:, None])  # below half of the height no triangle can turn over
+        np.minimum.at(reach, faces, 0.45 * height[:, None])  # below half of the height no triangle can flip
         distance, nearest = cKDTree(coarse.vertices).query(dense)
         same_side = (fine.face_normals[triangle] * coarse.vertex_normals[nearest]).sum(1) > 0.5
         usable = (distance < reach[nearest]) & same_side
@@ -153,6 +151,6 @@ class Sphere(Domain):
         return mesh.vertices, mesh.faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """All vertices after one random rotation, which keeps the sphere as it is."""
+        """All vertices (V, 3) after one random rotation of the sphere."""
         rotation = Rotation.from_quat(torch.randn(4, generator=random).numpy()).as_matrix()
         return points @ torch.as_tensor(rotation, dtype=torch.float32).T

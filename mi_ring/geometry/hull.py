@@ -15,8 +15,8 @@ from torch.nn import functional as F
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera, distortion_factor, nearest_point
 
-MIN_SHARE = 0.25  #: of the photographs must show a point; otherwise it is outside
-MAX_MASKS, MAX_WIDTH = 128, 512  #: number of silhouettes, and their width [px]; more improve the hull little
+MIN_SHARE = 0.25  #: a point is outside if a smaller share of the photographs shows it
+MAX_MASKS, MAX_WIDTH = 128, 512  #: limits of the number of silhouettes and their width [px]; more hardly help
 
 
 class NoHull(InputError):
@@ -29,7 +29,7 @@ class Silhouette(NamedTuple):
     mask: np.ndarray  #: (H, W) uint8, object above 127
     camera: Camera
     name: str  #: for messages
-    valid: np.ndarray | None = None  #: (H, W) uint8: the mask is unknown where this is 127 or less. None: nowhere
+    valid: np.ndarray | None = None  #: (H, W) uint8: the mask is unknown where this is ≤ 127. None: known everywhere
     frame: np.ndarray | None = None  #: (2, 2) corners of the photograph if the mask is a part [px]; no object beyond
 
 
@@ -61,10 +61,10 @@ def subsample(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[
 
 
 class Hull:
-    """The visual hull of silhouettes. Messages begin with `what`. Raises InputError if a silhouette is empty.
+    """The visual hull of silhouettes. Raises InputError, which begins with `what`, if a silhouette is empty.
 
-    `center` (3,) and `reach` are the centre and the radius of a ball that contains it [scene units]. A point may be
-    outside the share `outliers` of the silhouettes, so that a few faulty masks do no harm.
+    `center` (3,) and `reach` are the centre and the radius of a ball that contains it [scene units]. A point of the
+    hull may be outside a share `outliers` of the silhouettes, so that a few wrong masks do no harm.
     """
 
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:
@@ -82,14 +82,14 @@ class Hull:
         """Unit directions (n, 3) of the rays through the pixels of a mask."""
         rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
-            raise InputError(f"{silhouette.name}: mask: nothing in it, or next to nothing: no pixels above 127")
+            raise InputError(f"{silhouette.name}: mask: is empty, or nearly: no pixels above 127")
         return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
 
     def depth(self, points: Tensor) -> Tensor:
         """Approximate signed distance of points (N, 3) from the hull's surface [scene units]; positive inside.
 
-        It is the smallest distance from the outline in any silhouette, at the depth of the point, without outliers.
-        Photographs that do not show the point are not counted. A point that few photographs show is outside.
+        It is the smallest distance from the outline over all silhouettes except outliers, at the depth of the point.
+        Photographs that do not show the point do not count. A point that few photographs show is outside.
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
@@ -120,10 +120,10 @@ class Hull:
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """By how much the projected hull misses silhouettes, by default its own: distances (N, pixels) [px], 0 or more.
+        """Distances (N, pixels) [px], 0 or more, of silhouettes from the projected hull. Default: its own silhouettes.
 
-        For random `pixels` of each mask, or of its `outline`: the distance from the hull to the ray through the pixel,
-        sampled at `samples` points.
+        For `pixels` random pixels of each mask, or of its `outline`: the distance of the hull from the ray through the
+        pixel, sampled at `samples` points.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
@@ -160,7 +160,7 @@ class Hull:
         return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
 
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
-        """The closed surface of the largest piece [scene units], by marching cubes; `resolution` is along its side."""
+        """The closed surface of the largest piece [scene units], by marching cubes with `resolution` cells a side."""
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)

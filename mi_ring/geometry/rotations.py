@@ -5,9 +5,9 @@ from torch import Tensor
 
 
 def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """(P, 3, 3) rotations by multiples of 90° about the optical axis that bring the first of places (P, 3) to each.
+    """Rotations (P, 3, 3) by multiples of 90° about the optical axis that map the first of `places` (P, 3) to each.
 
-    It is the identity for places that are closer than `near` to the first.
+    They are the identity for places closer than `near` to the first.
     """
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
     turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])

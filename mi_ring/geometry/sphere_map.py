@@ -1,4 +1,4 @@
-"""A map between a domain and the unit sphere, by which the points of different domains correspond."""
+"""A map between a domain and the unit sphere. It gives corresponding points of different domains."""
 
 import numpy as np
 import trimesh
@@ -10,13 +10,13 @@ from mi_ring.geometry.domain import Domain, Sphere, gpytoolbox, normalized, tran
 from mi_ring.geometry.meshes import genus
 
 LEVEL = 4  #: of the domain's mesh that is mapped
-STEPS, STEP = 40, 0.1  #: number and length of the steps of the curvature flow, for a surface of the sphere's area
+STEPS, STEP = 40, 0.1  #: number and length of the steps of the curvature flow, for the surface area of the sphere
 
 
 class SphericalMap:
     """A conformal one-to-one map between a domain and the unit sphere, with as little rotation as possible.
 
-    Raises InputError, which begins with `name`, if the domain has handles or several pieces: then there is no such map.
+    Raises InputError, which begins with `name`, if the domain has handles or several pieces.
     """
 
     def __init__(self, domain: Domain, name: str = "domain") -> None:
@@ -28,7 +28,7 @@ class SphericalMap:
         mesh = trimesh.Trimesh(self.points, self.faces, process=False)
         if genus(mesh) or mesh.body_count > 1:
             shape = f"{genus(mesh)} handles and {mesh.body_count} pieces"
-            what = f"was fitted from a surface of {shape}, whose points correspond to none of another"
+            what = f"was fitted from a surface of {shape}, which cannot be mapped to another"
             raise InputError(f"{name}: {what}; fit both with the same --domain, sphere or mesh FILE")
         self.directions = sphere_directions(self.points, self.faces)
         outward = self.points - mesh.center_mass
@@ -52,12 +52,12 @@ def sphere_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012): mean
     curvature flow with the Laplacian of the first surface in all steps. It pinches off no limb and ends on a sphere.
     """
-    laplacian = gpytoolbox().cotangent_laplacian(points, faces)
+    laplacian = gpytoolbox.cotangent_laplacian(points, faces)
     x = points
     for _ in range(STEPS):
         area = trimesh.Trimesh(x, faces, process=False).area
         x = x * np.sqrt(4 * np.pi / area)
-        mass = gpytoolbox().massmatrix(x, faces)
+        mass = gpytoolbox.massmatrix(x, faces)
         x = splu((mass + STEP * laplacian).tocsc()).solve(mass @ x)
         x = x - mass.diagonal() @ x / mass.diagonal().sum()
     return normalized(x)

@@ -1,4 +1,4 @@
-"""Quality of the photographs of a capture, and findings: what the user should mend."""
+"""Quality of the photographs of a capture, and findings: problems that the user should correct."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -15,26 +15,29 @@ from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
 CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares above which there is a finding
-ODD_POWER = 3.0  #: a light is odd if a fit finds it so many times as strong as the others, or as weak
-FAR, LEAST_FAR = 4.0, 2.0  #: a fit has moved a camera far: so many times the median, and at least so far [px]
+ODD_POWER = 3.0  #: a light is odd if its fitted power is larger than this, or smaller than the inverse
+FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of the median, and than this [px]
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Names of photographs that a fit has moved much farther than the others. `photographs`: from its summary."""
+    """Names and shifts of photographs that a fit moved much farther than the others.
+
+    `photographs`: the entry of this name in calibration.json.
+    """
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """Names of photographs whose light is much stronger or weaker than the others', by the summary of a fit."""
+    """Names and powers of photographs whose light is much stronger or weaker than the others', as in `moved_far`."""
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
     return ", ".join(f"{name} ({power:.2g} times)" for name, power in odd.items())
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """`moved_far` and `odd_powers` of these photographs, by calibration.json beside the scene; empty without it."""
+    """`moved_far` and `odd_powers` of these photographs, from calibration.json beside the scene; empty without it."""
     record = read_json(scene.parent / "calibration.json")
     try:
         known = {name: entry for name, entry in record["photographs"].items() if name in names}
@@ -51,7 +54,7 @@ class PhotographQuality:
     distance: float  #: from the camera to the object
     light: float | None  #: from the light to the object; infinite for a directional light, None without a light
     angle: float | None  #: between light and camera, seen from the object [deg]
-    object: float | None  #: share of the photograph that is object
+    object: float | None  #: share of the photograph that the object covers
     clipped: float  #: share of the object that is clipped
     dark: float  #: share of the object that is almost black
     background: float | None  #: brightness of the background, relative to the object's
@@ -62,10 +65,13 @@ class PhotographQuality:
 #: Columns of the table and their number formats.
 FORMATS = {"distance": ".2f", "light": ".2f", "angle": ".0f", "object": ".1%", "clipped": ".1%", "dark": ".1%",
            "background": ".1%", "brightness": ".2f", "agreement": ".0%"}  # fmt: skip
-LEGEND = """distance, light: distance of camera and light from the object, in its radii; angle: between the two [°];
-object: share of the photograph that is object; clipped, dark: shares of the object that are over-exposed, and black;
-background: its brightness, relative to the object's; brightness: of the object, relative to the light that it gets and
-to the other photographs; agreement: share of the mask that the other masks agree with"""
+LEGEND = """distance, light: distances of camera and light from the object, in radii of the object
+angle: angle between camera and light, seen from the object [°]
+object: share of the photograph that the object covers
+clipped, dark: shares of the object that are over-exposed and black
+background: its brightness, relative to the object
+brightness: brightness of the object per irradiance, relative to the other photographs
+agreement: share of the mask that the other masks agree with"""
 
 
 def measure(
@@ -99,7 +105,7 @@ def measure(
 
 
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
-    """(N,) irradiance at the object in each photograph; 1 in all if the lights are unknown."""
+    """The irradiance (N,) at the object in each photograph; 1 everywhere if the lights are unknown."""
     received = capture.photographs.irradiance(center).mean(1)
     return received if np.median(received) > 0 else np.ones_like(received)
 
@@ -126,16 +132,16 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
     cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
-        return (f"{away.sum()} of {len(away)} cameras look away from the object: z of to_world is forward, here; "
-                "of OpenGL's (NeRF's, Blender's) axes: to_world @ diag(-1, 1, -1, 1)")  # fmt: skip
+        return (f"{away.sum()} of {len(away)} cameras look away from the object: here, z of to_world is forward; "
+                "convert OpenGL's axes (NeRF, Blender) by to_world @ diag(-1, 1, -1, 1)")  # fmt: skip
     return f"{', '.join(np.array(capture.names)[away][:5])}: looking away from the object" if away.any() else None
 
 
 def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
-    """Lower bound of the room's share in the light on the object; 0 if none is found.
+    """Lower bound of the share of room light in the light on the object; 0 if none is found.
 
-    `brightness` (n,), as in `PhotographQuality`, and irradiance `received` (n,) of the photographs. The room's light
-    does not fall off with the distance: with it the object is too bright where it receives little.
+    `brightness` (n,): as in `PhotographQuality`. `received` (n,): irradiance. Room light does not depend on the
+    distance of the flash, so the object looks too bright where the irradiance is small.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
@@ -157,10 +163,10 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
             found.append(f"{row.name}: the others agree to {row.agreement:.0%} of its mask: pose or mask is wrong")
     moved, odd = findings_of_fit(capture.path, capture.names)
     if moved:
-        found.append(f"{moved}: the fit has moved this camera much farther than the others: out of focus, or another "
-                     "scene?")  # fmt: skip
+        found.append(f"{moved}: the fit moved this camera much farther than the others: is the photograph blurred, or "
+                     "of another scene?")  # fmt: skip
     if odd:
-        found.append(f"{odd}: strength of the light that the fit found, relative to the others: did the flash fire?")
+        found.append(f"{odd}: strength of the light, relative to the others, as the fit found it: did the flash fire?")
     found += filter(None, [units(capture, center)])
     received = received_by(capture, center)
     # Only photographs with lights of their own, not from behind: others may show the unlit side.
@@ -169,20 +175,20 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     for row in lit:
         if not typical / 4 < row.brightness < 4 * typical:
             times = f"{row.brightness / typical:.2g} times as bright as the others"
-            found.append(f"{row.name}: is {times}, for the light it gets: its exposure or its light is wrong")
+            found.append(f"{row.name}: is {times}, for the light that it gets: exposure or light is wrong")
     if (share := np.median([row.clipped for row in rows])) > CLIPPED:
         found.append(f"{share:.0%} of the object is over-exposed; expose less")
     if (share := np.median([row.dark for row in rows])) > DARK:
         found.append(f"{share:.0%} of the object is black: under-exposed, or unlit")
     if not any(capture.masks.given) and dark_threshold(capture) is None:
-        found.append("no masks, and the background is not dark, as a fit would assume: give masks, or have them found "
-                     "by mi-ring photos")  # fmt: skip
+        found.append("no masks, and the background is not dark, which a fit without masks needs: give masks, or "
+                     "find them with mi-ring photos")  # fmt: skip
     share = room_light(np.array([row.brightness for row in lit]), received[[row in lit for row in rows]])
     if share > AMBIENT:
-        found.append(f"{share:.0%} of the light on the object is the room's: the object hardly gets darker where the "
-                     "flash is farther; darken the room, or go nearer")  # fmt: skip
+        found.append(f"{share:.0%} of the light on the object comes from the room: the object is hardly darker if the "
+                     "flash is farther away; darken the room, or go nearer")  # fmt: skip
     if (views := len({shot.camera.to_world.tobytes() for shot in capture.shots})) < 8:
-        found.append(f"{views} views are few: about 30 from all around are needed for a closed surface")
+        found.append(f"{views} views are too few: a closed surface needs about 30 from all sides")
     return found
 
 
@@ -202,7 +208,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 
 def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
-    """The capture with all photographs but without empty masks, and the names of the photographs that had them."""
+    """The capture without its empty masks, and the names of the photographs that had them."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
     empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     masks = capture.masks.replaced(dict.fromkeys(empty))

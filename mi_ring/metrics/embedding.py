@@ -1,4 +1,4 @@
-"""Is a surface an embedding, as the surface of a flow must be? It has no inverted and no crossing triangles."""
+"""Tests whether a surface is an embedding, as a flow gives it: without inverted and without crossing triangles."""
 
 import numpy as np
 import torch
@@ -11,10 +11,10 @@ STEP = 1e-3  #: distance from a triangle of the points on its two sides, in the 
 
 
 def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of a sampling of the domain, points `s` (V, 3), that Shape-Net flattens or inverts.
+    """Which triangles `faces` (F, 3) of domain points `s` (V, 3) Shape-Net flattens or inverts: (F,) bool.
 
-    A point on the outer side of such a triangle is on its inner side afterwards. For infinitely small triangles this
-    means det ∂Φ/∂s ≤ 0, which an exactly solved flow excludes.
+    Shape-Net moves a point from the outer side of such a triangle to its inner side. For infinitely small triangles
+    this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly solved flow.
     """
     s = s.to(ring.center.device)
     corners = torch.as_tensor(faces, device=s.device)
@@ -30,7 +30,7 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles that cross, overlap or touch another, exactly, by CGAL. Raises InputError without libigl."""
+    """Which triangles (F,) cross, overlap or touch another, exactly, by CGAL. Raises InputError without libigl."""
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections
 

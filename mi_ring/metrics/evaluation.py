@@ -1,5 +1,6 @@
 """Evaluation of a fit against ground truth."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from mi_ring.scene.self_intersections import crossing_triangles
 from mi_ring.system.files import read_json
 
 COMPARED = 1024  #: width at which photographs are compared, if they are larger [px]
-LINES = {  # of the table, by the beginnings of the names of numbers
+LINES = {  # text of each line of the table, by the prefix of the names of its numbers
     "normal": "normals, error °", "depth": "depth, error % of the diagonal", "iou": "silhouettes, IoU",
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
     "aligned": "truth moved by °, % of the diagonal, factor",
@@ -32,12 +33,12 @@ def evaluate(
     run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
     align: str | None = None,
 ) -> dict:  # fmt: skip
-    """Errors of the results folder `run`, and lists of those of each photograph: `views` and `novel_views`.
+    """Errors of the fit in the results folder `run`. Lists of errors by photograph: `views` and `novel_views`.
 
-    `mesh`: true surface; `novel`: scene file of novel views; `seen`: distances between surfaces are of parts that a
-    photograph shows. `align`: first move the truth and `novel` onto the result, by a "rigid" motion or a "similarity";
-    the motion is `aligned_*`. Numbers of fitted photographs end in `_input`, those of held-out ones in `_held_out`.
-    Undefined numbers are missing: the genus of an open surface, for instance.
+    `mesh`: true surface. `novel`: scene file of novel views. `spp`: samples per pixel of predicted photographs. `seen`:
+    measure distances between surfaces only where a photograph shows them. `align`: "rigid" or "similarity" first
+    aligns the truth and `novel` with the fit; `aligned_*` is this motion. Numbers end in `_input` for fitted
+    photographs and in `_held_out` for held-out ones. Undefined numbers are missing, such as the genus of an open mesh.
     """
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
@@ -80,21 +81,17 @@ def evaluate(
 
 
 def evaluation_table(numbers: dict[str, float]) -> str:
-    """The numbers of all photographs together as text, a line for each of the `LINES`."""
+    """A table of numbers as text, with a line for each of the `LINES`."""
     lines = []
     for start, words in LINES.items():
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
         if found:
             lines.append(f"{words:36}" + "".join(f"{value:>10}  {what:6}" for what, value in found.items()).rstrip())
     if any(key.startswith("aligned") for key in numbers):
-        lines.append("All but those of the input photographs are after this alignment.")
+        lines.append("All numbers, except those of the input photographs, are after this alignment.")
     return "\n".join(lines)
 
 
 def rounded(value: Any) -> Any:
-    """All numbers in lists and dictionaries, rounded to four digits after the point: more are not significant."""
-    if isinstance(value, dict):
-        return {key: rounded(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [rounded(v) for v in value]
-    return round(value, 4) if isinstance(value, float) else value
+    """A JSON value with all floats in it rounded to four decimals; more are not significant."""
+    return json.loads(json.dumps(value), parse_float=lambda digits: round(float(digits), 4))

@@ -1,4 +1,4 @@
-"""Do the masks of a capture agree with each other? If not, which mistake in the cameras explains it?"""
+"""Tests whether the masks of a capture agree, and finds the mistake in the cameras if they do not."""
 
 import copy
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """By file of each mask the share that the other masks agree with; and findings that concern all masks."""
+    """The share of each mask that the other masks agree with, by file; and findings about all masks."""
     if not capture.hull:
         return {}, []
     silhouettes = capture.silhouettes()
@@ -26,7 +26,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     agree, why = shares(capture.hull), None
     if capture.whole and agree.min() < CONFORMS:
         why = mistake(silhouettes) if np.median(agree) < CONFORMS else None
-        if not why:  # one wrong mask spoils the hull for all; a hull that tolerates some may find it
+        if not why:  # one wrong mask damages the hull; a hull that tolerates wrong masks may find it
             tolerant = copy.copy(capture.hull)
             tolerant.outliers = max(0.1, 1.01 / len(tolerant.silhouettes))
             robust = shares(tolerant)
@@ -39,7 +39,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """A silhouette with other values of these fields of its camera."""
+    """A silhouette whose camera has the `changed` fields."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
@@ -70,7 +70,7 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Share of the masks' pixels that all masks agree with; 0 if the visual hull is empty."""
+    """Share of mask pixels that all masks agree with; 0 if the visual hull is empty."""
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -78,7 +78,7 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """The mistake that explains why the masks do not agree, and how to correct it, as text; None if none does."""
+    """The known mistake that explains why the masks disagree, and its correction, as text; None if there is none."""
     some = subsample(silhouettes, 32, 96)
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
@@ -94,7 +94,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """A finding if all principal points are off by half a pixel: the masks' outlines then miss the hull a little."""
+    """A finding if all principal points are wrong by half a pixel: the outlines of masks and hull then differ."""
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

@@ -1,4 +1,4 @@
-"""The same photographs by `photometric` and by Mitsuba's path tracer."""
+"""Renders the same photographs with `photometric` and with Mitsuba's path tracer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +32,7 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """The scene without tables, lit for stock integrators, too, and its photographs. Raises InputError, one line."""
+    """A scene that stock integrators can light, without tables, and its photographs. Raises InputError."""
     scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
@@ -46,13 +46,13 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with exactly one `flash`, the photographs' light for stock integrators, and without a `room`.
+    """The scene with exactly one `flash`, by which stock integrators see the photographs' light, and without a `room`.
 
-    A `shapenet` has a `flash` already. Both renderers path trace the light of a `room`. Raises SceneError for several.
+    A `shapenet` has a `flash` already. Raises SceneError if there are several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
-        raise SceneError(f"flash: found {count} of them, so that the light would count {count} times; "
+        raise SceneError(f"flash: found {count} of them, so the light would count {count} times; "
                          'set <boolean name="flash" value="false"/> in all shapenets but one')  # fmt: skip
     emitters = top_level_emitters(scene)
     others = [emitter for emitter in emitters if not is_room(emitter)]
@@ -64,10 +64,9 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
 def render_both(
     scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
 ) -> Pictures:
-    """Photograph `k`, taken by `sensor`, `scale` times smaller: 16 independent renderings with `spp` samples per pixel.
+    """16 independent renderings of photograph `k` of `sensor`, reduced by `scale`, with `spp` samples per pixel each.
 
-    `photometric` and `path` have different samples along rays of the same kind: the film's filter is not used. Uses
-    seeds from `seed` to `seed` + 31.
+    Uses the seeds `seed` to `seed` + 31; `photometric` and `path` have different ones. Neither uses the film's filter.
     """
     size = sensor.camera.size
     width, height = (s // scale for s in size)
@@ -93,7 +92,7 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """As `render_photographs`, by `path`: [R, G, B]. All selected photographs must be that of `sensor`."""
+    """`render_photographs` with `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

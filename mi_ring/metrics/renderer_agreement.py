@@ -1,4 +1,4 @@
-"""Do two renderers agree within Monte Carlo noise?"""
+"""Tests whether two renderers agree within Monte Carlo noise."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,12 +12,12 @@ from mi_ring.metrics.path_tracing import BATCHES, Pictures
 
 BLOCK = 8  #: width and height of the blocks of pixels that are compared [px]
 ROUNDING = 1e-6  #: relative difference between two computations of the same radiance in float32
-IMPLAUSIBLE = 0.75  #: an implausible share of interreflection
+IMPLAUSIBLE = 0.75  #: share of interreflection above which the intensities are doubted
 
 
 @dataclass
 class Comparison:
-    """Numbers of one photograph, or of all. All but the PSNR and p-values are shares of the mean radiance of `path`."""
+    """Numbers of one photograph or of all. Numbers without a unit here are shares of the mean radiance of `path`."""
 
     name: str
     radiance: float  #: mean of `path` over all pixels and channels
@@ -34,13 +34,13 @@ class Comparison:
 
 
 def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
-    """Probability that independent pictures a, b (16, H, W, 3) float64 differ this much if equally distributed.
+    """p-value of the difference of independent pictures a, b (16, H, W, 3) float64 under equal distributions.
 
-    The smaller of two p-values with Šidák's correction. The first is of the mean of all pixels, by Student's t. The
-    second is of blocks of 8 × 8 pixels: if a and b agree, each of the 16 differences d of a block is as likely as −d,
-    even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance 2 − 2 Σ d⁴ / (Σ d²)². Blocks are
-    independent, so the sum over blocks is about gamma distributed, with known mean and variance. Channels share
-    samples and are not independent, so each block is taken in one channel only: red, green, blue in turn.
+    It is the smaller of two p-values, with Šidák's correction. The first tests the mean of all pixels, by Student's t.
+    The second tests blocks of 8 × 8 pixels. Under equal distributions, each of the 16 differences d of a block has
+    either sign with equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance
+    2 − 2 Σ d⁴ / (Σ d²)². Blocks are independent, so their sum has about a gamma distribution of known mean and
+    variance. Channels share samples, so each block uses only one channel: red, green, blue in turn.
     """
     whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
     error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
@@ -59,7 +59,7 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sums (16, h, w) over blocks of pixels of (16, H, W, 3), each in one channel. Blocks at the border are smaller."""
+    """Sums (16, h, w) of (16, H, W, 3) over blocks of pixels, each in one channel. Border blocks are smaller."""
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
     x = x.reshape(len(x), x.shape[1] // BLOCK, BLOCK, -1, BLOCK, 3).sum((2, 4))
@@ -68,7 +68,7 @@ def blocks(x: np.ndarray) -> np.ndarray:
 
 
 def sidak(p: Sequence[float] | np.ndarray) -> float:
-    """The least of several independent p-values, corrected for their number (Šidák 1967)."""
+    """The smallest of several independent p-values, corrected for their number (Šidák 1967)."""
     return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
 
 
@@ -96,7 +96,7 @@ def compare_renderers(name: str, pictures: Pictures) -> Comparison:
 
 
 def all_as_one(rows: list[Comparison]) -> Comparison:
-    """All photographs as one: shares of all light; p-values corrected for their number."""
+    """The comparison of all photographs together: shares of all light; p-values corrected for their number."""
     column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
     weight = column["radiance"] / (column["radiance"].sum() or 1.0)
     shares = {name: float((weight * values).sum()) for name, values in column.items()}
@@ -143,7 +143,7 @@ def verdict(rows: list[Comparison], everything: Comparison, significance: float)
     else:
         worst = min(rows, key=lambda row: (row.p_direct, -abs(row.unexplained)))
         way = "brighter" if worst.unexplained > 0 else "darker"
-        direct = (f"direct light DISAGREES with path ({p}), most of all in {worst.name}: "
+        direct = (f"direct light DISAGREES with path ({p}), most in {worst.name}: "
                   f"photometric is {percent(abs(worst.unexplained))} {way} on average")  # fmt: skip
     doubt = ": are the lights' intensities true?" if everything.interreflection > IMPLAUSIBLE else ""
     return [

@@ -15,7 +15,9 @@ from mi_ring.geometry.meshes import read_mesh
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.scene.plain_mesh import scene_of
 from mi_ring.scene.visibility import MaskedCamera, Visibility
-from mi_ring.system.optional import need
+from mi_ring.system.optional import LazyPackage
+
+gpytoolbox = LazyPackage("gpytoolbox", "the distance of surfaces")
 
 POINTS = 100_000  #: on each of two surfaces, to measure their distance
 ALIGNED, ALIGNMENTS = 20_000, 20  #: number of points and of steps of the alignment of two surfaces
@@ -31,19 +33,18 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """The rigid motion or `similarity` (4, 4) that moves a mesh onto another one nearby.
+    """The rigid motion or `similarity` (4, 4) that aligns a mesh with a mesh `onto` nearby.
 
-    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because the other mesh may lack a part.
+    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """
     middle, unit = onto.bounds.mean(0), onto.scale
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
     end = np.asarray((onto.vertices - middle) / unit), np.asarray(onto.faces, np.int32)
     start = trimesh.transform_points(trimesh.sample.sample_surface(mesh, ALIGNED, seed=0)[0], normalise)
-    squared_distance = need("gpytoolbox", "the distance of surfaces").squared_distance
     total = np.eye(4)
     for _ in range(ALIGNMENTS):
         points = trimesh.transform_points(start, total)
-        squared, nearest, _ = squared_distance(points, *end, use_cpp=True)
+        squared, nearest, _ = gpytoolbox.squared_distance(points, *end, use_cpp=True)
         normals = onto.face_normals[nearest]
         gaps = np.einsum("ij,ij->i", end[0][end[1][nearest, 0]] - points, normals)
         weights = 1 / (np.sqrt(squared) + np.sqrt(np.median(squared)) + 1e-9)
@@ -58,7 +59,7 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """At the pixel centres of a photograph: hit (P,), distance (P,), normal (P, 3), and is it a face's back (P,)?"""
+    """At the pixel centres of a photograph: hit (P,) bool, distance (P,), normal (P, 3), back of a face (P,) bool."""
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
     camera = photograph.camera(mi.UInt32(0))
@@ -74,7 +75,7 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Errors of all views, and of each: shading normals [deg], depths [% of `diagonal`], silhouettes.
+    """Errors of all views together, and by view: shading normals [deg], depths [% of `diagonal`], silhouettes.
 
     Normals and depths count at pixels that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of
     `guess` that see the back of a face.
@@ -97,7 +98,7 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Means and medians of errors (P,), if there are any."""
+    """Means and medians of errors (P,); empty if there are none."""
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -105,17 +106,15 @@ def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
 
 
 def compare_shapes(
-    guess: trimesh.Trimesh,
-    truth: trimesh.Trimesh,
-    views: Sequence[MaskedCamera] | None = None,
+    guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[MaskedCamera] | None = None,
     diagonal: float | None = None,
-) -> dict[str, float]:
+) -> dict[str, float]:  # fmt: skip
     """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two surfaces.
 
-    They are computed from the exact distances of 100,000 random points of each surface to the other. `chamfer`: mean
-    of the two mean distances. `f_score_t`: harmonic mean of precision, the share of the fit's points within t % of the
-    diagonal, and recall, the same of the truth's (Knapitsch et al., Tanks and Temples, ACM TOG 2017). With `views` only
-    points that one of them shows count; `unseen` and `unseen_true` are the shares of the others.
+    They use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean of the
+    two mean distances. `f_score_t`: harmonic mean of precision (share of the fit's points with a distance of at most
+    t % of the diagonal) and recall (the same for the truth); Knapitsch et al., Tanks and Temples, ACM TOG 2017.
+    With `views`, only points that a view shows count; `unseen` and `unseen_true` are the shares of the others.
     """
     diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
@@ -131,7 +130,7 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (n,) from random points of a surface, or from those that one of the `views` shows, to another one."""
+    """Distances (n,) of random points of `start` to `end`. With `views`, only of points that a view shows."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]
@@ -139,5 +138,4 @@ def distances(
             raise InputError("--seen: no photograph shows anything of the fit or of the true mesh; are they in the "
                              "same frame, and do the faces of both point outwards?")  # fmt: skip
     mesh = np.asarray(end.vertices - middle), np.asarray(end.faces, np.int32)  # near 0, for precision
-    squared = need("gpytoolbox", "the distance of surfaces").squared_distance(points - middle, *mesh, use_cpp=True)[0]
-    return np.sqrt(squared)
+    return np.sqrt(gpytoolbox.squared_distance(points - middle, *mesh, use_cpp=True)[0])

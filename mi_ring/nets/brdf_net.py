@@ -32,9 +32,9 @@ COOK_TORRANCE = (
 
 
 class MaterialNet(nn.Module):
-    """Base class of BRDF-Net: the parameters of a BSDF as functions of the domain point, each within its range.
+    """Base class of BRDF-Net: maps a domain point to the parameters of a BSDF, each within its range.
 
-    A subclass with a method `evaluate`, whose outputs are about 0 at first, can replace BRDF-Net.
+    A subclass with a method `evaluate` can replace BRDF-Net. Its initial outputs should be about 0.
     """
 
     bsdf_parameters: tuple[Parameter, ...]
@@ -46,7 +46,7 @@ class MaterialNet(nn.Module):
         self.set_parameters(parameters, scale)
 
     def set_parameters(self, parameters: Sequence[Parameter], scale: float) -> None:
-        """Set what the outputs of `evaluate` are: these parameters in this order; a colour takes three outputs."""
+        """Set the parameters that `evaluate` predicts, in the order of its outputs. A colour takes three outputs."""
         self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.scale.fill_(scale)
 
@@ -56,14 +56,14 @@ class MaterialNet(nn.Module):
         return sum(p.channels for p in self.bsdf_parameters)
 
     def evaluate(self, s: Tensor) -> Tensor:
-        """Unbounded values (..., outputs) at domain points (..., 3); about 0 at first."""
+        """Unbounded values (..., outputs) at domain points (..., 3); initially about 0."""
         raise NotImplementedError
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         """The parameters by name at domain points (..., 3): (..., 3) for colours, otherwise (...).
 
-        A sigmoid maps outputs to a parameter's range. If the range has no upper limit, it is softplus times `scale`, so
-        that the network's outputs are near 1 in any unit of light.
+        A sigmoid maps outputs to the range of a parameter. Without an upper limit, softplus times `scale` does, so that
+        outputs are about 1 in any unit of light.
         """
         raw = self.evaluate(s).float().split([p.channels for p in self.bsdf_parameters], -1)
         result = {}
@@ -78,9 +78,9 @@ class MaterialNet(nn.Module):
 
 @register_network("brdfnet")
 class BRDFNet(MLP, MaterialNet):
-    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): an MLP of 1,285 neurons; or the parameters of another BSDF.
+    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r) or the parameters of another BSDF: an MLP of 1,285 neurons.
 
-    On the domain point s, not on the deformed point.
+    Its input is the domain point s, not the deformed point.
     """
 
     def __init__(
@@ -91,5 +91,5 @@ class BRDFNet(MLP, MaterialNet):
         self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
-        """The arguments of the constructor, but for `scale`, which is among the weights."""
+        """The arguments of the constructor, except `scale`, which is saved with the weights."""
         return {"parameters": [tuple(p) for p in self.bsdf_parameters], **self.encoding.arguments()}

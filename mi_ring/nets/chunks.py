@@ -1,4 +1,4 @@
-"""Points in chunks, one per thread: how the networks use all cores of the processor."""
+"""Evaluation of networks in chunks of points, one per thread, on all cores of the processor."""
 
 import os
 import threading
@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-CHUNK = 8192  #: points that a thread computes at once, at most
-MAX_STORED = 20_000  #: points whose activations are stored; for more points, the backward pass computes them again
+CHUNK = 8192  #: most points that a thread computes at once
+MAX_STORED = 20_000  #: most points with stored activations; for more, the backward pass computes them again
 
 _pool: tuple[int, int, ThreadPoolExecutor] | None = None  # of the process: (its id, threads, executor)
 _lock = threading.Lock()
@@ -20,8 +20,8 @@ _lock = threading.Lock()
 def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Tensor:
     """The values of a network at points (n, 3), computed in chunks of equal size, one per thread.
 
-    `forward(chunk, keep)` returns the values of a chunk and, with `keep`, what the backward pass needs. That would be
-    most of a fit's memory for very many points: then the backward pass computes it again. A GPU has a single chunk.
+    `forward(chunk, keep)` returns the values of a chunk and, with `keep`, the data for the backward pass. For more than
+    `MAX_STORED` points the backward pass computes this data again, to save memory. A GPU uses a single chunk.
     """
     chunks = 1
     ctx.recompute = forward if keep and len(x) > MAX_STORED and x.device.type == "cpu" else None
@@ -39,13 +39,13 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Ten
 def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
     """The gradients of the points (n, 3) and of the parameters of `ctx.layers`.
 
-    `backward(gradient, stored, sums)` returns the gradient of a chunk's points and adds those of the parameters to
-    `sums`. Raises RuntimeError if it is called twice, or if the parameters have changed since the forward pass.
+    `backward(gradient, stored, sums)` returns the gradient of the points of a chunk and adds the gradients of the
+    parameters to `sums`. Raises RuntimeError for a second call, and if parameters changed after the forward pass.
     """
     _ = ctx.saved_tensors  # lets torch check for changes: the layers may share memory with the parameters
     if ctx.stored is None:
-        raise RuntimeError("the backward pass of a network was taken a second time; retain_graph does not keep it, "
-                           "but mi_ring.nets.mlp.plain_autograd() does")  # fmt: skip
+        raise RuntimeError("a second backward pass through a network is not supported, not even with retain_graph; "
+                           "use mi_ring.nets.mlp.plain_autograd()")  # fmt: skip
 
     @torch.no_grad()
     def run(gradient: Tensor, stored: Any) -> tuple[Tensor, list[Tensor]]:
@@ -68,7 +68,7 @@ def in_parallel(function: Callable, *arguments: Sequence) -> list:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """The worker threads of this process, at least this number."""
+    """The pool of worker threads of this process, with at least `threads` threads."""
     global _pool
     with _lock:
         if _pool is None or _pool[0] != os.getpid() or _pool[1] < threads:  # a fork does not copy threads
@@ -88,6 +88,6 @@ def pool(threads: int) -> ThreadPoolExecutor:
 
 
 def use_one_thread() -> None:
-    """Let torch use one thread for what the current thread computes."""
+    """Let torch use one thread for the computations of the current thread."""
     torch.get_num_threads()  # the first call copies the number of the process, which would undo the next line
     torch.set_num_threads(1)

@@ -36,7 +36,7 @@ class PosEnc(nn.Module):
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
     def backward(self, features: Tensor, gradient: Tensor) -> Tensor:
-        """The gradient of the points (n, 3) from that of the features (n, width), at least in float32."""
+        """The gradient (n, 3) of the points from the `gradient` (n, width) of the features; at least float32."""
         dtype = torch.promote_types(features.dtype, torch.float32)
         if self.spacing == "none":
             return gradient.to(dtype)

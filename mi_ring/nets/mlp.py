@@ -1,4 +1,4 @@
-"""The multilayer perceptron of both networks, with derivatives written by hand, which are faster."""
+"""The multilayer perceptron of both networks, with derivatives written by hand for speed."""
 
 import contextlib
 import contextvars
@@ -21,9 +21,9 @@ SLOPE = 0.01  #: of the leaky ReLU
 
 @contextlib.contextmanager
 def plain_autograd() -> Iterator[None]:
-    """A context manager in which networks use PyTorch's own operations: slower, but differentiable repeatedly.
+    """A context manager in which networks use PyTorch's own derivatives: slower, but of any order.
 
-    It is needed for Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
+    Use it for Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
     """
     token = _plain.set(True)
     try:
@@ -33,7 +33,7 @@ def plain_autograd() -> Iterator[None]:
 
 
 class MLP(nn.Module):
-    """`outputs` functions of a point: its encoding, `depth` hidden layers of leaky ReLUs, a linear layer."""
+    """A perceptron of a point: encoding, `depth` hidden layers with leaky ReLU, linear layer with `outputs`."""
 
     def __init__(self, depth: int, outputs: int, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
         super().__init__()
@@ -43,9 +43,9 @@ class MLP(nn.Module):
         self.output = nn.Linear(width, outputs)
 
     def evaluate(self, x: Tensor) -> Tensor:
-        """The functions (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
+        """The outputs (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
 
-        It can be differentiated once, by one backward pass; within `plain_autograd`, any number of times.
+        They allow one backward pass and first derivatives; within `plain_autograd`, any number of both.
         """
         if _plain.get():
             x = self.encoding(x)
@@ -56,9 +56,9 @@ class MLP(nn.Module):
         return values.reshape(*x.shape[:-1], self.output.out_features)
 
     def operands(self, x: Tensor) -> list:
-        """The last arguments of `_Evaluate` and of Shape-Net's `_EulerSteps`.
+        """The last arguments of `_Evaluate` and of `_EulerSteps`.
 
-        The encoding, the type of the matrix products, whether gradients are needed, weights and biases by layer.
+        They are: encoding, type of the matrix products, whether gradients are needed, weights and biases by layer.
         """
         dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # as autocast decides
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
@@ -85,12 +85,12 @@ class Layers:
         return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
 
     def zeros(self) -> list[Tensor]:
-        """Zeros to which the parameters' gradients are added, at least in float32."""
+        """Zeros for the sums of the parameters' gradients; at least float32."""
         dtype = torch.promote_types(self.dtype, torch.float32)
         return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
     def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
-        """The gradient of the points from that of the output; the parameters' gradients are added to `sums`."""
+        """The gradient of the points from the `gradient` of the output. Adds the parameters' gradients to `sums`."""
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):
             sums[2 * k] += gradient.T @ activations[k]

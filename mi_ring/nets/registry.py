@@ -16,9 +16,9 @@ _networks: dict[str, type[nn.Module]] = {}
 def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
     """A decorator that registers a class of networks under the `name` by which `ring.pt` refers to it.
 
-    The class may have a method `arguments`, which returns a dictionary of plain data; `network(**arguments)` must
-    then construct an equal network. Weights are saved by `state_dict`. Networks of other packages are found without an
-    import if they are entry points of the group `mi_ring.networks`. Raises ValueError if another class has the name.
+    The class may have a method `arguments`, which returns the arguments of its constructor as a dictionary of plain
+    data. Weights are saved by `state_dict`. Networks of other packages are found without an import if they are entry
+    points of the group `mi_ring.networks`. Raises ValueError if another class has the name.
     """
 
     def register(network: type[nn.Module]) -> type[nn.Module]:
@@ -32,7 +32,7 @@ def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
 
 
 def qualified_name(network: type) -> tuple[str, str]:
-    """Module and name: equal for a class that was defined twice, as in a cell of a notebook."""
+    """Module and name of a class. They are equal if a notebook cell defines the class again."""
     return network.__module__, network.__qualname__
 
 
@@ -42,8 +42,8 @@ def architecture_of(network: nn.Module) -> dict:
         if qualified_name(type(network)) == qualified_name(known):
             arguments = getattr(network, "arguments", None)
             return {"name": name, "arguments": arguments() if arguments else {}}
-    raise ValueError(f'{type(network).__name__}: has no name to be saved by; put @mi_ring.register_network("…") above '
-                     "the class")  # fmt: skip
+    raise ValueError(f'{type(network).__name__}: is not registered, so it cannot be saved; put '
+                     '@mi_ring.register_network("…") above the class')  # fmt: skip
 
 
 def build(architecture: dict) -> Any:

@@ -12,10 +12,10 @@ from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 
 @register_network("resnet")
 class ResNet(Flow):
-    """`steps` blocks `x ← x + Vₖ(x) / T`, each with its own weights, so that it is not the flow of one field.
+    """T = `steps` blocks `x ← x + Vₖ(x) / T`, each with its own weights. It is not the flow of one velocity field.
 
     By default all blocks together have as many parameters as Shape-Net: for T = 20 they are about 42 neurons wide.
-    With `width`, each has this number of neurons; at Shape-Net's 256 that is T times as many parameters.
+    `width`: neurons per layer of each block; with Shape-Net's 256 there are T times as many parameters.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class ResNet(Flow):
 def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
     """Widths of blocks that together have about as many parameters as one block of width `WIDTH`.
 
-    The first blocks are one neuron wider than the others, to come as near as possible.
+    The first blocks are one neuron wider than the others, for the smallest difference.
     """
 
     def parameters(width: int) -> int:

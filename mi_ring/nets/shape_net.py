@@ -12,17 +12,17 @@ from mi_ring.nets.encoding import PosEnc
 from mi_ring.nets.mlp import MLP, WIDTH, Layers, _plain
 from mi_ring.nets.registry import register_network
 
-SPEED = 2.0  #: bound of each component of the velocity: in unit time a point can cross the unit sphere
+SPEED = 2.0  #: largest component of the velocity: in unit time, a point can cross the unit sphere
 
 Velocity = Callable[[Tensor], Tensor]
 
 
 class Flow(nn.Module):
-    """Φ(x, t) = x + ∫₀ᵗ V(Φ(x, s)) ds of a time-invariant velocity field V, by Euler steps.
+    """The flow Φ(x, t) = x + ∫₀ᵗ V(Φ(x, s)) ds of a time-invariant velocity field V, by Euler steps.
 
-    Base class of Shape-Net. To replace Shape-Net, derive a class with a method `velocity`, or write a module that has
+    Base class of Shape-Net. To replace Shape-Net, derive a class with a method `velocity`, or write a module with
     `forward`, `velocity`, `flow` and `steps`. Points are in the normalised frame, where the domain is about the unit
-    sphere. The velocity should be small at first, so that the fit starts from the domain.
+    sphere. The initial velocity should be small, so that the fit starts from the domain.
     """
 
     steps: int = 20  #: T: steps from the domain to the object
@@ -42,7 +42,7 @@ class Flow(nn.Module):
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Φ(x, time) for points (V, 3), `time` in [0, 1]; between two steps it takes a shorter step."""
+        """Φ(x, time) for points (V, 3), `time` in [0, 1]. The last step is shorter if `time` is between two steps."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
         return x + rest * self.velocity_of(steps)(x) if rest else x
@@ -51,8 +51,8 @@ class Flow(nn.Module):
 class VelocityField(MLP):
     """V, an MLP of 771 neurons in the paper.
 
-    It is bounded by `SPEED` (by tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH
-    2022) and almost 0 at first, so that the start surface is the domain.
+    It is bounded by `SPEED`, by tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH
+    2022. It is initially almost 0, so that the start surface is the domain.
     """
 
     def __init__(self, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
@@ -79,9 +79,9 @@ class ShapeNet(VelocityField, Flow):
         return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """`Flow.flow`, with products in bfloat16 under `torch.autocast`.
+        """`Flow.flow`, with matrix products in bfloat16 under `torch.autocast`.
 
-        It can be differentiated once, by one backward pass; within `plain_autograd`, any number of times.
+        It allows one backward pass and first derivatives; within `plain_autograd`, any number of both.
         """
         if _plain.get():
             return super().flow(x, steps)
@@ -89,7 +89,7 @@ class ShapeNet(VelocityField, Flow):
 
 
 class _EulerSteps(torch.autograd.Function):
-    """Euler steps of length `scale` at most. For each it stores the activations and the direction."""
+    """Euler steps `x ← x + scale · tanh(MLP(x))`. For each step it stores the activations and the tanh."""
 
     @staticmethod
     def forward(

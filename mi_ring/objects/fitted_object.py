@@ -23,12 +23,11 @@ class FittedObject(nn.Module):
     """A surface x(s) = center + radius · Φ(s) with a material Ψ(s) at every point s of the domain.
 
     `center` (3,) and `radius` are in scene units. `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
-    `indirect`: the fit included interreflection, so pictures do, too. `subdivisions`: the level at which to sample the
-    surface; the networks are less certain between the vertices of the fit. `networks` replace the paper's networks,
-    which are made by `steps`, `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and
-    `mi_ring.nets.brdf_net.MaterialNet`. `ground` (2, 3) is a point of the table below the object and the table's unit
-    normal; points below the table are moved up to it. `up` (3,), and `metres`, the length of a scene unit, are for
-    exports; None if they are unknown.
+    `indirect`: whether the fit and pictures include interreflection. `subdivisions`: level at which to sample the
+    surface; finer levels are less certain. `networks` replace the paper's networks, which are made from `steps`,
+    `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet`.
+    `ground` (2, 3): a point of the table below the object and the table's unit normal; points below the table are moved
+    up to it. `up` (3,) and `metres`, the length of a scene unit, are for exports; None if unknown.
     """
 
     shape_net: Flow
@@ -70,11 +69,11 @@ class FittedObject(nn.Module):
         self, camera: Camera, light: Light | None = None, spp: int = 16, level: int | None = None, shadows: bool = True,
         seed: int = 0,
     ) -> Tensor:  # fmt: skip
-        """A picture (H, W, 3), linear radiance by direct light, of the size of the camera.
+        """A picture (H, W, 3) of the camera's size: linear radiance by direct light.
 
-        `light`: default is a point light of intensity 1 at the camera. `level`: of the icosphere; default:
-        `subdivisions`. `spp`: samples per pixel. The picture has gradients with respect to the parameters of both
-        networks, moving outlines and shadows included, for one backward pass; none within `torch.no_grad()`.
+        `light`: default: a point light of intensity 1 at the camera. `level`: of the mesh; default: `subdivisions`.
+        `spp`: samples per pixel. The picture allows one backward pass to the parameters of both networks. Gradients
+        include moving outlines and shadows.
         """
         shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
         surface = Surface(assembled([shape]), shape, self)
@@ -85,7 +84,7 @@ class FittedObject(nn.Module):
         return prediction.render(surface, shot, vertices, material, spp, seed, shadows)[0][0]
 
     def to_scene(self, points: Tensor) -> Tensor:
-        """Points (V, 3) of the normalised frame in scene units, none of them below the ground."""
+        """Points (V, 3) of the normalised frame in scene units. Points below the ground are moved up to it."""
         points = self.center + self.radius * points
         if self.ground is None:
             return points

@@ -20,21 +20,21 @@ SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """Another material for the object."""
+    """Changes of the material."""
 
     material: Path | None = None
-    """Results folder of another fit, whose material this object gets.
+    """Results folder of another fit. The object gets the material of that fit.
     Both fits must start from the same domain or from surfaces without handles."""
     specular_scale: float = 1.0
     """Factor for the specular reflectance."""
     roughness_add: float = 0.0
-    """Number that is added to the roughness."""
+    """Number to add to the roughness, which stays within its range."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors for red, green and blue."""
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
-    """Apply the options to the material of an object. Raises InputError if they are not possible for it."""
+    """Apply the options to the material of an object. Raises InputError if the material does not allow them."""
     if options.material:
         other = load_fit(options.material)
         ring.bsdf, ring.brdf_net = other.bsdf, other.brdf_net
@@ -73,7 +73,7 @@ def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> l
 
 
 class TransferredMaterial(MaterialNet):
-    """A BRDF-Net of the domain `there` as a function on the domain `here`; points correspond by the sphere."""
+    """A BRDF-Net of the domain `there`, evaluated on the domain `here`. Both are mapped to the sphere."""
 
     def __init__(self, net: MaterialNet, here: SphericalMap, there: SphericalMap) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))
@@ -85,7 +85,7 @@ class TransferredMaterial(MaterialNet):
 
 
 class EditedMaterial(MaterialNet):
-    """A BRDF-Net with gains and offsets by parameter name; its values stay within the parameters' ranges."""
+    """A BRDF-Net with gains and offsets by parameter name. Values stay within the parameters' ranges."""
 
     def __init__(self, net: MaterialNet, gains: dict, offsets: dict) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))

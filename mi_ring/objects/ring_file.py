@@ -1,4 +1,4 @@
-"""`ring.pt`: the file of a reconstructed object, which refers to networks by their registered names."""
+"""`ring.pt`: the file of a reconstructed object. It stores networks by their registered names."""
 
 import io
 import math
@@ -38,8 +38,8 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
 def ring_of(state: dict) -> FittedObject:
     """The inverse of `ring_state`.
 
-    Raises InputError for networks that are not registered here and for settings of older versions that are gone, and
-    KeyError, RuntimeError, TypeError or ValueError if the state is damaged.
+    Raises InputError for networks that are not registered and for removed settings of older versions. If the state is
+    damaged, raises KeyError, RuntimeError, TypeError or ValueError.
     """
     refuse("material_at", state.get("material_at", "domain"), "domain")
     shape_net = state["shape_net"]
@@ -61,14 +61,14 @@ def ring_of(state: dict) -> FittedObject:
 
 
 def refuse(name: str, found: object, supported: str) -> None:
-    """Raise InputError for a setting of an older version that is not the one still supported."""
+    """Raise InputError unless a setting of an older version has the only value that is still supported."""
     if found != supported:
         raise InputError(f"{name}: is {found}, only {supported} is supported; fit again, or use the version of mi_ring "
                          "that wrote this file")  # fmt: skip
 
 
 def require_valid(ring: FittedObject) -> None:
-    """Raise ValueError for an object that no fit can have made."""
+    """Raise ValueError for values that no fit gives: damaged or forged files."""
     for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
         require(bool(value.isfinite().all()), f"{name} is not finite")
     require(float(ring.radius) > 0, f"the radius is {float(ring.radius):.4g}")
@@ -102,9 +102,9 @@ def upgraded(state: dict) -> dict:
 
 
 def read_state(path: Path, kind: str, advice: str) -> dict:
-    """A state that `write_state` wrote. Raises InputError if there is no such file, or if it is damaged or not `kind`.
+    """A state that `write_state` wrote. Raises InputError if the file is missing, damaged or not `kind`.
 
-    Older files have no checksum of ours, only those of zip files.
+    Files of 0.1 have only the checksums of the zip format.
     """
     try:
         content = path.read_bytes()
@@ -121,7 +121,7 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     except Exception as error:  # torch raises errors of many kinds for other files
-        # Torch's message is left out: it advises to load files that may run any code.
+        # Torch's message is left out: it advises an unsafe way to load the file.
         raise InputError(f"{path}: not {kind}, or damaged; {advice}") from error
     if not isinstance(state, dict):
         raise InputError(f"{path}: not {kind} (holds a {type(state).__name__}); {advice}")
@@ -147,4 +147,4 @@ def load_fit(path: str | Path) -> FittedObject:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (AttributeError, IndexError, KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: damaged, or of other networks than it says ({error!r})") from error
+        raise InputError(f"{path}: damaged, or its networks do not match their names ({error!r})") from error

@@ -9,10 +9,10 @@ def ambiguity(light: str) -> str:
     """The warning for a light, named as in a fit's summary; empty if the capture gives the light."""
     if light == "capture":
         return ""
-    text = ("The light was unknown: how bright it is, and of which colour, cannot be told from the object's. "
-            "The object is taken to reflect half of it, in each colour")  # fmt: skip
+    text = ("The light was unknown: its brightness and colour cannot be separated from those of the object. "
+            "The fit assumes that the object reflects half of the light in each colour")  # fmt: skip
     if "lamp" not in light:
-        text += "; slow changes of light and of reflectance can hardly be told apart, either"
+        text += "; smooth variations of light and reflectance can hardly be separated either"
     return text + "."
 
 

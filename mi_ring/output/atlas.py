@@ -1,4 +1,4 @@
-"""Texture atlases: a fitted surface is cut open and flattened, and its networks are baked into images."""
+"""Texture atlases: the fitted surface is unwrapped, and the networks are baked into images."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
 
-MAX_CUT_LEVEL = 5  #: the finest level that is cut open: the time grows with the square of the number of triangles
+MAX_CUT_LEVEL = 5  #: finest level that is unwrapped: the time grows with the square of the number of triangles
 PADDING = 4  #: between charts [texels]
 CHUNK = 2**17  #: texels that the networks evaluate at once
 
@@ -28,12 +28,12 @@ class Atlas(NamedTuple):
     normals: np.ndarray  # (V, 3), the same on both sides of seams
     tangents: np.ndarray  # (V, 4), as in glTF: along u, and the sign of the bitangent n × t
     faces: np.ndarray  # (F, 3)
-    uncut: np.ndarray  # (V,) number of the vertex in the surface before it was cut: the same on both sides of seams
+    uncut: np.ndarray  # (V,) index of the vertex before unwrapping: the same on both sides of seams
     subdivisions: int
 
 
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
-    """Cut a surface open for square textures with `resolution` texels a side, by xatlas (Young 2018, after Thekla)."""
+    """Unwrap a surface for square textures of `resolution` texels a side, by xatlas (Young 2018, after Thekla)."""
     points, faces = ring.domain.sample(min(subdivisions, MAX_CUT_LEVEL))
     xatlas = need("xatlas", "textures")
     options = xatlas.PackOptions()
@@ -49,7 +49,7 @@ def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: 
 
 
 def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """The surface points (V, 3) in the normalised frame of domain points (V, 3)."""
+    """Surface points (V, 3), in the normalised frame, of domain points (V, 3)."""
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
@@ -57,13 +57,12 @@ def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndar
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Cut every triangle into four. New vertices are on the domain; `uv` and `more` (V, n) are interpolated."""
-    columns = [s, uv, *more]
-    ends = np.cumsum([c.shape[1] for c in columns])[:-1]
-    finer, faces = trimesh.remesh.subdivide(np.hstack(columns).astype(np.float64), faces)
-    s, *rest = np.split(finer, ends, axis=1)
-    s = np.concatenate([s[: len(columns[0])], ring.domain.project(s[len(columns[0]) :])])
-    return (s.astype(np.float32), rest[0], faces, *rest[1:])
+    """Subdivide every triangle into four. New vertices are on the domain; `uv` and `more` (V, n) are interpolated."""
+    attributes = dict(enumerate((uv, *more)))
+    finer, faces, attributes = trimesh.remesh.subdivide(s.astype(float), faces, vertex_attributes=attributes)
+    finer[len(s) :] = ring.domain.project(finer[len(s) :])
+    uv, *more = attributes.values()
+    return finer.astype(np.float32), uv, faces, *more
 
 
 def assemble(

@@ -18,25 +18,25 @@ LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
 class Panel(NamedTuple):
-    """That part of the report."""
+    """The section of the report about calibration."""
 
-    rows: list[tuple[str, str, str, str]]  #: what, before, after, standard deviation
+    rows: list[tuple[str, str, str, str]]  #: quantity, before, after, standard deviation
     chart: str  #: a data URI
-    untold: str  #: what photographs cannot tell, in words
+    untold: str  #: the warning of `ambiguity`
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
-    """`refined`: the content of calibration.json, which changed capture `before` into `after`."""
+    """The section for the captures `before` and `after` the refinement. `refined`: content of calibration.json."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
     light = refined.get("light", "capture")
     if light != "capture":
-        rows.insert(0, ("what lights the object, by coarse fits", "", light, ""))
+        rows.insert(0, ("kind of light, by coarse fits", "", light, ""))
     rows += [row(entry) for entry in of_photographs(refined["photographs"])]
     return Panel(rows, chart(before, after, refined["photographs"]), ambiguity(light))
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """The row of an unknown: what it is, before, after, standard deviation."""
+    """The row of an unknown: quantity, before, after, standard deviation."""
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
@@ -56,7 +56,7 @@ def numbers(value: Any, digits: int) -> str:
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Medians of the unknowns of single photographs."""
+    """Medians over all photographs of the unknowns that each photograph has."""
     entries = list(photographs.values())
     result = []
     for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved, median [scene units]")):
@@ -73,25 +73,25 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """A sentence about held-out photographs, from the result of `mi_ring.fitting.validation`."""
+    """A sentence about the held-out photographs. `held_out`: the result of `mi_ring.fitting.validation`."""
     if not held_out:
-        return "not asked, for the fit ended early"
+        return "not tested: the fit ended early"
     if "unexplained" not in held_out:
-        return "nothing that is surely the object shows in them; nothing was asked"
+        return "not tested: no pixel in them is surely of the object"
     text = f"{held_out['unexplained']:.1%} of the object's light in them is unexplained"
     if "before" in held_out:
-        text += f", {held_out['before']:.1%} by this surface with calibration as it was"
+        text += f"; {held_out['before']:.1%} with the calibration before the fit"
     if held_out["put_back"]:
-        text += f"; what did not help was put back, the surface as it is: {', '.join(held_out['put_back'])}"
+        text += f"; reset, because the refinement did not help: {', '.join(held_out['put_back'])}"
     return text
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
-    """Cameras and lights from above, and for each photograph how far it moved, or its power."""
+    """Cameras and lights from above, and beside it the environment, or the shift or the power of each photograph."""
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
     light = after.photographs.room if after.photographs.dark else None
-    told = max(moved) > 0 or len(power) or light is not None  # else nothing of single photographs is
+    told = max(moved) > 0 or len(power) or light is not None  # otherwise there is no second chart
     figure = Figure(figsize=(9 if told else 4.5, 3.4), layout="constrained")
     plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]
     up = before.up
@@ -113,19 +113,19 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
         if max(moved) > 0:
             bars.bar(range(len(moved)), moved, color=AFTER)
             bars.set_ylabel("pixels")
-            bars.set_title("how far the object has moved in each photograph", fontsize=9)
+            bars.set_title("shift of the object in each photograph", fontsize=9)
         else:
             for channel, colour in zip(power.T, ("tab:red", "tab:green", "tab:blue")):
                 bars.plot(channel, ".", color=colour)
             bars.axhline(1, color=BEFORE, linewidth=1)
             bars.set_title("power of the light of each photograph, by colour", fontsize=9)
-        bars.set_xlabel("photograph that was not kept out")
+        bars.set_xlabel("photograph (without held-out ones)")
     with np.errstate(invalid="ignore"):  # cameras that are all in one place have no scale
         return svg_uri(figure)
 
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
-    """Cameras, their directions and their lights, projected to a plane of two directions (2, 3)."""
+    """Draw cameras, viewing directions and lights, projected to the plane of two unit vectors (2, 3)."""
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
     axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)

@@ -35,8 +35,8 @@ SLANT = 45.0  #: angle between light and camera in a light orbit, seen from the 
 class RenderConfig(MaterialOptions):
     """Render every photograph of a scene with the object of a finished fit, under the same file names.
 
-    Or render a film: the camera goes around the object, the light does, or the start surface flows into the object. OUT
-    is then a folder of numbered pictures, or an MP4 file.
+    Or render a film: the camera or the light moves around the object, or the start surface deforms into the object. OUT
+    is then a folder of numbered pictures or an MP4 file.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -47,12 +47,12 @@ class RenderConfig(MaterialOptions):
     """Folder for the pictures, or a file FILE.mp4 for a film.
     A picture is linear if the scene names an EXR file, and 8-bit sRGB if it names PNG or JPEG."""
     turntable: int = 0
-    """Number of pictures from a camera that goes once around the object, together with its light."""
+    """Number of pictures with a camera that moves once around the object, together with its light."""
     light_orbit: int = 0
-    """Number of pictures with a light that goes once around the line from the object to the camera.
-    The light is 45 degrees away from that line."""
+    """Number of pictures with a light that moves once around the line from the object to the camera.
+    Seen from the object, the angle between light and camera is 45 degrees."""
     flow: int = 0
-    """Number of pictures of the flow, from the surface where the fit started to the object."""
+    """Number of pictures of the flow, from the start surface of the fit to the object."""
     view: str | None = None
     """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
     Without it: the first photograph."""
@@ -60,15 +60,15 @@ class RenderConfig(MaterialOptions):
     """Width of the pictures of --turntable, --light-orbit and --flow [px].
     Without it: the width of that photograph."""
     up: tuple[float, float, float] | None = None
-    """Axis of the turntable, which is also up for --envmap.
+    """Axis of the turntable, and the up direction of --envmap (x y z).
     Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
     """Environment map that lights the object in place of the scene's lights: EXR or HDR, latitude and longitude."""
     integrator: str | None = None
-    """Mitsuba's name of the integrator.
-    Without it: photometric, or path with --envmap. path shows all interreflection, but no `table`."""
+    """Mitsuba's name of the integrator. Without it: photometric, or path with --envmap.
+    path computes all interreflection, but does not show a `table`."""
     format: Literal["png", "exr"] | None = None
-    """Format of the pictures. Without it: as the scene's file names say, and png for the three films."""
+    """Format of the pictures. Without it: that of the scene's file names; png for numbered pictures."""
     fps: float = 24.0
     """Pictures per second of a film."""
     time: float = 1.0
@@ -85,7 +85,7 @@ class RenderConfig(MaterialOptions):
 
     @property
     def film(self) -> bool:
-        """Is the output one film, instead of a folder of pictures?"""
+        """Whether the output is one film, not a folder of pictures."""
         return self.out.suffix.lower() == ".mp4"
 
 
@@ -96,7 +96,7 @@ class RenderedView:
     shot: Shot
     name: str  #: of the picture's file
     time: float  #: of the flow
-    sensor: Any = None  #: the scene's own, if there is one, with the film that the scene gives it
+    sensor: Any = None  #: the scene's own sensor with its film, if there is one
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
@@ -130,7 +130,7 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
     camera, middle = framed(shot.camera._replace(size=size), ring, up)
     light = shot.own_light
     if config.light_orbit and not light.rgb.any():
-        raise InputError(f"{config.scene}: --light-orbit: photographs have no light of their own that could go round; "
+        raise InputError(f"{config.scene}: --light-orbit: the photographs have no light of their own to move; "
                          "give --turntable")  # fmt: skip
     views, digits = [], max(3, len(str(count - 1)))
     for k in range(count):
@@ -150,7 +150,7 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        falloff = 0.0 if config.light_orbit else shot.falloff  # about the axis of a camera that the light goes with
+        falloff = 0.0 if config.light_orbit else shot.falloff  # about the axis of the camera
         views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, files=Files(Path("none"))), name, time))
     return views
 
@@ -161,9 +161,9 @@ def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """A camera at the same position that shows the whole object, and the fit's start surface, in its middle.
+    """A camera at the same position that is centred on the object and shows it and the start surface of the fit.
 
-    Also returns the middle (3,) of the object [scene units].
+    Also returns the centre (3,) of the object [scene units].
     """
     s = ring.domain.sample(3)[0].numpy()
     points = np.concatenate([flow_points(ring, s, time) for time in (0.0, 1.0)]).astype(float)
@@ -183,7 +183,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """The object in its scene, in the scene's light, or in an environment and fixed lamps. Then there is no table."""
+    """The object in the light of its scene. With --envmap: in that environment and fixed lamps, without a table."""
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -221,9 +221,9 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """A picture (H, W, 3) by an integrator of Mitsuba, as the mean of passes, so that memory does not grow with `spp`.
+    """A picture (H, W, 3) by an integrator of Mitsuba. It is the mean of passes, so memory does not grow with `spp`.
 
-    A pass has at most `LANES` rays, or one ray per pixel if there are more pixels.
+    A pass has at most `LANES` rays, but at least one ray per pixel.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

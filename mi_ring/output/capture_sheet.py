@@ -19,13 +19,13 @@ CELL, LINE = 200, 16  # size of a photograph, height of a line of text [px]
 GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # colours of the photographs' names
 RED, YELLOW, GREEN = (255, 51, 51), (255, 220, 40), (26, 255, 51)
 LEGEND = (
-    ("mask", RED), ("unsure, or beyond the lens: not used", YELLOW), ("hull of all masks", GREEN),
-    ("share of the mask that the other masks agree to", GOOD), ("less than needed", DOUBTED),
+    ("mask", RED), ("not used: unsure, or outside the lens", YELLOW), ("hull of all masks", GREEN),
+    ("share of the mask that the other masks agree with", GOOD), ("too small", DOUBTED),
 )  # fmt: skip
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
-    """Cameras with their viewing directions, lights and the normalising sphere, along the three axes."""
+    """Cameras, viewing directions, lights and the normalising sphere, projected along the three axes."""
     cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())

@@ -31,9 +31,9 @@ def export(
     """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
 
     `subdivisions`: level of the mesh, about 10 · 4^level vertices; default: that of the fit, at most 5 for GLB.
-    `resolution`: width of textures [px]. `time`: of the flow, in [0, 1]. `metres`: length of a scene unit, for GLB;
-    default: as the object knows it. `views`: cameras of the photographs; PLY and GLB then say what they show.
-    `photograph`: camera and light of an XML scene, with the light of its room (BASIS, 3).
+    `resolution`: width of the textures [px]. `time`: of the flow, in [0, 1]. `metres`: length of a scene unit [m], only
+    for GLB; default: that of the object. `views`: cameras of the photographs; PLY and GLB then mark the vertices that
+    they show. `photograph`: camera and light of an XML scene, and the light of its room (BASIS, 3).
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """
@@ -64,13 +64,13 @@ def export(
 def require_exportable(
     file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
 ) -> str:  # fmt: skip
-    """The suffix of a file. Raises InputError for one that is not among `KINDS`, and for values out of range."""
+    """The suffix of a file, one of `KINDS`. Raises InputError for other suffixes and for values out of range."""
     kind = file.suffix.lower()
     if kind not in KINDS:
         raise InputError(f"{file}: must end in {', '.join(KINDS)}")
     finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
     if subdivisions is not None and not 0 <= subdivisions <= finest:
-        more = f"; textures have what is finer, and .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
+        more = f"; textures have the finer detail; .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
         raise InputError(f"--subdivisions: is {subdivisions}, must be 0 to {finest}{more}")
     if not 64 <= resolution <= 4096:
         raise InputError(f"--resolution: is {resolution}, must be 64 to 4096")

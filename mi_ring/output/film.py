@@ -21,9 +21,10 @@ def write_picture(linear: np.ndarray, path: Path) -> None:
 
 
 def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:
-    """Write pictures (H, W, 3), linear, as an H.264 film in an MP4 file that browsers play; complete or not at all.
+    """Write linear pictures (H, W, 3) as an MP4 file (H.264) that browsers play. An error leaves no partial file.
 
-    `size`: (width, height) [px] of the pictures; odd ones get another column or row. Raises InputError if it fails.
+    `size`: (width, height) [px] of the pictures; odd sizes get one more column or row. `fps`: pictures per second.
+    Raises InputError if the file cannot be written.
     """
     partial = path.with_name(f".{path.stem}.partial.mp4")
     odd_columns, odd_rows = size[0] % 2, size[1] % 2

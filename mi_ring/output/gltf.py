@@ -35,18 +35,18 @@ class Material(NamedTuple):
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
-    """Convert a BSDF (Mitsuba's XML) and its `values`, (N, 3) or (N,) by name, to glTF's metallic-roughness parameters.
+    """Convert a BSDF (Mitsuba's XML) and its `values` by name, (N, 3) or (N,), to glTF's metallic-roughness material.
 
     ``cooktorrance``: glTF's dielectric is (1 − F) c/π + F D V with Schlick's F between F₀ = min(0.04 k, 1) w and
     F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25, F is w at all angles, and
 
         w = 4 ρᵞ,  c = π ρᵈ / (1 − w),  roughness = √r
 
-    make it ρᵈ + 4 ρᵞ D V, with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: ours is Smith's product, glTF's is
-    correlated with height. c ≤ 1 and w ≤ 1 hold where the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If one point in a
-    hundred does not, the lights' intensities were wrong, and all ρ are scaled.
+    give ρᵈ + 4 ρᵞ D V with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: our G is Smith's product, glTF's G is
+    height-correlated. c ≤ 1 and w ≤ 1 hold if the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If more than 1 % of the
+    points do not conserve energy, the lights' intensities were wrong, and all ρ are scaled.
 
-    ``diffuse`` is exact in glTF, and ``principled`` without other lobes nearly so. Raises InputError for other BSDFs.
+    ``diffuse`` is exact in glTF. ``principled`` without other lobes is nearly exact. Raises InputError for other BSDFs.
     """
     loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")
@@ -77,11 +77,11 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
             f0 = ((eta - 1) / (eta + 1)) ** 2 if eta else 0.08 * float(np.ravel(params["specular"])[0])
             return Material(value("base_color", 3), value("metallic"), value("roughness"), zero + 1, f0 / 0.04, 1.0)
         kind = f"principled with {', '.join(further)}"
-    raise InputError(f"{kind}: this material cannot be told in glTF's terms; write PLY or a scene for Mitsuba (.xml)")
+    raise InputError(f"{kind}: glTF cannot express this material; write PLY or a scene for Mitsuba (.xml)")
 
 
 def require_expressible(ring: FittedObject) -> None:
-    """Raise InputError if glTF cannot express the material of an object; call it before baking, which takes long."""
+    """Raise InputError if glTF cannot express the material of an object. Call it before the slow baking."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
@@ -175,7 +175,7 @@ def assemble_glb(
     node = pygltflib.Node(
         name="object", mesh=0, scale=[metres] * 3 if metres else None,
         rotation=None if up is None else Rotation.align_vectors([[0, 1.0, 0]], [up])[0].as_quat().tolist(),
-        extras={"unit": f"{metres:g} m" if metres else "that of the scene; its length is not known"},
+        extras={"unit": f"{metres:g} m" if metres else "scene unit of unknown length"},
     )  # fmt: skip
     sampler = pygltflib.Sampler(
         magFilter=pygltflib.LINEAR, minFilter=pygltflib.LINEAR_MIPMAP_LINEAR,

@@ -1,4 +1,4 @@
-"""index.html: a page that shows many fits, with a picture and the figures of each report."""
+"""index.html: a page that lists many fits, with a picture and numbers from each report."""
 
 import base64
 import contextlib
@@ -37,13 +37,13 @@ class Entry(NamedTuple):
 
     name: str
     state: str  #: of STATES
-    text: str  #: about its progress, or its error
+    text: str  #: its progress or its error
     folder: Path  #: its results
     log: Path  #: its output
 
 
 def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
-    """Write the page of all fits. While they are `running`, browsers reload it from time to time."""
+    """Write the page of all fits. While fits are `running`, browsers reload it from time to time."""
     template = resources.files("mi_ring.output").joinpath("index.html.jinja").read_text("utf-8")
     rows = [row_of(entry, out) for entry in entries]
     states = [entry.state for entry in entries]
@@ -75,9 +75,9 @@ def link_to(file: Path, out: Path) -> str | None:
 
 @functools.lru_cache(maxsize=4096)
 def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
-    """The figures of a report, without explanations, and the prediction of its first photograph, small, as a data URI.
+    """The numbers of a report, and the prediction of its first photograph as a data URI of a thumbnail.
 
-    Cached by the file's time `modified`: the page is written again whenever one of many fits makes progress.
+    `modified`: modification time of the file. The result is cached, because the page is often written again.
     """
     page = report.read_text("utf-8")
     cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", page)

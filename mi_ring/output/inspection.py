@@ -1,4 +1,4 @@
-"""Is a capture usable, and what is wrong with it? A table, findings and a contact sheet."""
+"""Inspection of a capture: a table of its photographs, findings and a contact sheet."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ class Inspection:
     """The result of `inspect`."""
 
     text: str  #: the table of photographs and the findings
-    findings: list[str]  #: the problems to mend
+    findings: list[str]  #: the problems to correct
     page: Image.Image  #: the contact sheet
 
     def save(self, path: Path, field: str) -> None:
-        """Write the contact sheet as PNG. Raises InputError, about `field`, if it cannot be written."""
+        """Write the contact sheet as PNG. Raises InputError, which names the `field`, if this fails."""
         with writing(f"{path}: {field}"):
             path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, encoded_picture(self.page))
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Measure a capture. Empty masks are findings; the other findings are made as if they were not there."""
+    """Inspect a capture. Empty masks are findings and are ignored by the rest of the inspection."""
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
@@ -60,9 +60,9 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
         masks = "found by brightness, for the room was dark"
     else:
         masks = f"{given} of {len(rows)} photographs" + ("" if given else "; the start will be a guess")
-    mend = [f"To mend: {line}" for line in found] or ["Nothing to mend found."]
+    problems = [f"Problem: {line}" for line in found] or ["No problems found."]
     unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
     place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
     dark = capture.photographs.dark and capture.photographs.room is None
-    light = ["Light: photographs have none of their own; mi-ring fit --light auto finds one"] if dark else []
-    return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *light, *mend]), found, page)
+    light = ["Light: the photographs have no light of their own; mi-ring fit --light auto finds it"] if dark else []
+    return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *light, *problems]), found, page)

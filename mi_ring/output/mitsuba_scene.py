@@ -22,15 +22,15 @@ from mi_ring.system.files import write_file
 def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
     """The first photograph in a fit's scene.xml, and the light of the room.
 
-    Raises InputError if there is no such file, or if neither the photograph nor the room has a light.
+    Raises InputError if there is no scene.xml, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
     scene, shots = open_scene(run / "scene.xml")
     room = room_of(scene)
     if room is None and not shots[0].own_light.rgb.any():
-        raise InputError(f"{run}/scene.xml: a scene for Mitsuba takes the photographs' own light, of which there is "
-                         "none; give an OBJ or GLB file, and light it yourself")  # fmt: skip
+        raise InputError(f"{run}/scene.xml: a scene for Mitsuba needs the photographs' own light, and there is "
+                         "none; export OBJ or GLB and light it yourself")  # fmt: skip
     return shots[0], room
 
 

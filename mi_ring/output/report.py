@@ -1,7 +1,6 @@
-"""report.html: one self-contained page that shows whether to trust a fit."""
+"""report.html: a self-contained page that shows the quality of a fit."""
 
 import base64
-import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from skimage.registration import phase_cross_correlation
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
-from mi_ring.images import linear_to_srgb, to_bytes
+from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.metrics.image_errors import comparable
 from mi_ring.objects.fitted_object import FittedObject
@@ -37,12 +36,12 @@ REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
 TOGETHER = 4  # photographs that are drawn at once
 PICTURE = 480  # largest side of the pictures on the page [px]
 
-# From these values on the page says that something stands out.
-LOW_PSNR, LOW_IOU = 3.0, 0.9  # PSNR below the median of all photographs [dB]; overlap of prediction and mask
+# Thresholds of the findings.
+LOW_PSNR, LOW_IOU = 3.0, 0.9  # PSNR below the median of all photographs [dB]; IoU of prediction and mask
 UNEXPLAINED = 0.3  # share of the object's light; good fits end at 0.07 to 0.15
 FEW_ITERATIONS = 60
-SATURATED = 0.25  # share of the object's pixels; mi-ring check allows less, but in the median photograph
-SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph from the others, and of all photographs [px]
+SATURATED = 0.25  # share of the object's pixels, in one photograph
+SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph relative to the others, and of all photographs [px]
 
 
 @dataclass
@@ -55,7 +54,7 @@ class PhotographPanel:
     saturated: float  # share of the object's pixels
     shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
     pictures: dict[str, str]
-    held_out: bool = False  # of the fit; then the page does not say what is wrong with it
+    held_out: bool = False  # then the page has no findings about it
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
@@ -116,28 +115,28 @@ def fit_findings(
     rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
-    """Sentences about what stands out, each with what to do about it.
+    """Sentences about problems of a fit, each with advice.
 
-    `refined`: the fit's `summary`; `unexplained`: share of the object's light that is not as predicted.
+    `refined`: content of calibration.json. `unexplained`: share of the object's light that the fit does not predict.
     """
     found = []
     if iteration == iterations >= FEW_ITERATIONS and unexplained > UNEXPLAINED:
-        found.append(f"{unexplained:.0%} of the object's light is not as predicted: this surface is not to be trusted. "
-                     "Cameras, masks or lights are wrong; look at the contact sheet of mi-ring check.")  # fmt: skip
+        found.append(f"{unexplained:.0%} of the object's light is not as predicted: do not trust this surface. "
+                     "Cameras, masks or lights are wrong; see the contact sheet of mi-ring check.")  # fmt: skip
     if iteration == iterations < FEW_ITERATIONS:
-        found.append(f"The fit had {iterations} iterations, too few for a surface that is to be trusted.")
+        found.append(f"The fit had {iterations} iterations, too few for an accurate surface.")
     if iteration < iterations:
-        found.append(f"The fit ended early, at iteration {iteration} of {iterations}: go on with --resume.")
+        found.append(f"The fit ended early, at iteration {iteration} of {iterations}: continue it with --resume.")
 
     typical, scatter = middle([row.psnr for row in rows])
     limit = typical - max(LOW_PSNR, 3 * scatter)
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
-        found.append(f"{few}: far below the others' {typical:.1f} dB; look at the difference there. If a longer fit "
-                     "does not mend it, mend pose, light or mask, or leave the photograph out.")  # fmt: skip
+        found.append(f"{few}: far below the others' {typical:.1f} dB; see the difference there. If a longer fit "
+                     "does not help, correct pose, light or mask, or leave the photograph out.")  # fmt: skip
     covers = [(row.iou, row.name) for row in rows if row.iou is not None]
     if few := worst((iou, name, f"IoU {iou:.2f}") for iou, name in covers if iou < LOW_IOU):
-        found.append(f"{few}: prediction and mask do not cover the same; see with mi_ring.check whether mask "
-                     "and pose are right.")  # fmt: skip
+        found.append(f"{few}: prediction and mask do not overlap well; check mask and pose with "
+                     "mi-ring check.")  # fmt: skip
     if few := worst((-row.saturated, row.name, f"{row.saturated:.1%}") for row in rows if row.saturated > SATURATED):
         found.append(f"{few}: so much of the object is saturated; the fit only knows that it is at least this bright. "
                      "Expose less.")  # fmt: skip
@@ -148,12 +147,12 @@ def fit_findings(
         scatter = np.hypot(*scatter)
         if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(shifts))):
             found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx and cy "
-                         "or to_world) or masks seem off by as much or more. If cameras were measured, see that the "
-                         "first pixel's centre is (0.5, 0.5); else fit with --refine auto cameras.")  # fmt: skip
+                         "or to_world) or masks seem off by this shift or more. Measured cameras need the first "
+                         "pixel's centre at (0.5, 0.5); correct others with --refine auto cameras.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
-            found.append(f"{few} of the prediction: shifted as the others are not; mend the pose, or leave the "
+            found.append(f"{few} of the prediction, unlike the others; correct the pose, or leave the "
                          "photograph out.")  # fmt: skip
     if refined and (few := moved_far(refined["photographs"])):
         found.append(f"{few}: the fit has moved the camera much farther than the others': out of focus, or another "
@@ -187,7 +186,7 @@ class PredictedPhotograph(NamedTuple):
 
 
 def scale_of(result: FitResult, size: tuple[int, int]) -> int:
-    """How many times smaller photographs of this size are compared: as in the last stage of the fit."""
+    """The factor by which photographs of this size are reduced for the comparison, as in the last stage of the fit."""
     return -(-size[0] // result.width)
 
 
@@ -215,7 +214,7 @@ def panels_of(
 
 
 def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
-    """The row of photograph `k`, and its mean squared error in sRGB over the pixels that are `comparable`."""
+    """The panel of photograph `k`, and its mean squared error in sRGB over the `comparable` pixels."""
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
@@ -256,7 +255,7 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
 
 
 def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
-    """How far `photo` (H, W, 3) is right of and below `guess` [px], where `inside` (H, W); None if one is black."""
+    """The shift (right, down) of `photo` (H, W, 3) relative to `guess` within `inside` (H, W) [px]; None if black."""
     if not (photo.any() and guess.any() and inside.any()):
         return None
     rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]
@@ -268,12 +267,11 @@ def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[flo
 
 
 def data_uri(picture: np.ndarray) -> str:
-    """An (H, W) or (H, W, 3) picture in [0, 1] as a small WebP."""
+    """A picture (H, W) or (H, W, 3) in [0, 1] as the data URI of a small WebP."""
     image = Image.fromarray(to_bytes(picture))
     image.thumbnail((PICTURE, PICTURE))
-    buffer = io.BytesIO()
-    image.save(buffer, "WEBP", quality=85, method=1)  # faster, hardly larger
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+    content = encoded_picture(image, "WEBP", quality=85, method=1)  # method 1: faster, hardly larger
+    return "data:image/webp;base64," + base64.b64encode(content).decode()
 
 
 def loss_curve(result: FitResult) -> str:

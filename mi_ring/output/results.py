@@ -1,7 +1,6 @@
-"""The results of a fit: everything that is written into its folder."""
+"""Writes the results folder of a fit."""
 
 import contextlib
-import io
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.reduction import whole_mask
 from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml
 from mi_ring.errors import InputError
-from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes, write_image
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import calibration_panel, gltf, report
@@ -33,21 +32,21 @@ VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, 
 
 
 def default_folder(scene: Path) -> Path:
-    """Where the results of a scene go: out/<its name>. Raises InputError if those of another scene are there."""
+    """The default results folder of a scene, out/NAME. Raises InputError if it has results of another scene."""
     folder, other = Path("out") / scene_name(scene), None
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # there is none, or it says nothing of use
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # config.json is missing or damaged
         other = folder / read_json(folder / "config.json")["scene"]
     if other and other.is_file() and scene.is_file() and not other.samefile(scene):
-        raise InputError(f"{folder}: holds the results of another scene, {relative_to(Path(), other)}; say with --out "
-                         "where those of this one are to go")  # fmt: skip
+        raise InputError(f"{folder}: holds the results of another scene, {relative_to(Path(), other)}; give another "
+                         "folder with --out")  # fmt: skip
     return folder
 
 
 def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the folder and write config.json: the options, and the scene file relative to the folder.
+    """Make the results folder and write config.json: the options, and the path of the scene relative to the folder.
 
-    A folder that holds another result is moved aside, not overwritten. Raises InputError if the folder cannot be
-    written or holds the scene.
+    Without `resume`, a folder with other results is renamed, not overwritten. Raises InputError if the folder cannot be
+    written or contains the scene file.
     """
     if folder.resolve() in scene.resolve().parents:
         raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
@@ -55,28 +54,28 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """As `prepare_folder`, for a scene file that may be in the folder."""
+    """As `prepare_folder`, but the scene file may be in the folder."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for partial in folder.glob(".*.partial"):  # of a process that was killed: nobody else writes here
+        for partial in folder.glob(".*.partial"):  # left by a killed process: no other process writes here
             partial.unlink(missing_ok=True)
     options = options | {"scene": relative_to(folder, scene.resolve())}
     write_file(folder / "config.json", json.dumps(options, indent=2, default=str))
 
 
 def move_aside(folder: Path) -> None:
-    """Rename a folder to make room for other results."""
+    """Rename a folder, so that its name is free."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
 
 
 def save(folder: Path, result: FitResult) -> None:
-    """Write all results of a fit into a folder of its own. Earlier results there are moved aside.
+    """Write all results of a fit into a folder. A folder with earlier results is renamed first.
 
-    A capture from arrays is written as well: as the scene file capture/scene.xml in the folder.
+    A capture from arrays is written too, as capture/scene.xml in the folder.
     """
     capture = result.given
     ring_state(result.ring)  # raises for networks without a name before anything is moved
@@ -119,7 +118,7 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
-    """inputs.png: the start surface drawn over photographs, in green. Wrong masks or poses show at once."""
+    """inputs.png: photographs with the start surface in green. It shows wrong masks and poses."""
     some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
@@ -135,9 +134,7 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
             ImageDraw.Draw(picture).text((3, 2), capture.names[k], fill=(255, 255, 255))
             place = some.index(k)
             sheet.paste(picture, (place % columns * cell, line + place // columns * cell))
-    buffer = io.BytesIO()
-    sheet.save(buffer, "PNG")
-    write_file(path, buffer.getvalue())
+    write_file(path, encoded_picture(sheet))
 
 
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
@@ -188,10 +185,10 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
 
 
 def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
-    """The object as GLB for the report's viewer; None, with a printed line, if that fails."""
+    """The object as GLB for the viewer in the report. If that fails, prints why and returns None."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)
-    except Exception as error:  # whatever it is, the report is worth more
-        print(f"The report goes without a view of the object: {' '.join(str(error).split())}")
+    except Exception as error:  # the report must be written in any case
+        print(f"The report has no view of the object: {' '.join(str(error).split())}")
         return None

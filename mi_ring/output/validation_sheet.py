@@ -14,7 +14,7 @@ LEGEND = "Each photograph by its own exposure. Differences: red where photometri
 
 
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
-    """The row of one photograph, with its own exposure. In differences red means that photometric is brighter."""
+    """The row of one photograph, at its own exposure. Differences are red where photometric is brighter."""
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0
 

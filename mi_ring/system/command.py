@@ -1,4 +1,4 @@
-"""What all commands share: arguments parsed into a dataclass, user errors in one line, signals, exit status."""
+"""Shared by all commands: parsing of arguments, user errors in one line, signals, exit status."""
 
 import ast
 import contextlib
@@ -23,19 +23,19 @@ from mi_ring.errors import InputError
 from mi_ring.system import llvm
 
 MAX_MESSAGE = 800  #: characters of an error message
-#: Signals that end a command: from Ctrl-C, from `kill` and schedulers, from a terminal that is closed (not on Windows).
+#: Signals that end a command: Ctrl-C; `kill` and schedulers; a terminal that closes (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-REPEATED = 5.0  #: seconds in which a second SIGTERM or SIGHUP is taken for a copy of the first
+REPEATED = 5.0  #: a second SIGTERM or SIGHUP within this time is a copy of the first [s]
 
 
 def parse(
     config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
     description: str | None = None, needs_llvm: bool = True,
 ) -> Any:  # fmt: skip
-    """Fill a dataclass from the command line. Raises InputError, one line, for what cannot be understood.
+    """An instance of a dataclass, from the command line. Raises InputError for wrong arguments.
 
-    The help begins with `description`, by default the docstring of the dataclass. If the command `needs_llvm` and there
-    is none, that is an InputError, too; its help needs none.
+    The help begins with `description`, by default the docstring of the dataclass. With `needs_llvm`, also raises
+    InputError if there is no LLVM, but not for --help.
     """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
@@ -62,8 +62,8 @@ def require_utf8(name: str) -> None:
 def complaint_in(box: str) -> str:
     """The error message in the box that tyro prints, as one line.
 
-    The box holds a title, the message, and advice, separated by horizontal rules. Of the advice two parts are used:
-    options of similar spelling, and the help of the option. The box has no sides if the output is not UTF-8.
+    The box has a title, the message, and advice, separated by horizontal rules. Two parts of the advice are used:
+    options of similar spelling, and the help of the option. If the output is not UTF-8, the box has no sides.
     """
     if "│" in box:
         lines = [line.strip("│") for line in box.splitlines() if line.startswith("│")]
@@ -71,7 +71,7 @@ def complaint_in(box: str) -> str:
         lines = [line for line in box.splitlines() if line.strip()][2:]  # after the title and its rule
     groups = itertools.groupby(lines, lambda line: set(line.strip()) in ({"─"}, {"-"}))
     parts = [list(group) for is_rule, group in groups if not is_rule] or [[]]
-    if parts[0] and parts[0][0].strip().startswith("Missing from "):  # their names are indented, their help is more so
+    if parts[0] and parts[0][0].strip().startswith("Missing from "):  # names are indented, and help texts further
         indents = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
         names = [line.split()[0] for line, indent in zip(parts[0][1:], indents) if indent == min(indents)]
         return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
@@ -83,10 +83,7 @@ def complaint_in(box: str) -> str:
 
 
 def plain(complaint: str, help_text: str) -> str:
-    """An error message of tyro, reworded like ours: the option, what was found, what is needed.
-
-    `help_text` is the help of the option.
-    """
+    """An error message of tyro in our form: option, value found, values allowed. `help_text`: help of the option."""
     if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
         choices = wrong[3].replace("'", "").split(", ")
         alike = difflib.get_close_matches(wrong[1], choices)
@@ -96,7 +93,7 @@ def plain(complaint: str, help_text: str) -> str:
         has_none = "has no value" if wrong[1].startswith("--") else "is missing; --help tells more"
         return f"{name_in_help(wrong[1])}: {has_none if wrong[2] == '1' else f'must be {wrong[2]} values'}"
     union = r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]"
-    if wrong := re.match(union, complaint):  # without the reasons why each type does not fit
+    if wrong := re.match(union, complaint):  # tyro's reasons for each type are left out
         kinds = re.sub("[{}]", "", wrong[2].replace("{None}|", "")).replace(",", "|")
         return "{}: is {}; must be {}".format(wrong[1], wrong[3].replace("'", ""), kinds)
     unread = r"Error parsing (--\S+): (?:Could not find valid parse|Failed to parse)[^\[]*(\[.*\])?"
@@ -123,13 +120,13 @@ def scene_name(scene: Path) -> str:
 
 
 def one_line(message: str) -> str:
-    """A message without line breaks; if it is longer than `MAX_MESSAGE`, without its middle."""
+    """A message without line breaks. The middle of one that is longer than `MAX_MESSAGE` is left out."""
     words = " ".join(message.split())
     return words if len(words) <= MAX_MESSAGE else f"{words[: MAX_MESSAGE // 2]} … {words[-MAX_MESSAGE // 2 :]}"
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal of `SIGNALS` has arrived; the argument is its number."""
+    """One of the `SIGNALS` has arrived. The argument is its number."""
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
@@ -141,27 +138,27 @@ _received: list[tuple[int, float]] = []  #: signals within `resumable`: number, 
 
 
 def interrupted() -> bool:
-    """Has a signal arrived within `resumable`? Native code may have turned it into another error."""
+    """Whether a signal has arrived within `resumable`. Native code may have turned it into another error."""
     return bool(_received)
 
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command resumes; it prints that when a signal of `SIGNALS` arrives.
+    """A context manager for work that the same command can resume. On one of the `SIGNALS` it prints this.
 
-    Raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
+    It raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
     """
 
     def receive(number: int, frame: object) -> None:
         before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
         _received.append((number, now))
-        # Shells, schedulers and the kernel may send the same signal several times; only Ctrl-C means it each time.
+        # Shells, schedulers and the kernel may send a signal several times. Each Ctrl-C is meant.
         if number == signal.SIGINT or now - before > REPEATED:
             raise Interrupted(number)
 
     handled = []
     if threading.current_thread() is threading.main_thread():
-        handled = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # as under nohup
+        handled = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # nohup ignores SIGHUP
     before = {number: signal.signal(number, receive) for number in handled}
     try:
         yield
@@ -170,7 +167,7 @@ def resumable() -> Iterator[None]:
             raise
         with contextlib.suppress(OSError):  # the terminal may be closed
             sys.stdout.flush()
-            print("interrupted; the same command goes on", file=sys.stderr, flush=True)
+            print("interrupted; to continue, give the same command again", file=sys.stderr, flush=True)
         raise Interrupted(_received[0][0] if _received else signal.SIGINT) from stop
     finally:
         for number, handler in before.items():
@@ -179,7 +176,7 @@ def resumable() -> Iterator[None]:
 
 
 def make_callable(module: str, function: Callable) -> None:
-    """Let `mi_ring.evaluate(…)` call a function, although `mi_ring.evaluate` is the module of a command."""
+    """Make the module of a command callable, so that `mi_ring.evaluate(…)` calls the function."""
 
     class CallableModule(ModuleType):
         __call__ = staticmethod(function)
@@ -205,7 +202,7 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except (InputError, OSError) as error:
-        # An OSError with a file name is a user error: no permission, a folder that was removed. Others are bugs.
+        # An OSError with a file name is a user error: no permission, a removed folder. Others are bugs.
         if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
             raise
         message = str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"

@@ -21,12 +21,12 @@ from mi_ring.errors import InputError
 
 SEAL = b"blake2b "  #: begins the comment of a zip file that holds its checksum
 DIGEST = 32  #: hexadecimal digits of the checksum
-END, COMMENT = b"PK\x05\x06", 20  #: how the last record of a zip file begins; where in it the comment's length is
+END, COMMENT = b"PK\x05\x06", 20  #: of the last record of a zip file: signature, and offset of the comment's length
 
 
 @contextlib.contextmanager
 def writing(what: Path | str) -> Iterator[None]:
-    """Turns an OSError, for instance of a full disk, into an InputError that begins with `what`."""
+    """A context manager that turns an OSError, such as a full disk, into an InputError that begins with `what`."""
     try:
         yield
     except OSError as error:
@@ -35,7 +35,7 @@ def writing(what: Path | str) -> Iterator[None]:
 
 
 def require_place(path: Path, field: str = "") -> None:
-    """Make the folder of a file before the long work for it. Raises InputError if nothing can be written there."""
+    """Make the folder of a file. Raises InputError if it is not writable. Call it before long work for the file."""
     with writing(f"{path}: {field}" if field else path):
         path.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path.parent).close()
@@ -49,14 +49,14 @@ def relative_to(folder: Path, path: Path) -> str:
 
 
 def partial_path(path: Path) -> Path:
-    """The temporary file, beside `path`, to write until it is complete. No other process has this name."""
+    """A temporary file beside `path`, for the incomplete content. No other process uses this name."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
 def write_file(path: Path, content: bytes | memoryview | str, durable: bool = False, keep: Path | None = None) -> None:
     """Write a file so that it is complete or absent. Raises InputError if it cannot be written.
 
-    `durable`: also after a power cut; this is slower. `keep`: where to move the old file of this name.
+    `durable`: it survives a power failure; slower. `keep`: new path for the old file of this name.
     """
     partial = partial_path(path)
     with writing(path):
@@ -80,7 +80,7 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """`torch.save` by `write_file`, with a checksum by which `read_state` notices any changed bit."""
+    """`torch.save` with `write_file` and a checksum, by which `read_state` detects damage."""
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
     seal(buffer)
@@ -97,7 +97,7 @@ def seal(archive: io.BytesIO) -> None:
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Does a zip file end in the checksum that `seal` wrote, and does it hold?"""
+    """Whether a zip file ends with the checksum of `seal`, and it is right."""
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 
@@ -116,21 +116,21 @@ def read_json(path: Path) -> Any:
 
 
 def quoted(content: bytes) -> list[str]:
-    """The quoted strings of an XML file, among them the names of all files that it refers to."""
+    """The quoted strings of an XML file. They include the names of all files that it refers to."""
     strings = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
     return [(double or single).decode(errors="replace") for double, single in strings]
 
 
 @contextlib.contextmanager
 def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
-    """A context manager that locks a folder. If another process has the lock, raise InputError or `wait` for it.
+    """A context manager that locks a folder. If another process has the lock, it raises InputError or `wait`s.
 
-    The lock file is beside the folder, so that the folder may be moved. The lock ends with the process.
+    The lock file is beside the folder, so the folder may be moved. The lock ends with the process.
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
     if place.is_file():
-        raise InputError(f"{folder}: {field}: is a file; give a folder, which is made if it is not there")
+        raise InputError(f"{folder}: {field}: is a file; give a new or existing folder")
     require_place(place, field)  # otherwise filelock would report that another process holds the lock
     with writing(f"{folder}: {field}"):
         lock = filelock.FileLock(file)
@@ -141,23 +141,23 @@ def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[N
                 raise InputError(
                     f"{folder}: {field}: another process is writing there; wait for it, or give another folder"
                 ) from None
-            print(f"waiting for {folder}, which another process makes", flush=True)
+            print(f"waiting for {folder}: another process writes it", flush=True)
             acquired = lock.acquire()
     with acquired:
         try:
             yield
         finally:
-            # A process that waits has opened this file; it must not lock a file that is removed. Windows cannot remove
-            # an open file; there filelock removes it.
+            # A waiting process has opened this file, and must not lock a removed file. Windows cannot remove an open
+            # file; there, filelock removes it.
             if os.name == "posix" and not wait:
                 file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder`. At the end it is renamed to `folder`, which must then be missing or empty.
+    """A context manager with a temporary folder that is renamed to `folder` at the end, and removed after an error.
 
-    After an error nothing is left of it. Raises InputError if something in it cannot be written.
+    `folder` must then be missing or empty. Raises InputError if something cannot be written.
     """
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Which GPU a process of a distributed fit uses. It must be chosen before anything initialises CUDA."""
+"""Chooses the GPU of each process of a distributed fit. This must happen before anything initialises CUDA."""
 
 import os
 import sys
@@ -8,9 +8,9 @@ OWN = "MI_RING_OWN_GPU"  #: environment variable: 1 if no other process of the s
 
 
 def choose_gpu() -> None:
-    """Let each process that `torchrun` has started on this machine see one GPU only, by its rank.
+    """Let each process that `torchrun` started on this machine see only one GPU, chosen by its rank.
 
-    This applies to mi_ring's own command, not to other programs that import mi_ring.
+    Only for mi_ring's own command, not for other programs that import mi_ring.
     """
     if not any(word in ("mi_ring", "mi_ring.fit") or Path(word).stem == "mi-ring" for word in sys.orig_argv):
         return

@@ -1,12 +1,12 @@
 """Finds the LLVM library that Dr.Jit compiles with. Run as a script, it downloads one.
 
-Dr.Jit chooses its LLVM once, at import, and takes the first that it finds. LLVM 15 and 16 load without complaint, but
-abort the process at the first kernel; Debian 12 installs LLVM 14. So `mi_ring` chooses before Dr.Jit does (`prepare`)
-and reports what is wrong with the result (`missing`).
+Dr.Jit takes the first LLVM that it finds, at import. LLVM 15 and 16 load without an error, but abort the process at the
+first kernel; Debian 12 installs LLVM 14. So `prepare` chooses an LLVM before Dr.Jit does, and `missing` reports what is
+wrong with it.
 
-`python mi_ring/system/llvm.py` (part of `make setup`) makes an LLVM available: if the machine has no usable one, it
-unpacks Debian or Ubuntu packages beside the Python environment. This needs no root, changes nothing in the system, and
-imports only the standard library.
+`python mi_ring/system/llvm.py` (part of `make setup`) makes an LLVM available. If the machine has no usable one, it
+unpacks Debian or Ubuntu packages beside the Python environment. It needs no root rights, does not change the system,
+and imports only the standard library.
 """
 
 import ctypes
@@ -24,9 +24,9 @@ from pathlib import Path
 OLDEST = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 PRIVATE = Path(sys.prefix) / "llvm"  # the copy that belongs to this environment
-DEBIAN_VERSIONS = (19, 18, 17, *range(20, 30))  # that Debian and Ubuntu have packages of, the best tested first
+DEBIAN_VERSIONS = (19, 18, 17, *range(20, 30))  # of packages of Debian and Ubuntu, the best tested first
 
-# Full names only: libLLVMSPIRVLib.so.19.1 and a compiler's libLLVM-18-rust-*.so are other libraries. Last: Homebrew.
+# Full names: libLLVMSPIRVLib.so.19.1 and libLLVM-18-rust-*.so are other libraries. The last pattern is Homebrew's.
 _NAME = re.compile(
     r".*/(?:libLLVM-(\d+)[\d.]*\.so[\d.]*|libLLVM\.so\.(\d+)[\d.]*"
     r"|llvm[@\d]*/(\d+)[^/]*/lib/libLLVM\.dylib)"
@@ -36,9 +36,9 @@ _too_late = False  # Dr.Jit was imported before `prepare`
 
 
 def prepare() -> None:
-    """Choose Dr.Jit's LLVM by the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
+    """Choose Dr.Jit's LLVM with the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
 
-    It keeps a value that the user has set, and sets nothing if no library is usable; see `missing`.
+    It keeps a value of the user. If no library is usable, it sets nothing; see `missing`.
     """
     global _too_late
     _too_late = "drjit" in sys.modules
@@ -50,9 +50,9 @@ def prepare() -> None:
 
 
 def missing() -> str | None:
-    """What Mitsuba's `llvm_*` variants lack on this machine and how to get it; None if they can run.
+    """What Mitsuba's variants `llvm_*` need and this machine lacks, with advice; None if they can run.
 
-    Call it after `prepare`. Without libatomic, Dr.Jit cannot even be imported.
+    Call it after `prepare`. Without libatomic, Dr.Jit cannot be imported.
     """
     if not has_atomic():
         return f"Dr.Jit needs libatomic.so.1, which this machine lacks. {cure('libatomic1')}"
@@ -84,7 +84,7 @@ def missing() -> str | None:
 
 
 def cure(package: str, more: str = "") -> str:
-    """How to install the library of a Debian package on this machine, in one sentence that ends in `more`."""
+    """A sentence that says how to install the library of a Debian package on this machine. It ends with `more`."""
     installers = {"darwin": "brew install llvm", "win32": "winget install LLVM.LLVM"}
     if sys.platform in installers:
         return f"Run `{installers[sys.platform]}`{more}."
@@ -138,14 +138,14 @@ def loads(path: str | Path) -> bool:
 
 
 def has_atomic() -> bool:
-    """Can libatomic be loaded? Dr.Jit is linked with it on Linux, but slim containers do not have it."""
+    """Whether libatomic can be loaded. Dr.Jit needs it on Linux; small containers do not have it."""
     return sys.platform != "linux" or loads("libatomic.so.1")
 
 
 def preload(folder: Path) -> None:
-    """Load the shared libraries unpacked in `folder`, except LLVM, in an order that satisfies their dependencies.
+    """Load the shared libraries in `folder`, except LLVM, each after its dependencies.
 
-    The dynamic loader does not search this folder, but it resolves a dependency by a library that is already loaded.
+    The dynamic loader does not search this folder, but it accepts libraries that are already loaded.
     """
     waiting = [path for path in folder.rglob("*.so*") if path.is_file() and not path.name.startswith("libLLVM")]
     while waiting != (left := [path for path in waiting if not loads(path)]):
@@ -153,9 +153,9 @@ def preload(folder: Path) -> None:
 
 
 def install(target: Path = PRIVATE) -> str:
-    """Make a usable LLVM and libatomic available. Returns one line that says where they are.
+    """Make LLVM and libatomic available. Returns one line that says where they are.
 
-    If the machine lacks one of them, the folder `target` is filled by `unpack`. Raises RuntimeError if that fails.
+    If one is missing, packages are unpacked into the folder `target`. Raises RuntimeError if that fails.
     """
     preload(target)
     path, packages = os.environ.get(VARIABLE) or find(), []
@@ -172,11 +172,11 @@ def install(target: Path = PRIVATE) -> str:
 
 
 def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
-    """Unpack Debian or Ubuntu packages into the folder `target`, replacing it. Returns the packages' names.
+    """Unpack Debian or Ubuntu packages into the folder `target`, which is replaced. Returns the packages' names.
 
-    `alternatives` are lists of packages. The first list that the archive has is taken, with the dependencies that this
-    machine lacks; packages that the machine has are left out. It needs no root: apt keeps its lists and its cache in a
-    temporary folder. `target` appears complete or not at all. Raises RuntimeError if there is no apt or if it fails.
+    `alternatives`: lists of packages. The first list that the archive has is used, with its dependencies; installed
+    packages are left out. No root rights are needed: apt's lists and cache are in a temporary folder. `target` is
+    complete or absent. Raises RuntimeError if there is no apt or if it fails.
     """
     if not shutil.which("apt-get"):
         raise RuntimeError(
@@ -188,12 +188,12 @@ def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
         folder = Path(name).resolve()
         for part in ("state/lists/partial", "cache/archives/partial", "debs", "tree"):
             (folder / part).mkdir(parents=True)
-        # As root: apt's own sandbox user could not write here, and apt would warn about it at length.
+        # Sandbox user root: apt's own sandbox user cannot write here.
         apt = [
             "apt-get", "-qq", f"-oDir::State={folder}/state", "-oDir::State::status=/var/lib/dpkg/status",
             f"-oDir::Cache={folder}/cache", "-oAPT::Sandbox::User=root", "-oAcquire::Languages=none",
         ]  # fmt: skip
-        # An unreachable third-party source fails here and does no harm. Without the archive, the next step fails.
+        # An unreachable third-party source fails here, without harm. Without the archive, the next step fails.
         subprocess.run([*apt, "update"], check=False)
         for wanted in alternatives:
             plan = subprocess.run(

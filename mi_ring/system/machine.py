@@ -21,8 +21,8 @@ from mi_ring.system import llvm
 Thing = TypeVar("Thing")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-EXR_THREADS = 2  #: with fewer, Mitsuba waits forever when it reads or writes an EXR
-_exr_lock = threading.Lock()  # held by who changes the number of threads for an EXR
+EXR_THREADS = 2  #: with fewer threads, Mitsuba waits forever when it reads or writes an EXR
+_exr_lock = threading.Lock()  # for changes of the number of threads by `exr_threads`
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 LARGE_ARRAY = 2**25  #: bytes from which freed arrays go back to the system; the most that mallopt allows
 
@@ -33,9 +33,9 @@ def device() -> torch.device:
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Are matrix products faster in bfloat16 than in float32? Most processors emulate bfloat16.
+    """Whether matrix products are faster in bfloat16 than in float32. Most processors emulate bfloat16.
 
-    It is decided by the processor's features, not by a measurement, so that fits can be repeated exactly.
+    The features of the processor decide, not a measurement, so that fits can be repeated exactly.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -52,14 +52,14 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
-    """A context manager in which matrix products have this precision; `auto` is the faster one."""
+    """A context manager for matrix products in this precision. `auto`: the faster one."""
     if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
         return lambda: torch.autocast(device.type, torch.bfloat16)
     return contextlib.nullcontext
 
 
 def set_variant(variant: str) -> str:
-    """Switch Mitsuba to a variant and return its name. Without a usable GPU, `llvm_ad_rgb` replaces CUDA variants.
+    """Switch Mitsuba to a variant and return its name. Without a usable GPU, a CUDA variant becomes `llvm_ad_rgb`.
 
     Raises InputError if the variant needs LLVM and there is none.
     """
@@ -76,7 +76,7 @@ def set_variant(variant: str) -> str:
             except RuntimeError as error:
                 reason = " ".join(str(error).split())
     if reason:
-        print(f"--variant {variant}: no GPU to use ({reason}); going on with llvm_ad_rgb, on the processor")
+        print(f"--variant {variant}: no usable GPU ({reason}); using llvm_ad_rgb on the processor")
         variant = "llvm_ad_rgb"
     if variant.startswith("llvm") and (problem := llvm.missing()):
         raise InputError(problem)
@@ -85,7 +85,7 @@ def set_variant(variant: str) -> str:
 
 
 def cores() -> int:
-    """The number of processor cores that this process may use, by its affinity and its container's quota."""
+    """The number of processor cores that this process may use: by its affinity and its container's quota."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
@@ -100,9 +100,9 @@ def in_threads(function: Callable[..., Result], *things: Iterable, most: int | N
 def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """`second(thing, first(thing))` of each thing. Another thread runs `second` during the next thing's `first`.
+    """`second(thing, first(thing))` of each thing. `second` runs in another thread, during the next `first`.
 
-    If Dr.Jit has one thread, all runs in this thread: `exr_threads` must not change their number during rendering.
+    If Dr.Jit has one thread, both run in this thread: `exr_threads` must not change the number during rendering.
     """
     if dr.thread_count() < EXR_THREADS:
         for thing in things:
@@ -120,7 +120,7 @@ def pipelined(
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """The result of a long native call, which runs in another thread so that Ctrl-C has an effect at once."""
+    """The result of a long native call. It runs in another thread, so that Ctrl-C works at once."""
     future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
     while not wait([future], 0.1).done:
         pass
@@ -130,7 +130,7 @@ def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) 
 def cpu_quota(root: Path) -> float:
     """The number of cores that the control groups below `root` allow this process; infinite without a limit.
 
-    The groups that contain its group limit it, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
+    Parent groups limit it too: https://docs.kernel.org/admin-guide/cgroup-v2.html
     """
     groups = [root]
     with contextlib.suppress(OSError):
@@ -153,27 +153,22 @@ def set_threads(count: int = 0) -> None:
     dr.set_thread_count(count or cores())
 
 
-def processor() -> str:
-    """The model of the processor and the number of `cores`."""
+def computer() -> str:
+    """The GPU, if the current variant uses one, the model of the processor and the number of `cores`."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {cores()} core{'s' * (cores() > 1)}"
-
-
-def computer() -> str:
-    """The GPU, if the current variant computes on one, and the processor."""
     gpu = f"{torch.cuda.get_device_name()}, " if device().type == "cuda" else ""
-    return gpu + processor()
+    return f"{gpu}{model}, {cores()} core{'s' * (cores() > 1)}"
 
 
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
     """A context manager in which torch and Dr.Jit use this number of threads. 0: all `cores`.
 
-    Only one thread is deterministic: the order of parallel sums depends on which thread finishes first.
+    Only one thread is deterministic: the order of parallel sums varies.
     """
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(count)
@@ -186,7 +181,7 @@ def threads_of(count: int = 0) -> Iterator[None]:
 
 @contextlib.contextmanager
 def exr_threads() -> Iterator[None]:
-    """A context manager in which Dr.Jit has the `EXR_THREADS` threads that Mitsuba needs for an EXR, or more."""
+    """A context manager in which Dr.Jit has at least `EXR_THREADS` threads, for reading or writing an EXR."""
     with _exr_lock:  # another thread may have raised the number for a moment
         before = dr.thread_count()
     if before >= EXR_THREADS:
@@ -216,6 +211,6 @@ def keep_memory() -> None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system, which may be half of the memory of a fit."""
+    """Return freed memory to the system. It may be half of the memory of a fit."""
     dr.flush_malloc_cache()
     glibc("malloc_trim")(0)

@@ -1,4 +1,4 @@
-"""Packages that cannot be installed on every machine: they are imported when they are needed."""
+"""Packages that are not available for every machine. They are imported when they are needed."""
 
 import contextlib
 import importlib.util
@@ -12,14 +12,14 @@ from mi_ring.errors import InputError
 
 
 def installed(package: str) -> bool:
-    """Can this package be imported?"""
+    """Whether this package can be imported."""
     return importlib.util.find_spec(package) is not None
 
 
 def need(package: str, what: str, distribution: str | None = None) -> ModuleType:
-    """Import a package. Raises InputError, which begins with `what`, its use, if it is not installed.
+    """Import a package. If it is not installed, raises InputError, which begins with its use, `what`.
 
-    `distribution`: the name to install it by, if that differs.
+    `distribution`: its name for pip, if that differs.
     """
     try:
         with keeping_handlers():  # pycolmap installs its own
@@ -28,13 +28,12 @@ def need(package: str, what: str, distribution: str | None = None) -> ModuleType
         if error.name != package:
             raise
         raise InputError(f"{what}: needs the package {package}, which is not installed; try `pip install "
-                         f"{distribution or package}` (for some systems, Linux on ARM for one, there is none "
-                         "ready-made)") from error  # fmt: skip
+                         f"{distribution or package}`; it is not built for every system") from error  # fmt: skip
 
 
 @contextlib.contextmanager
 def keeping_handlers() -> Iterator[None]:
-    """Restore the handler of SIGTERM afterwards: some libraries replace it."""
+    """A context manager that restores the handler of SIGTERM, which some libraries replace."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Progress bars, and output that survives readers which stop reading."""
+"""Progress bars, and output that tolerates a closed terminal or pipe."""
 
 import contextlib
 import errno
@@ -18,7 +18,7 @@ DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and 
 
 @contextlib.contextmanager
 def tolerating_closed_output() -> Iterator[None]:
-    """A context manager that drops output that cannot be written: after `| head`, or if the terminal is closed."""
+    """A context manager that drops output which cannot be written, such as after `| head` or in a closed terminal."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and TolerantStream(stream) for stream in before)  # None: there is no console
     try:
@@ -34,7 +34,7 @@ def tolerating_closed_output() -> Iterator[None]:
 
 
 class TolerantStream:
-    """A text stream that drops what cannot be written, and everything after its reader is gone."""
+    """A text stream that drops text which cannot be written, and all text after its reader is gone."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -97,7 +97,7 @@ def progress(
 ) -> tqdm:
     """Iterate over `things` and show the progress; `options` are those of tqdm.
 
-    A terminal shows a bar. A log gets two lines a minute, and none for what takes less than two seconds.
+    A terminal shows a bar. A log gets a line every 30 seconds, and none for less than two seconds of work.
     """
     kind = tqdm
     if not getattr(sys.stderr, "isatty", bool)():
