@@ -25,6 +25,10 @@ OPTIONAL = {
 class DoctorConfig:
     """Say what mi_ring lacks on this machine and how to get it. The exit status is 1 if a fit cannot run."""
 
+    empty_cache: bool = False
+    """Remove the reduced photographs from the cache folder. Use it to get disk space back. The next fit makes those it
+    needs again."""
+
 
 class Finding(NamedTuple):
     """A line of the output."""
@@ -57,12 +61,15 @@ def findings() -> Iterator[Finding]:
 
 
 def computing() -> Iterator[Finding]:
-    """The processor and the GPU."""
+    """The cache folder, the processor and the GPU."""
     import drjit as dr
     import torch
 
+    from mi_ring.system import cache
     from mi_ring.system.machine import cores, has_fast_bfloat16
 
+    used = f"{cache.size() / 2**20:.0f} MiB, of at most {cache.LIMIT / 2**30:.0f} GiB, in {cache.cache_folder()}"
+    yield Finding("ok", "cache", f"{used}; to empty it: mi-ring doctor --empty-cache")
     precision = "bfloat16" if has_fast_bfloat16(torch.device("cpu")) else "float32"
     yield Finding("ok", "processor", f"{cores()} cores; the networks compute in {precision}")
     if torch.cuda.is_available() and dr.has_backend(dr.JitBackend.CUDA):
@@ -73,7 +80,10 @@ def computing() -> Iterator[Finding]:
 
 def main(arguments: Sequence[str]) -> int:
     """The command. Returns its exit status: 1 if a fit cannot run."""
-    command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False)
+    if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
+        from mi_ring.system import cache  # which imports torch
+
+        cache.empty()
     found = list(findings())
     for mark, what, text in found:
         print(f"{mark:8} {what:11} {text}")

@@ -167,7 +167,7 @@ def read_image(path: Path) -> np.ndarray:
             pixels = np.array(mi.Bitmap(str(path)), copy=True)
     elif suffix in (".jpg", ".jpeg"):  # Mitsuba accepts truncated files and fills them with grey
         with open_image(path) as image:
-            pixels = np.array(image if image.mode == "L" else image.convert("RGB"))
+            pixels = np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))  # no copy: it is large
     else:
         with open_image(path):  # Pillow checks it, but reduces 16 bits to 8; Mitsuba does not
             pixels = np.array(mi.Bitmap(str(path)), copy=True)

@@ -42,8 +42,9 @@ def decode(
     lookup = value if linear else srgb_to_linear(value)
     lookup = lookup if contrast == 1 else contrasted(lookup, 1 / contrast).astype(np.float32)
     lookup = lookup if gamma == 1 else np.maximum(lookup, 0) ** np.float32(1 / gamma)
-    saturated = value >= saturation
-    return (lookup, saturated) if image.dtype == np.float32 else (lookup[image], saturated[image])
+    if image.dtype == np.float32:
+        return lookup, value >= saturation
+    return lookup[image], image >= np.searchsorted(value, np.float32(saturation))
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:

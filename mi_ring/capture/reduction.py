@@ -204,7 +204,7 @@ def reduce(capture: Capture, k: int, window: Window) -> Reduced:
         linear, over = decode(part, is_linear(shot.encoding, part), shot.saturation, shot.response.gamma,
                               shot.response.contrast)  # fmt: skip
         radiance.append(averaged(linear, blocks))
-        clipped.append(averaged(over, blocks) > 0)
+        clipped.append(averaged(over, blocks) > 0 if over.any() else np.zeros(radiance[-1].shape, bool))
     kind = np.float16 if image.dtype == np.uint8 else np.float32
     rgb = resized(np.concatenate(radiance), window).astype(kind)
     over = resized(np.concatenate(clipped).astype(np.float32), window) > 0
