@@ -56,7 +56,7 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
     layout = Layout(calibration)
     if not layout.count:
         return {}
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     colours, silhouettes = Equations(layout.count), Equations(layout.count)
     for index in problem.capture.together(problem.fitted):
         scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)

@@ -10,7 +10,7 @@ from torch import Tensor
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.refinement import START
-from mi_ring.fitting.schedule import Rate, Stepper
+from mi_ring.fitting.schedule import Rate
 
 RATE = Rate(0.5, 0.1, START)  #: share of a comparison by which an estimate moves
 PULL = 0.01  #: pull toward what the scene says, relative to this share
@@ -22,16 +22,14 @@ ENOUGH = 30  #: pixels
 class ExposureSolver(torch.optim.Optimizer):
     """Steps of the photographs of the last iteration: `look` at it, then `step`."""
 
+    rate = RATE
+
     def __init__(self, calibration: Calibration, name: str) -> None:
         """`name`: power or gain."""
         self.tensor, self.width = getattr(calibration, name), calibration.widths[name]
         super().__init__([{"params": [self.tensor]}], {"lr": RATE.initial})
         #: photographs with the logarithm (3,) of observed by predicted brightness, NaN of colours without pixels
         self.seen: list[tuple[int, Tensor]] = []
-
-    def stepper(self) -> Stepper:
-        """With its rate."""
-        return Stepper(self, [RATE])
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.grabcut import grabcut, overlap
 from mi_ring.fitting.model import Model
-from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import prediction
@@ -28,13 +27,13 @@ BRIGHTNESS = 0.25  #: linear brightness of the object in these pictures
 Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduced size, by photograph
 
 
-def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Renderer, level: int) -> Masks:
+def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
     """New masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
 
-    `level`: of the surface.
+    `exposure`: mean radiance of the object. `level`: of the surface.
     """
     capture = model.calibrated(capture)
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     places: dict[tuple, list[int]] = {}
     for k, shot in enumerate(capture.shots):
         places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
@@ -44,7 +43,7 @@ def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Rende
         scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
-        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / problem.exposure)))
+        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / exposure)))
         background = np.zeros(picture.shape[:2], bool)
         if seen.valid is not None:
             background |= ~seen.valid.numpy().any(0)

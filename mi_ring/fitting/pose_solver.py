@@ -16,7 +16,7 @@ from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
-from mi_ring.fitting.schedule import Rate, Stepper
+from mi_ring.fitting.schedule import Rate
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.images import blur
 
@@ -80,10 +80,6 @@ class PoseSolver(torch.optim.Optimizer):
         super().__init__([{"params": [calibration.turn, calibration.move]}], {"lr": INITIAL})
         self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
-
-    def stepper(self) -> Stepper:
-        """With its rate."""
-        return Stepper(self, [self.rate])
 
     def look(self, it: Iteration) -> None:
         """Remember the photographs of an iteration and the curvature of its loss."""

@@ -40,6 +40,7 @@ class Stepper(NamedTuple):
 
     optimizer: torch.optim.Optimizer
     rates: Sequence[Rate]
+    evaluates: bool = False  #: Does its `step` take a function that evaluates the loss again, as L-BFGS does?
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,6 @@ class Schedule:
     def final_level(self) -> int:
         """Level of the icosphere in the last stage."""
         return self.stages[-1].level
-
-    def surface_fixed(self, iteration: int) -> bool:
-        """Is the surface fixed in an iteration, counted from 0?"""
-        last = self.stages[-1]
-        return last.settles and last.first <= iteration < last.last
 
     def masks_due(self, iteration: int) -> bool:
         """Are masks to be refined before an iteration, counted from 0?"""

@@ -171,7 +171,7 @@ def resume_hint(folder: Path) -> Iterator[None]:
 
 def write_inputs(fit: Fit, folder: Path) -> None:
     """inputs.png: the start surface drawn over the photographs."""
-    results.write_inputs(folder / "inputs.png", fit.problem.capture, fit.renderer.showing(fit.model, INPUTS_LEVEL))
+    results.write_inputs(folder / "inputs.png", fit.problem.capture, fit.renderer.show(fit.model, INPUTS_LEVEL))
 
 
 def start_of(fit: Fit) -> str:

@@ -29,7 +29,7 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
     Each photograph is compared at its best exposure. `level`: of the surface.
     """
     capture, shares = model.calibrated(problem.capture), []
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
         shot = capture.shots[k]
         scale = -(-shot.size[0] // COMPARED_WIDTH)
