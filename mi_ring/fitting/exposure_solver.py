@@ -52,7 +52,7 @@ class ExposureSolver(torch.optim.Optimizer):
                 observed, predicted = both[:, compared[:, colour], colour]
                 if len(observed) >= ENOUGH:
                     brighter[n, colour] = (observed / predicted).log().median()
-        brighter = it.batch.gathered(brighter)
+        brighter = it.batch.share.gathered(brighter)
         several = (~brighter.isnan()).sum(0) >= 2  # in each colour
         mean = torch.where(several, brighter.nanmean(0), torch.nan)
         found = zip(it.batch.all_photographs.tolist(), brighter - mean)

@@ -132,8 +132,8 @@ class Fit(Renamed):
 
     def context(self) -> Context:
         """What terms and solvers may know at this iteration."""
-        config, problem = self.problem.config, self.problem
-        return Context(config, self.capture, self.model, self.schedule, problem.exposure, problem.lighting.plain > 0,
+        config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
+        return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
     def refine_masks(self) -> None:

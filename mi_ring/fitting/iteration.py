@@ -77,5 +77,5 @@ class Iteration(renamed.Renamed):
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]
         error = torch.where(self.observation.clipped[pixels], error.clamp(max=0), error)
-        wrong, light = self.batch.total(torch.stack([error.abs().sum(), self.observation.rgb[pixels].sum()]))
+        wrong, light = self.batch.share.sum(torch.stack([error.abs().sum(), self.observation.rgb[pixels].sum()]))
         return float(wrong / light)

@@ -31,7 +31,7 @@ BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.1  #: the fewest lamps are chosen whose error is at most this factor of the least
-PLAIN = 1.2  #: one material at first is chosen if its error is at most this factor of that of a varying one
+ONE_MATERIAL = 1.2  #: one material at first is chosen if its error is below this factor of that of a varying one
 LOOSE = 0.35  #: progress at which one material begins to vary
 FAINT = 0.1  #: least initial strength of a lamp, relative to the first
 ROWS = 16  #: of the map of directions in which lamps are searched
@@ -70,7 +70,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     if math.isinf(trials.error(found)):
         raise trials.failures[-1]
     if found.kind != "capture":
-        found = trials.plain(found)
+        found = trials.with_material(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
@@ -151,12 +151,12 @@ class CoarseFits:
         lamps = tuple((tuple(vector), tuple(one)) for vector, one in zip(vectors.tolist(), rgb.tolist()))
         return Lighting("lamps", lamps, distant)
 
-    def plain(self, lighting: Lighting) -> Lighting:
+    def with_material(self, lighting: Lighting) -> Lighting:
         """The lighting that was found; with one material at first if that explains the photographs as well."""
-        one = lighting._replace(plain=1.0)
-        if self.error(one) >= PLAIN * self.error(lighting) or not self.are_apart(one):
+        one = lighting._replace(one_material_until=1.0)
+        if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
-        return self.found[one]._replace(plain=LOOSE)
+        return self.found[one]._replace(one_material_until=LOOSE)
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:

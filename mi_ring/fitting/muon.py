@@ -11,6 +11,7 @@ from mi_ring.nets.chunks import in_parallel
 #: Coefficients of the quintic of Newton and Schulz, and how often it is applied (Jordan et al. 2024, "Muon: an
 #: optimizer for hidden layers in neural networks").
 COEFFICIENTS, ITERATIONS = (3.4445, -4.775, 2.0315), 5
+MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
@@ -19,8 +20,8 @@ class Muon(torch.optim.Optimizer):
     PyTorch's own does so in bfloat16, which most processors emulate: there it takes 20 times as long as in float32.
     """
 
-    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype, momentum: float = 0.95) -> None:
-        super().__init__(params, {"lr": lr, "momentum": momentum})
+    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
+        super().__init__(params, {"lr": lr})
         self.dtype = dtype
 
     @torch.no_grad()
@@ -33,8 +34,8 @@ class Muon(torch.optim.Optimizer):
                 state = self.state[p]
                 if not state:
                     state["momentum_buffer"] = torch.zeros_like(p.grad)
-                momentum = state["momentum_buffer"].lerp_(p.grad, 1 - group["momentum"])
-                updates.append(p.grad.lerp(momentum, group["momentum"]))
+                momentum = state["momentum_buffer"].lerp_(p.grad, 1 - MOMENTUM)
+                updates.append(p.grad.lerp(momentum, MOMENTUM))
             if updates and updates[0].device.type == "cpu":  # small matrices: one per thread is faster than one by all
                 updates = in_parallel(torch.no_grad()(partial(orthogonalised, dtype=self.dtype)), updates)
             else:

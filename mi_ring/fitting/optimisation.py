@@ -61,12 +61,12 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
 @torch.no_grad()
 def solve_room(calibration: Calibration, it: Iteration) -> None:
     """Add an iteration's photographs to the normal equations of the room's light and solve them, once it is time."""
-    predicted, seen, batch = it.prediction, it.observation, it.batch
-    if predicted.other_light is None or not calibration.solves_room(it.progress):
+    other, seen, batch = it.prediction.other_light, it.observation, it.batch
+    if other is None or not calibration.solves_room(it.progress):
         return
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
-    calibration.room.solve(predicted.other_light, predicted.without_room, observed, pixels, it.progress, batch.total)
+    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum)
 
 
 class Optimisation:

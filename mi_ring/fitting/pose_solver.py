@@ -83,8 +83,9 @@ class PoseSolver(torch.optim.Optimizer):
 
     def look(self, it: Iteration) -> None:
         """Remember the photographs of an iteration and the curvature of its loss."""
-        begun = it.progress >= self.rate.start
-        self.seen = (torch.from_numpy(it.batch.all_photographs), it.batch.gathered(curvature(it))) if begun else None
+        self.seen = None
+        if it.progress >= self.rate.start:
+            self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
@@ -119,7 +120,7 @@ def curvature(it: Iteration) -> Tensor:
         weight = 2 * torch.ones_like(error)
     else:
         covered = error[prediction.coverage > 0.5]
-        total, count = it.batch.total(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
+        total, count = it.batch.share.sum(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
         mean = (total / count).nan_to_num(1.0).clamp(min=1e-6)
         weight = 1 / error.maximum(mean)
     weight *= ~seen.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
@@ -128,7 +129,7 @@ def curvature(it: Iteration) -> Tensor:
     weight *= it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * weight[0].numel())
     colours = perceived(prediction.rgb, context.exposure, kind)
     silhouettes = blur(prediction.coverage, it.outline_blur())
-    masked = max(1.0, float(it.batch.total(seen.masked.sum())))
+    masked = max(1.0, float(it.batch.share.sum(seen.masked.sum())))
     mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * height * width)
 
     at, radius = calibration(it.batch.scale), float(context.model.ring.radius)

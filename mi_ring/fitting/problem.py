@@ -1,7 +1,5 @@
 """The problem that a fit solves: photographs as they are lit, and settings. Fixed from the first iteration on."""
 
-import math
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -11,7 +9,7 @@ import torch
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, room_frames, with_lighting
+from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, with_lighting
 from mi_ring.fitting.processes import Processes, current
 from mi_ring.system.machine import device
 
@@ -42,15 +40,6 @@ class Problem:
         seen = as_lit.part(fitted) if len(held_out) else as_lit
         return cls(capture, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
                    current(), device())  # fmt: skip
-
-    @property
-    def room_frames(self) -> Collection[str]:
-        """Axes in which unknown room light is fixed: "world", "camera"."""
-        return room_frames(self.capture, self.lighting)
-
-    def albedo(self, center: np.ndarray) -> float:
-        """Albedo of an object at `center` (3,) according to the lights' intensities; above 1 they cannot be true."""
-        return math.pi * self.seen.reflectance(center, self.exposure)
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:

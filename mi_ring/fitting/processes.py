@@ -131,15 +131,14 @@ class Team(Processes):
 
     def on_first(self, work: Callable[[], Value]) -> Value:
         """As of one process."""
-        outcome: tuple[str, Any] | None = None
+        outcome: Any = None
         try:
             outcome = ("value", work()) if self.rank == 0 else None
         except InputError as error:
             outcome = ("error", str(error))
         except SystemExit as stop:
             outcome = ("exit", stop.code)
-        told: Any = self.broadcast(outcome)
-        kind, value = told
+        kind, value = self.broadcast(outcome)
         if kind == "error":
             raise InputError(value)
         if kind == "exit":

@@ -34,20 +34,7 @@ class Batch:
     size: tuple[int, int]  #: of these photographs' files (width, height) [px]
     scale: int  #: photographs are compared this many times smaller
     seeds: dict[str, int]  #: of the renderer, of its indirect light, and of the regulariser
-    share: Share  #: of this process
-
-    @property
-    def weight(self) -> float:
-        """Weight of this process's mean over photographs in the mean over all."""
-        return self.share.weight
-
-    def total(self, tensor: Tensor) -> Tensor:
-        """The sum over all photographs, from the sum over those of this process. Without gradients."""
-        return self.share.sum(tensor)
-
-    def gathered(self, tensor: Tensor) -> Tensor:
-        """(N, …) for all photographs, from (n, …) for those of this process. Without gradients."""
-        return self.share.gathered(tensor)
+    share: Share  #: this process's part of the N photographs; brings results of all processes together
 
 
 class Sampler:

@@ -44,7 +44,7 @@ def mask(it: Iteration) -> Tensor | None:
     instance one that fills a handle with its shadow.
     """
     seen, context = it.observation, it.context
-    masked = float(it.batch.total(seen.masked.sum()))
+    masked = float(it.batch.share.sum(seen.masked.sum()))
     if not masked:
         return None
     coverage, threshold = it.prediction.coverage, context.capture.threshold
@@ -56,7 +56,7 @@ def mask(it: Iteration) -> Tensor | None:
     if not seen.masked.any():  # only photographs of other processes have one
         return 0 * it.prediction.coverage.sum()
     loss = mask_loss(coverage[seen.masked], seen.mask[seen.masked], it.outline_blur(), valid, doubt)
-    return loss * (int(seen.masked.sum()) / masked / it.batch.weight) if it.batch.weight else loss
+    return loss * (int(seen.masked.sum()) / masked / it.batch.share.weight) if it.batch.share.weight else loss
 
 
 def velocity(it: Iteration) -> Tensor | None:
@@ -146,9 +146,9 @@ class Loss:
             it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
             values[name] = float(value.detach()), 1.0
             loss = loss + it.weights[name] * value
-        loss = loss * it.batch.weight
+        loss = loss * it.batch.share.weight
         found = torch.tensor([*values.values(), (float(loss.detach()), 1.0)], dtype=torch.double)
-        found[:-1, 0] *= it.batch.weight
-        *sums, (it.loss, _) = it.batch.total(found).tolist()
+        found[:-1, 0] *= it.batch.share.weight
+        *sums, (it.loss, _) = it.batch.share.sum(found).tolist()
         it.terms = {name: value for name, (value, times) in zip(values, sums) if times}
         return loss
