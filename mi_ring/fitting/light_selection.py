@@ -17,7 +17,7 @@ from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
-#: Settings of a coarse fit. They do not depend on those of the fit, so that the choice does not either.
+#: Settings of a coarse fit. They do not depend on those of the fit: neither does the choice.
 COARSE: dict[str, Any] = {
     "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0,
     **{name: getattr(Config(), name) for name in (
@@ -59,13 +59,13 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
         found = trials.lamps()
     else:
         likely = [Lighting("environment"), Lighting("turntable")]
-        if math.isfinite(trials.error(likely[0])):  # it tells where lamps are
+        if math.isfinite(trials.error(likely[0])):  # the environment shows where lamps are
             likely.insert(1, trials.brightest(1))
         if not is_unlit(capture):
             own = trials.error(Lighting("capture"))
             likely = [one for one in likely if trials.error(one) < BETTER[one.kind] * own] or [Lighting("capture")]
         found = trials.best(*likely)
-        if found.kind in ("environment", "lamps"):  # several lamps are between the two
+        if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
         raise trials.failures[-1]
@@ -101,7 +101,7 @@ class CoarseFits:
             fit = Fit(self.capture, config, lighting=lighting)
             iterations = progress(fit, f"trying {lighting}", fit.schedule.iterations, unit="iteration")
             errors = [it.terms["rgb"] for it in iterations][-LAST:]
-        except InputError as error:  # it diverged, or a lamp is inside the object: it is not that light
+        except InputError as error:  # it diverged, or a lamp is inside the object: the light is another
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
@@ -140,7 +140,7 @@ class CoarseFits:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """So many lamps in the brightest directions of the environment, as strong as an albedo of one half needs."""
+        """`count` lamps in the brightest directions of the environment. Their strength fits an albedo of one half."""
         self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
@@ -152,7 +152,7 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """The lighting that was found; with one material at first if that explains the photographs as well."""
+        """The lighting that was found, with one material at first if that explains the photographs about as well."""
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
@@ -179,7 +179,7 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
-        """Strengths (n + 1, C) and what is left."""
+        """Strengths (n + 1, C) of the lamps and of constant light, and the sum of squared residuals."""
         design = np.concatenate([lobes[:, chosen], grey], 1)
         solved = [nnls(design, colour) for colour in colours.T]
         return np.stack([strengths for strengths, _ in solved], 1), sum(rest**2 for _, rest in solved)

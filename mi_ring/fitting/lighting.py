@@ -108,10 +108,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """The lighting with the lamps that a fit has found: those of `capture`, which it has calibrated.
+    """The lighting with the lamps that a fit has found. `capture`: as the fit has calibrated it.
 
-    All lamps are scaled so that the first brings as much light as before to the object at `center` (3,): the albedo
-    is assumed.
+    All lamps are scaled, so that the first brings as much light to the object at `center` (3,) as before: the albedo
+    is an assumption.
     """
     if not lighting.lamps:
         return lighting

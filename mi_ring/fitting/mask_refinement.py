@@ -19,7 +19,7 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import prediction
 from mi_ring.system.progress import progress
 
-LARGEST = 512  #: largest side of the pictures in which they are found [px]
+LARGEST = 512  #: largest side of the pictures in which masks are found [px]
 BAND = 0.04  #: how far the surface may be off, relative to the object's size
 PLAUSIBLE = 0.8  #: overlap with the surface's coverage below which a mask is not used
 BRIGHTNESS = 0.25  #: linear brightness of the object in these pictures
@@ -39,7 +39,7 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
         places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture, coverage of the surface, and pixels that are certainly background."""
+        """Picture (h, w, 3), coverage of the surface (h, w), and pixels (h, w) that are certainly background."""
         scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)

@@ -22,7 +22,7 @@ from mi_ring.fitting.terms import Term
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
-CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped, lest it diverges
+CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
 
 def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
@@ -31,14 +31,8 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
     Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear layers.
     """
     lists = [getattr(part, "hidden", None) for part in networks.modules()]
-    hidden: list[Any] = [
-        layer.weight
-        for layers in lists
-        if isinstance(layers, nn.ModuleList)
-        for layer in layers
-        if isinstance(layer, nn.Linear)
-    ]
-    hidden = hidden if config.optimizer == "muon" else []
+    layers = [layer for some in lists if isinstance(some, nn.ModuleList) for layer in some]
+    hidden = [layer.weight for layer in layers if isinstance(layer, nn.Linear) and config.optimizer == "muon"]
     rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
     adam = torch.optim.Adam(rest, lr=config.learning_rate)
     result = [Stepper(adam, [Rate(config.learning_rate, config.decay)])]
@@ -70,7 +64,7 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
 
 
 class Optimisation:
-    """All optimisers of a model with their learning rates, solvers of calibration, and the guard against NaN."""
+    """The optimisers of a model with their learning rates, the solvers of calibration, and the guard against NaN."""
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
         """`terms`: of the loss."""
@@ -121,12 +115,12 @@ class Optimisation:
         return it
 
     def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Fix the surface during the settling stage, and start the room's normal equations anew at its beginning."""
+        """Fix the surface during the settling stage. At its start, reset the room light's equations."""
         fixed = schedule.shaping <= iteration < schedule.iterations
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()
-            self.guard.keep()  # so that a retreat does not bring it back
+            self.guard.keep()  # so that a retreat does not restore the old equations
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
         """Compute the gradients of the loss, summed over all processes. Returns the loss of all processes."""

@@ -1,7 +1,7 @@
 """Solves for the poses of cameras by Gauss-Newton, from how a picture moves with its camera.
 
-An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps, which do not depend on
-the size of an error, move right cameras away or arrive too late. The gradient is that of the loss; this module computes
+An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps do not depend on the size
+of an error: they move correct cameras away, or arrive too late. The gradient is that of the loss. This module computes
 the curvature to divide it by. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews,
 IJCV 2004), with the surface in place of a template.
 """
@@ -25,8 +25,8 @@ from mi_ring.images import blur
 DAMPING, FLOOR = 0.1, 0.01
 LONGEST = 3.0  #: longest step [standard deviations]
 INITIAL, DECAY = 1.0, 0.5  #: factor of the steps: it decreases to average over iterations
-LEAST = 1e-9  #: least curvature: what no photograph determines stays
-NEAR, FAR = 0.2, 0.4  #: progress at which they begin, for a start near the object and far from it
+LEAST = 1e-9  #: least curvature: what photographs do not determine stays unchanged
+NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the object and far from it
 
 
 def slopes(picture: Tensor) -> Tensor:
@@ -40,10 +40,10 @@ def slopes(picture: Tensor) -> Tensor:
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
     """How far the pixels of a sphere move with the camera: (H, W, 2, 6) [px], right and down.
 
-    For a turn [rad] about each axis of the camera and a step [scene units] along each, Mitsuba's axes. `intrinsics`
-    (4,) fx, fy, cx, cy [px], of a pinhole: distortion changes little of it; `size` (width, height); `center` (3,) of
-    the sphere, in the camera's axes, of which a camera inside it sees a smaller one. Where a ray misses it, the depth
-    is that of the point next to it.
+    The six columns: a turn [rad] about each axis of the camera, and a step [scene units] along each (Mitsuba's axes).
+    `intrinsics` (4,): fx, fy, cx, cy [px]; distortion hardly matters. `size`: (width, height). `center` (3,): of the
+    sphere, in the camera's axes. It is made smaller if the camera is inside. Rays that miss it have the depth of their
+    point nearest to it.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
@@ -89,7 +89,7 @@ class PoseSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """One step along the gradients that the parameters have; none before refinement begins."""
+        """One step along the current gradients. Nothing moves before refinement begins."""
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:
@@ -108,8 +108,9 @@ class PoseSolver(torch.optim.Optimizer):
 def curvature(it: Iteration) -> Tensor:
     """Second derivatives (n, 6, 6) of the loss of an iteration by `turn` and `move` of its photographs.
 
-    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. Absolute differences count as
-    squares of the same slope (iteratively reweighted least squares); those below the mean count as the mean.
+    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. An absolute difference counts
+    as a square with the same slope (iteratively reweighted least squares). The slope of the mean difference is used
+    for those below the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape

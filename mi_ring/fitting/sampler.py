@@ -25,7 +25,7 @@ class Batch:
     """
 
     number: int  #: of the iteration, from 1
-    progress: float  #: share of the shaping iterations before it, in [0, 1]; 1: the surface is fixed
+    progress: float  #: share of the shaping iterations that are done, in [0, 1]; 1: the surface is fixed
     stage: Stage
     points: Tensor  #: (V, 3) domain points
     faces: np.ndarray  #: (F, 3)
@@ -38,9 +38,9 @@ class Batch:
 
 
 class Sampler:
-    """Draws batches. Photographs come in random order, all of one size before one of them comes again.
+    """Draws batches. Photographs come in random order; all of one size come before one of them comes again.
 
-    Each purpose has a random generator of its own: what is switched off changes nothing else that is drawn.
+    Each purpose has its own random generator: to switch one off does not change what others draw.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -69,7 +69,7 @@ class Sampler:
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
         count = min(count, len(alike))
-        if len(waiting) < count:  # those that are left come last in the next round
+        if len(waiting) < count:  # the remaining ones come first, and last in the next round
             order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
             waiting = waiting + [k for k in order if k not in waiting] + waiting
         self.waiting[size] = waiting[count:]

@@ -53,7 +53,7 @@ def ending_signals() -> Iterator[Callable[[], int]]:
 
 
 class Keeper:
-    """Writes log, checkpoints and results of a fit into its folder. What cannot be written now is tried again later.
+    """Writes log, checkpoints and results of a fit into its folder. If writing fails, it tries again later.
 
     Of several processes only the first one writes.
     """
@@ -86,7 +86,7 @@ class Keeper:
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
-        """Call `write`; if it fails, tell the user once and go on."""
+        """Call `write`. If it fails, tell the user once and go on."""
         try:
             write()
         except (InputError, OSError) as error:
@@ -108,7 +108,7 @@ class Keeper:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
-        """Write checkpoint and results elsewhere, as far as possible. Returns a sentence about where they are."""
+        """Write checkpoint and results to a temporary folder, as far as possible. Returns where, as a sentence."""
         saved = ""
         try:
             elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
@@ -126,7 +126,7 @@ class Keeper:
 
 
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
-    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
+    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints. `costs`: None: measured."""
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
         costs = fit.problem.processes.broadcast(measure(fit, left, interrupted))
@@ -169,11 +169,6 @@ def resume_hint(folder: Path) -> Iterator[None]:
         raise
 
 
-def write_inputs(fit: Fit, folder: Path) -> None:
-    """inputs.png: the start surface drawn over the photographs."""
-    results.write_inputs(folder / "inputs.png", fit.problem.capture, fit.renderer.show(fit.model, INPUTS_LEVEL))
-
-
 def start_of(fit: Fit) -> str:
     """A description of the surface that a fit starts from."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
@@ -212,7 +207,9 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             print(f"{processes.count} processes share the points and photographs of each iteration")
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
-            processes.on_first(lambda: write_inputs(fit, folder))
+            processes.on_first(lambda: results.write_inputs(
+                folder / "inputs.png", fit.problem.capture, fit.renderer.show(model, INPUTS_LEVEL)
+            ))  # fmt: skip
         keeper = Keeper(fit, folder, prepare)
         with resume_hint(folder):
             try:

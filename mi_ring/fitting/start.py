@@ -101,7 +101,7 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     except InputError:
         if choice == "hull" or shape.center is None or shape.radius is None:
             raise
-        surface = None  # the masks make no hull, but the scene says where the object is
+        surface = None  # the masks give no hull, but the scene says where the object is
     if surface is None and choice == "hull":
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip

@@ -13,7 +13,7 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import mask_loss, rgb_loss, velocity_loss
 from mi_ring.nets.shape_net import Flow
 
-DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: difference above which they are doubted, and progress from then on
+DOUBT, SETTLED = 0.5, 0.5  #: masks of a lit room are doubted above this difference, from this progress on
 PATTERNED = 0.1  #: factor of the weight `settling` if the object is probably not of one material
 REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iteration
 
@@ -31,17 +31,15 @@ TermLike: TypeAlias = Term | Callable[[Iteration], Tensor | None]
 
 def rgb(it: Iteration) -> Tensor:
     """Colours: predicted photographs against observed ones."""
-    seen = it.observation
-    return rgb_loss(
-        it.prediction.rgb, seen.rgb, seen.clipped, it.context.exposure, it.context.config.loss, it.counted()
-    )
+    seen, context = it.observation, it.context
+    return rgb_loss(it.prediction.rgb, seen.rgb, seen.clipped, context.exposure, context.config.loss, it.counted())
 
 
 def mask(it: Iteration) -> Tensor | None:
     """Silhouettes, of the photographs that have a mask.
 
-    Masks of a lit room are guesses. Once the shape has settled, the majority of them outweighs single wrong ones, for
-    instance one that fills a handle with its shadow.
+    Masks of a lit room are guesses. Once the shape has settled, the majority outweighs single wrong masks: for
+    instance one that takes a shadow for a part of the object.
     """
     seen, context = it.observation, it.context
     masked = float(it.batch.share.sum(seen.masked.sum()))

@@ -1,7 +1,6 @@
 """Validation on held-out photographs: does what was refined explain them better?
 
-Surface and material stay as they were fitted together with what was refined. So the result judges all of it together,
-and what is reset is not fitted again.
+Surface and material are not fitted again when values are reset. So the comparison favours what was refined.
 """
 
 import copy
