@@ -24,7 +24,7 @@ COARSE: dict[str, Any] = {
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip
 LAST = 12  #: last iterations of a coarse fit whose mean error counts
-ALIKE = 1.1  #: ratio of the lights' strengths above which the user is told
+ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
 #: An environment fixed in the camera looks much like a flash.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
@@ -168,7 +168,7 @@ def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
 
-    Colours are relative to the first lamp, which is white: its colour cannot be told from the object's. `harmonics`
+    Colours are relative to the first lamp, taken to be white: the object could have its colour. `harmonics`
     (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
     light: each direction in turn moves to its best place, until none moves.
     """

@@ -1,4 +1,4 @@
-"""Mask refinement: masks are found anew during a fit, by GrabCut near what the surface covers by then."""
+"""Mask refinement: during a fit, GrabCut finds the masks again, near the outline of the current surface."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -68,7 +68,7 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape
-        scale = width // columns  # the rest is narrower than a pixel of the mask
+        scale = width // columns  # what remains at the border is narrower than a pixel of the mask
         whole = cv2.resize(255 * mask.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
         return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
 

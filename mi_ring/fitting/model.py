@@ -36,12 +36,12 @@ class Model(nn.Module):
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:
-        """Whether the surface stays as it is. Parameters that were frozen from the start stay frozen."""
+        """Fix the surface, or let it move. Parameters that were frozen at the start stay frozen."""
         for parameter in self.to_freeze:
             parameter.requires_grad_(not fixed)
 
     def update_albedo(self) -> None:
-        """Scale the material's brightness by what the fit has found of the power of all lights."""
+        """Scale the material's brightness by the power of all lights that the fit has found."""
         if self.calibration and "scale" in self.calibration.refined:
             net, initial = self.ring.brdf_net, self.albedo / self.calibration.rig.power / math.pi
             net.set_parameters(net.bsdf_parameters, initial * self.calibration.albedo_factor)

@@ -15,9 +15,9 @@ MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """`torch.optim.Muon` without weight decay, that orthogonalises in a `dtype` of one's choice.
+    """`torch.optim.Muon` without weight decay, with a choice of the `dtype` in which it orthogonalises.
 
-    PyTorch's own does so in bfloat16, which most processors emulate: there it takes 20 times as long as in float32.
+    PyTorch's own takes bfloat16. Most processors emulate it, 20 times as slow as float32.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
@@ -26,7 +26,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step. A tall matrix takes a longer one, by the root of how much taller it is."""
+        """One step. That of a tall matrix is longer, by the root of height / width."""
         for group in self.param_groups:
             params = [p for p in group["params"] if p.grad is not None]
             updates = []
@@ -46,7 +46,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """About the nearest matrix with orthonormal rows or columns: singular values are brought to between 0.7 and 1.2."""
+    """About the nearest matrix with orthonormal rows or columns: its singular values are between 0.7 and 1.2."""
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

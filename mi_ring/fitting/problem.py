@@ -1,4 +1,4 @@
-"""The problem that a fit solves: photographs as they are lit, and settings. Fixed from the first iteration on."""
+"""The problem that a fit solves: photographs, their lights, and settings. It does not change during the fit."""
 
 from dataclasses import dataclass
 
@@ -20,11 +20,11 @@ class Problem:
 
     given: Capture  #: the capture as it was handed in
     capture: Capture  #: lit by `lighting`
-    seen: Capture  #: of it the photographs that are fitted
-    scene: mi.Scene  #: to render, without an environment that is among the room's harmonics
+    seen: Capture  #: the photographs of `capture` that are fitted
+    scene: mi.Scene  #: without the environment, if `environment` has it
     config: Config
     lighting: Lighting
-    environment: np.ndarray | None  #: (BASIS, 3) harmonics of the scene's own environment, if it was made one
+    environment: np.ndarray | None  #: (BASIS, 3) of the scene's environment, see `environment_as_harmonics`
     fitted: np.ndarray  #: indices of the photographs that are fitted
     held_out: np.ndarray  #: indices of the others
     exposure: float  #: mean radiance of the object in the fitted photographs

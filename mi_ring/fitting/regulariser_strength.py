@@ -47,7 +47,7 @@ class RegulariserStrength:
     def strength(self, decay: float) -> float:
         """A factor of the regulariser's weight, which falls to `decay`. It is 1 while much light is unexplained.
 
-        What no surface explains (wrong lights, a room that is not dark), a weak regulariser would explain by folds.
+        With wrong lights, or in a room that is not dark, a weak regulariser would let the surface fold.
         """
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 

@@ -50,7 +50,7 @@ class Sampler:
         capture = problem.capture
         self.sizes = [capture.shots[k].size for k in problem.fitted]
         self.alike = {size: np.intersect1d(index, problem.fitted) for size, index in capture.sizes.items()}
-        #: by size (width, height): photographs that have not come yet in this round
+        #: by size (width, height): photographs that are still to come in this round
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:

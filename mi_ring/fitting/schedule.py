@@ -9,9 +9,9 @@ import torch
 from mi_ring.fitting.config import Config
 
 HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
-EXCHANGE = 0.4  #: iterations of the second stage that replace one of these; with the presets both take the same time
+EXCHANGE = 0.4  #: iterations of the second stage that replace one of the first: they take as long, with the presets
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
-RAMP = 0.05  #: progress during which a learning rate rises from 0, once it starts
+RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after its start
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel

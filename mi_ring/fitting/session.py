@@ -27,26 +27,26 @@ from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress, tolerating_closed_output
 
 CHECKPOINT_SECONDS = 30.0
-INPUTS_LEVEL = 4  #: of the surface in inputs.png
+INPUTS_LEVEL = 4  #: level of the surface in inputs.png
 WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an iteration takes
 
 
 @contextlib.contextmanager
 def ending_signals() -> Iterator[Callable[[], int]]:
-    """Yields a function that returns the first signal that ends a fit, 0: none. A second Ctrl-C ends it at once.
+    """Yields a function that returns the first signal that has come, or 0. A second Ctrl-C ends the fit at once.
 
-    Shells, schedulers and the kernel send the other signals more than once.
+    Other signals may come repeatedly, from shells, schedulers and the kernel.
     """
-    come: list[int] = []
+    received: list[int] = []
 
     def hear(number: int, frame: object) -> None:
-        come.append(number)  # without printing: it may interrupt a print
+        received.append(number)  # without printing: it may interrupt a print
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
-    before = {number: signal.signal(number, hear) for number in heard}
+    handled = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
+    before = {number: signal.signal(number, hear) for number in handled}
     try:
-        yield lambda: come[0] if come else 0
+        yield lambda: received[0] if received else 0
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -72,12 +72,12 @@ class Keeper:
         if log and log[-1]["iteration"] == it.number:
             self.attempt(lambda: results.add_to_log(self.folder, log[-1]))
         due = it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS
-        if due and it.number < self.fit.iterations:  # else it is written in any case
+        if due and it.number < self.fit.iterations:  # after the last iteration it is written in any case
             self.attempt(self.checkpoint)
             self.saved = time.monotonic()
 
     def checkpoint(self) -> None:
-        """Write a checkpoint and the whole log now. Raises InputError or OSError if that is impossible."""
+        """Write a checkpoint and the whole log now. Raises InputError or OSError if that fails."""
         if not self.writes:
             return
         if not self.folder.is_dir():  # somebody has removed it
@@ -138,9 +138,9 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     )  # fmt: skip
     if keeper.writes:
         results.write_log(keeper.folder, fit.course.log)
-    come = 0
+    stop = 0
     with bar:
-        while fit.iteration < fit.iterations and not (come := interrupted()):
+        while fit.iteration < fit.iterations and not (stop := interrupted()):
             retreats = fit.optimisation.guard.retreats
             it = fit.step()
             if fit.optimisation.guard.retreats > retreats:
@@ -153,7 +153,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
             keeper.follow(it)
-    if come:
+    if stop:
         print("Interrupted: writing what there is (Ctrl-C again to drop it)", flush=True)
     keeper.checkpoint()
 
@@ -192,8 +192,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         def interrupted() -> int:
             return processes.maximum(heard())
 
-        somebody = getattr(sys.stdin, "isatty", bool)()
-        keeps = "; Ctrl-C ends early and keeps what there is" * somebody
+        keeps = "; Ctrl-C ends early and keeps what there is" * getattr(sys.stdin, "isatty", bool)()
         print(f"{len(fit.capture)} photographs; results go to {folder}/{keeps}")
         if model.calibration:
             print(f"Refined besides surface and material: {', '.join(model.calibration.refined)}")

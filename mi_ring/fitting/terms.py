@@ -130,7 +130,7 @@ class Loss:
     def __call__(self, it: Iteration) -> Tensor:
         """This process's part of the loss, a scalar. The iteration gets the loss, terms and weights of all processes.
 
-        A term is a mean over photographs, or is equal in all processes, so that parts add up by their weights.
+        A term is a mean over photographs, or is equal in all processes: parts add up by their weights.
         """
         loss, values = torch.zeros((), device=it.batch.points.device), dict.fromkeys(self.terms, (0.0, 0.0))
         for name, term in self.terms.items():
