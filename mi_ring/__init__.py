@@ -54,7 +54,6 @@ _API = {
     "register_network": "nets.registry", "plain_autograd": "nets.mlp",
     "FittedObject": "objects.fitted_object", "load_fit": "objects.ring_file",
     "Lighting": "fitting.lighting", "choose_lighting": "fitting.light_selection",
-    "evaluate": "metrics.evaluation", "export": "output.exporting",
     "Camera": "geometry.camera", "Light": "scene.lights", "Response": "scene.shot", "Shot": "scene.shot",
 }  # fmt: skip
 

@@ -427,8 +427,10 @@ def test_rates_of_cameras_and_lights_rise_once_there_is_a_shape_and_fall(small_c
     calibration, fit.optimisation.solvers = fit.model.calibration, []  # which would look at an iteration
 
     def rates(progress):
-        it = SimpleNamespace(terms={"calibration": 0.0}, loss=0.0, progress=progress)
-        fit.optimisation.step(sum(p.sum() for p in calibration.parameters()) * 0.0, it)
+        unlit = SimpleNamespace(other_light=None)
+        it = SimpleNamespace(terms={"calibration": 0.0}, loss=0.0, progress=progress, prediction=unlit,
+                             observation=None, batch=None)  # fmt: skip
+        fit.optimisation.step(lambda: (sum(p.sum() for p in calibration.parameters()) * 0.0, it))
         groups = [g for o in fit.optimisation.optimizers for g in o.param_groups]
         return [next(g["lr"] for g in groups if any(p is unknown for p in g["params"]))
                 for unknown in (calibration.turn, calibration.light)]  # fmt: skip

@@ -107,7 +107,7 @@ def test_interreflection_is_averaged_beside_a_table(broken_capture, table, indir
     for it in running:
         seen[it.batch.photographs] += 1
     assert seen.sum() == 7 * 4
-    counts = {k: count for k, (count, _) in running.renderer.average.pictures.items()}
+    counts = {k: count for k, (count, _) in running.renderer.averages.items()}
     assert counts == ({k: count for k, count in enumerate(seen) if count} if table and indirect else {})
 
 

@@ -125,7 +125,7 @@ def test_the_first_lamp_is_the_photographs_own(small_capture):
 
 def test_one_material_is_the_mean_of_all_until_it_may_vary():
     material = {"diffuse": torch.tensor([[0.1, 0.2, 0.3], [0.5, 0.4, 0.9]]), "roughness": torch.tensor([0.2, 0.6])}
-    plain = Lighting("environment", plain=0.6)
+    plain = Lighting("environment", one_material_until=0.6)
     shared = plain.material_at(0.59, material)
     torch.testing.assert_close(shared["diffuse"], torch.tensor([[0.3, 0.3, 0.6]]).expand(2, 3))
     torch.testing.assert_close(shared["roughness"], torch.tensor([0.4, 0.4]))

@@ -72,7 +72,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
             self.error = errors.get(name, 0.1)
             if self.error is None:
                 raise InputError("diverged at iteration 9")
-            if lighting.plain and lighting.lamps:  # which has found the first lamp farther away
+            if lighting.one_material_until and lighting.lamps:  # which has found the first lamp farther away
                 (vector, rgb), *others = lighting.lamps
                 lighting = lighting._replace(lamps=((tuple(2 * x for x in vector), rgb), *others))
             if name in together:  # its second lamp has moved to the first
@@ -92,7 +92,7 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
     center, _ = capture.sphere()
     monkeypatch.setattr(light_selection, "Fit", Trial)
     found = mi_ring.choose_lighting(capture, config)
-    assert str(found) == believed and found.plain == plain and found.lamps == ended[believed].lamps
+    assert str(found) == believed and found.one_material_until == plain and found.lamps == ended[believed].lamps
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
 
 
@@ -123,7 +123,7 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture, mon
         with pytest.raises(InputError, match="small.xml: a coarse fit .* has no finite error"):
             mi_ring.choose_lighting(capture, config)
     else:
-        assert mi_ring.choose_lighting(capture, config).plain > 0
+        assert mi_ring.choose_lighting(capture, config).one_material_until > 0
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

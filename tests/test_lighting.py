@@ -209,7 +209,7 @@ def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path
 def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
     capture = mi_ring.load_capture(in_an_environment)
     config = mi_ring.Config.preset("fast", **TINY, light="environment")
-    fit = mi_ring.Fit(capture, config, lighting=Lighting("environment", plain=0.6))
+    fit = mi_ring.Fit(capture, config, lighting=Lighting("environment", one_material_until=0.6))
     fit.step(), fit.step()
     resumed = mi_ring.Fit(capture, config, state=fit.state())
     assert resumed.problem.lighting == fit.problem.lighting
@@ -258,7 +258,7 @@ def test_light_and_material_settle_where_the_surface_is(in_an_environment):
 
     capture = mi_ring.load_capture(in_an_environment)
     config = mi_ring.Config.preset("fast", **TINY, light="environment")
-    lighting = Lighting("environment", plain=0.01)  # of one material, but not for long
+    lighting = Lighting("environment", one_material_until=0.01)  # of one material, but not for long
     fit = mi_ring.Fit(capture, config, lighting=lighting)
     *_, shaping, settling = fit.schedule.stages
     assert settling.settles and not shaping.settles
@@ -283,8 +283,8 @@ def test_light_and_material_settle_where_the_surface_is(in_an_environment):
 
 @pytest.mark.parametrize(
     ("lighting", "settling", "weight"),
-    [(Lighting("environment"), 0.03, 0.003), (Lighting("turntable", plain=0.35), 0.02, 0.02),
-     (Lighting("environment", plain=0.35), 0.0, None), (Lighting("capture"), 0.03, None),
+    [(Lighting("environment"), 0.03, 0.003), (Lighting("turntable", one_material_until=0.35), 0.02, 0.02),
+     (Lighting("environment", one_material_until=0.35), 0.0, None), (Lighting("capture"), 0.03, None),
      (Lighting("lamps", (((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)),), distant=True), 0.03, None)],
 )  # fmt: skip
 def test_what_settles(lighting, settling, weight, small_capture):

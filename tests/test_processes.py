@@ -41,20 +41,21 @@ def step(fit):
     backward = optimisation.backward
 
     def noting(loss, it):  # before the gradients are clipped
-        backward(loss, it)
+        total = backward(loss, it)
         found.update({name: torch.cat([p.grad.flatten() for p in part.parameters() if p.grad is not None])
                       for name, part in parts.items()})
+        return total
 
     optimisation.backward = noting
     fit.course.iteration = fit.iterations // 2
     it = fit.step()
-    _, exposure, pose = optimisation.solvers
+    exposure, pose = optimisation.solvers
     seen = [value for _, value in exposure.seen]
     found |= {"powers": torch.stack(seen) if seen else torch.zeros(1), "curvature": pose.seen[1],
               "room": calibration.room.vector, "loss": torch.tensor(it.loss),
               "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),
-              "averages": torch.stack([picture for _, picture in fit.renderer.average.pictures.values()]),
+              "averages": torch.stack([picture for _, picture in fit.renderer.averages.values()]),
               "stepped": torch.cat([p.detach().flatten() for p in fit.model.parameters()])}
     return found
 

@@ -14,6 +14,7 @@ from mi_ring.fitting import terms
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.regulariser_strength import RegulariserStrength
 from mi_ring.geometry.domain import Sphere
 
@@ -39,7 +40,7 @@ def test_what_is_unexplained_is_a_share_of_the_objects_light():
     clipped[..., 3, :] = True  # brighter than observed: no error
     seen = Observation(observed, clipped, torch.tensor([[[1.0, 1, 1, 1, 0]]]), torch.tensor([True]), None)
     shown = SimpleNamespace(rgb=predicted, coverage=torch.tensor([[[1.0, 1, 0.5, 1, 1]]]))
-    batch = SimpleNamespace(total=lambda tensor: tensor)
+    batch = SimpleNamespace(share=ALONE.share(1))
     found = Iteration(batch, seen, shown, None).unexplained()
     assert found == pytest.approx((0.1 + 0.05) / (0.5 + 0.25 + 0.4))
     seen = seen._replace(masked=torch.tensor([False]))  # then what is predicted to be the object is

@@ -12,7 +12,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 from mi_ring.system.machine import release_memory
 
 FEWEST = 40  #: iterations: fewer give no useful result
-AROUND = 40  #: iterations of the last stage that take as long as the pictures before a fit and its results
+AROUND = 40  #: time of the pictures before a fit and of its results, in iterations of the last stage
 
 Settings = TypeVar("Settings", bound=Config)
 Planner = Callable[[Config], Schedule]  #: the schedule of settings, see `Fit.plan`
@@ -20,13 +20,13 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """Seconds of an iteration at each level and width of the stages: of the second of two, the first is a warm-up.
+    """Seconds of an iteration at each level and width of the stages. The second of two iterations is measured.
 
-    They are run in another fit, which starts from the state of this one. Empty if `interrupted`.
+    Another fit runs them, from the state of this one. Returns an empty dictionary if `interrupted`.
     """
     print("Measuring what iterations take on this machine", flush=True)
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
-    trial.ring.domain = fit.ring.domain  # it keeps its samplings, which the fit needs in any case
+    trial.ring.domain = fit.ring.domain  # it caches its samplings for the fit, too
     state, costs = trial.sampler.state(), {}
     for stage in {(stage.level, stage.width): stage for stage in stages}.values():
         # A stage that shapes the surface: one with a fixed surface takes less time.
@@ -36,8 +36,8 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
         for _ in range(2):
             if interrupted():
                 return {}
-            trial.sampler.restore(state | {"waiting": {}})  # the same photographs, which are cached, as later in a fit
-            trial.course.iteration = max(0, last - 2)  # the last one does more
+            trial.sampler.restore(state | {"waiting": {}})  # the same photographs: in a fit they are cached, too
+            trial.course.iteration = max(0, last - 2)  # the last iteration of a fit does more
             started = time.perf_counter()
             trial.step()
             costs[stage.level, stage.width] = time.perf_counter() - started
@@ -57,7 +57,7 @@ def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, costs: Costs) -> Settings:
-    """The settings whose fit takes nearest to `seconds`, with as many iterations as fit into them."""
+    """Of these settings those whose fit takes about `seconds`, with as many iterations as that time allows."""
     config = min(configs, key=lambda config: abs(math.log(seconds_of(config, plan, costs) / seconds)))
     around = seconds_around(config, plan, costs)
     share = (seconds - around) / (seconds_of(config, plan, costs) - around)

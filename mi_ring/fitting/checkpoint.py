@@ -14,13 +14,13 @@ from mi_ring.system.files import is_sealed, relative_to, write_state
 from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
-BEFORE = "checkpoint.before.pt"  #: the one before it, in case it is damaged
+BEFORE = "checkpoint.before.pt"  #: the previous checkpoint, in case the newest is damaged
 FORMAT = 5  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
-    """The content of a checkpoint; of the one before it, with a printed line, if it is damaged.
+    """The content of a checkpoint. If it is damaged: of the one before, and a line is printed.
 
     Raises InputError if there is none, or if it was made with other settings.
     """
@@ -43,7 +43,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
                          f"on with the version that wrote it, or {ADVICE}")  # fmt: skip
     if found != FORMAT or not all(isinstance(part, dict) for part in parts):
         raise InputError(f"{path}: holds no checkpoint; {ADVICE}")
-    known = Config().settings() | state["settings"]  # newer settings had their defaults
+    known = Config().settings() | state["settings"]  # settings that are newer than the checkpoint had their defaults
     known["weights"] = WEIGHTS | known["weights"]
     known, asked, default = (by_option(settings) for settings in (known, config.settings(), Config().settings()))
     differing = []

@@ -180,7 +180,7 @@ class Config(Ablation, Tuning, Common):
         both = {"power", "gain"} <= set(self.refine)
         require(not both, "refine", "without power or without gain, for they look alike")
 
-        for f in dataclasses.fields(Config):  # settings from Python are not checked by tyro
+        for f in dataclasses.fields(Config):  # for calls from Python: the command line has checked them
             if get_origin(f.type) is Literal:
                 allowed = get_args(f.type)
                 require(getattr(self, f.name) in allowed, f.name, f"one of {', '.join(allowed)}")

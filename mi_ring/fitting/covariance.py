@@ -21,7 +21,7 @@ from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 
-COMPARED_WIDTH, SPP = 96, 8  #: largest width [px] and samples per pixel of the pictures that are compared
+COMPARED_WIDTH, SPP = 96, 8  #: of the compared pictures: largest width [px], samples per pixel
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
 BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
@@ -36,7 +36,7 @@ class Layout:
             self.count += getattr(calibration, name).numel()
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """Name, component and places (n,) of all numbers that photographs depend on."""
+        """The unknowns of photographs `index` (n,): name, component, and the place of each photograph's number (n,)."""
         result = []
         for name, unknown in self.calibration.unknowns.items():
             for row in unknown.rows(self.calibration.rig, index):
@@ -47,7 +47,7 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """Standard deviation of each unknown in its own unit, shaped like it; without the room's light.
+    """Standard deviation of each unknown in its own unit and shape, except the room's light.
 
     `level`: of the surface.
     """
@@ -56,11 +56,12 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
     layout = Layout(calibration)
     if not layout.count:
         return {}
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     colours, silhouettes = Equations(layout.count), Equations(layout.count)
     for index in problem.capture.together(problem.fitted):
         scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
-        compare(CovarianceGroup(problem, model, surface, index, scale), layout, colours, silhouettes)
+        group = CovarianceGroup(problem, calibration, surface, model.ring.indirect, index, scale)
+        compare(group, layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
     precision = np.eye(layout.count) + colours.information() + silhouettes.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
@@ -101,8 +102,9 @@ class CovarianceGroup:
     """Photographs `index` of one size, `scale` times smaller, with what the model predicts for them."""
 
     problem: Problem
-    model: Model
+    calibration: Calibration
     surface: Surface
+    indirect: bool  #: Is interreflection predicted?
     index: np.ndarray
     scale: int
 
@@ -113,12 +115,6 @@ class CovarianceGroup:
         room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
-    @property
-    def calibration(self) -> Calibration:
-        """The unknowns."""
-        assert self.model.calibration is not None
-        return self.model.calibration
-
     def direct(self) -> tuple[Tensor, Tensor]:
         """Radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
         shadows = self.problem.config.shadows and self.problem.capture.shadows
@@ -126,21 +122,21 @@ class CovarianceGroup:
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
         """Radiance (n, H, W, 3) by interreflection and by the room's light."""
-        ring, calibration = self.model.ring, self.calibration
+        calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
         room = calibration.room_harmonics()
-        if ring.indirect or room.any():
+        if indirect or room.any():
             photographs = self.photographs()
             around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
-                                         indirect=ring.indirect, harmonics=calibration.room.which)  # fmt: skip
-            bounced = around.interreflection.cpu() if ring.indirect else bounced
+                                         indirect=indirect, harmonics=calibration.room.which)  # fmt: skip
+            bounced = around.interreflection.cpu() if indirect else bounced
             added = around.occlusion if photographs.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
         return bounced, room_light
 
 
-def compare(at: CovarianceGroup, layout: Layout, colours: "Equations", silhouettes: "Equations") -> None:
-    """Add photographs to the equations: their errors, and their derivatives by central differences."""
+def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
+    """Add photographs to the equations: errors, and derivatives by central differences."""
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)
     lit, coverage = at.direct()
@@ -155,7 +151,7 @@ def compare(at: CovarianceGroup, layout: Layout, colours: "Equations", silhouett
         factor, changes = float(np.exp(step * calibration.widths[name])), calibration.unknowns[name].changes
         colour = torch.ones(3)
         colour[k] = factor
-        if changes == "light":  # not by the unknown itself, whose mean does not count
+        if changes == "light":  # directly: of the unknown itself the mean is subtracted
             return picture(lit * colour, bounced * colour), coverage
         if changes == "gain":
             return picture(lit, gain=colour), coverage
@@ -178,7 +174,7 @@ def compare(at: CovarianceGroup, layout: Layout, colours: "Equations", silhouett
     error, off = picture(lit) - perceived(seen.rgb, problem.exposure, "log"), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
-    outlined = (covering.abs().amax(0) > 0) | (off != 0)  # where nothing can be wrong, pixels do not count
+    outlined = (covering.abs().amax(0) > 0) | (off != 0)  # pixels away from outlines have no error and do not count
     for n in range(len(index)):
         colours.add(changing[:, n], error[n], surely[n], own[n])
         if seen.masked[n] and problem.capture.threshold is None:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from mi_ring.capture.capture import Capture
+from mi_ring.capture.capture import Capture, Observation
 from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
@@ -25,7 +26,7 @@ from mi_ring.fitting.regulariser_strength import RegulariserStrength
 from mi_ring.fitting.renamed import FIT, Renamed
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.result import result_of
-from mi_ring.fitting.sampler import Sampler
+from mi_ring.fitting.sampler import Batch, Sampler
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.start import require_settings, starting_ring
 from mi_ring.fitting.terms import Loss, TermLike
@@ -38,7 +39,7 @@ from mi_ring.output import results
 from mi_ring.output.fit_result import FitResult
 from mi_ring.system.machine import release_memory
 
-PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: parts of a fit with a state of their own
+PARTS = "sampler", "renderer", "regulariser", "optimisation"  #: have a state of their own
 
 
 class Fit(Renamed):
@@ -107,39 +108,37 @@ class Fit(Renamed):
             self.refine_masks()
         batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
         observation = self.sampler.observe(self.problem, self.capture, batch)
-        prediction = self.renderer.predict(self.problem, self.model, batch)
-        it = Iteration(batch, observation, prediction, self.context())
-        loss = self.loss(it)
-        self.optimisation.step(loss, it)
-        it.prediction = prediction.detached()
+        it = self.optimisation.step(lambda: self.evaluate(batch, observation))
+        self.renderer.remember(it.prediction)
+        it.prediction = it.prediction.detached()
         self.regulariser.note(it)
         self.course.iteration += 1
         self.optimisation.settle(self.schedule, self.iteration)
         self.course.seconds += time.perf_counter() - started
-        self.finish(it)
-        return it
-
-    def finish(self, it: Iteration) -> None:
-        """Validate after the last iteration, log, and call the callbacks."""
-        last = it.number == self.iterations
         if it.number == it.stage.last:
             release_memory()  # what comes next has other sizes
-        if last and len(self.problem.held_out):
+        if (last := it.number == self.iterations) and len(self.problem.held_out):
             masked = replace(self.problem, capture=self.capture)
             self.course.validation = validate(masked, self.model, self.renderer, self.schedule.final_level)
         self.course.record(it, self.optimisation.learning_rate, self.regulariser, last)
         for callback in self.callbacks:
             callback(it)
+        return it
+
+    def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
+        """The loss of a batch for the present model, with its graph. Changes nothing: a step may repeat it."""
+        it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
+        return self.loss(it), it
 
     def context(self) -> Context:
         """What terms and solvers may know at this iteration."""
-        config, problem = self.problem.config, self.problem
-        return Context(config, self.capture, self.model, self.schedule, problem.exposure, problem.lighting.plain > 0,
+        config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
+        return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
     def refine_masks(self) -> None:
         """Find masks anew."""
-        parts = self.capture, self.problem, self.model, self.renderer, self.schedule.final_level
+        parts = self.capture, self.problem.exposure, self.model, self.renderer, self.schedule.final_level
         self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
         self.capture = with_masks(self.problem.capture, self.course.masks)
 
@@ -165,7 +164,7 @@ class Fit(Renamed):
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """The current prediction of photograph `k`: (H, W, 3) linear radiance, at most `width` pixels wide.
 
-        `level`: of the surface. Do not call it within a term of the loss, whose backward pass needs the renderer.
+        `level`: of the surface. Do not call it within a term of the loss: its backward pass needs the renderer.
         """
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 

@@ -32,7 +32,7 @@ class Context:
 
 @dataclass
 class Iteration(renamed.Renamed):
-    """What an iteration has drawn, observed, predicted and weighed. Keep numbers of it: its pictures use memory."""
+    """What an iteration has drawn, observed and predicted. Do not keep it: its pictures use memory."""
 
     batch: Batch
     observation: Observation
@@ -64,7 +64,7 @@ class Iteration(renamed.Renamed):
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """(n, H, W) bool: pixels whose colours count; None: all. In a lit room other pixels show anything."""
+        """(n, H, W) bool: pixels whose colours count; None: all. In a lit room the background does not count."""
         return self.object_pixels() if self.context.capture.lit_room else None
 
     def outline_blur(self) -> float:
@@ -77,5 +77,5 @@ class Iteration(renamed.Renamed):
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]
         error = torch.where(self.observation.clipped[pixels], error.clamp(max=0), error)
-        wrong, light = self.batch.total(torch.stack([error.abs().sum(), self.observation.rgb[pixels].sum()]))
+        wrong, light = self.batch.share.sum(torch.stack([error.abs().sum(), self.observation.rgb[pixels].sum()]))
         return float(wrong / light)

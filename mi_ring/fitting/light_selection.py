@@ -17,21 +17,21 @@ from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
-#: Settings of a coarse fit. They do not depend on those of the fit, so that the choice does not either.
+#: Settings of a coarse fit. They do not depend on those of the fit: neither does the choice.
 COARSE: dict[str, Any] = {
     "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0,
     **{name: getattr(Config(), name) for name in (
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip
 LAST = 12  #: last iterations of a coarse fit whose mean error counts
-ALIKE = 1.1  #: ratio of the lights' strengths above which the user is told
+ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
 #: An environment fixed in the camera looks much like a flash.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.1  #: the fewest lamps are chosen whose error is at most this factor of the least
-PLAIN = 1.2  #: one material at first is chosen if its error is at most this factor of that of a varying one
+ONE_MATERIAL = 1.2  #: one material at first is chosen if its error is below this factor of that of a varying one
 LOOSE = 0.35  #: progress at which one material begins to vary
 FAINT = 0.1  #: least initial strength of a lamp, relative to the first
 ROWS = 16  #: of the map of directions in which lamps are searched
@@ -59,18 +59,18 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
         found = trials.lamps()
     else:
         likely = [Lighting("environment"), Lighting("turntable")]
-        if math.isfinite(trials.error(likely[0])):  # it tells where lamps are
+        if math.isfinite(trials.error(likely[0])):  # the environment shows where lamps are
             likely.insert(1, trials.brightest(1))
         if not is_unlit(capture):
             own = trials.error(Lighting("capture"))
             likely = [one for one in likely if trials.error(one) < BETTER[one.kind] * own] or [Lighting("capture")]
         found = trials.best(*likely)
-        if found.kind in ("environment", "lamps"):  # several lamps are between the two
+        if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
         raise trials.failures[-1]
     if found.kind != "capture":
-        found = trials.plain(found)
+        found = trials.with_material(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
@@ -101,7 +101,7 @@ class CoarseFits:
             fit = Fit(self.capture, config, lighting=lighting)
             iterations = progress(fit, f"trying {lighting}", fit.schedule.iterations, unit="iteration")
             errors = [it.terms["rgb"] for it in iterations][-LAST:]
-        except InputError as error:  # it diverged, or a lamp is inside the object: it is not that light
+        except InputError as error:  # it diverged, or a lamp is inside the object: the light is another
             self.failures.append(error)
             self.errors[lighting], self.found[lighting] = math.inf, lighting
             return math.inf
@@ -140,7 +140,7 @@ class CoarseFits:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """So many lamps in the brightest directions of the environment, as strong as an albedo of one half needs."""
+        """`count` lamps in the brightest directions of the environment. Their strength fits an albedo of one half."""
         self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
@@ -151,12 +151,12 @@ class CoarseFits:
         lamps = tuple((tuple(vector), tuple(one)) for vector, one in zip(vectors.tolist(), rgb.tolist()))
         return Lighting("lamps", lamps, distant)
 
-    def plain(self, lighting: Lighting) -> Lighting:
-        """The lighting that was found; with one material at first if that explains the photographs as well."""
-        one = lighting._replace(plain=1.0)
-        if self.error(one) >= PLAIN * self.error(lighting) or not self.are_apart(one):
+    def with_material(self, lighting: Lighting) -> Lighting:
+        """The lighting that was found, with one material at first if that explains the photographs about as well."""
+        one = lighting._replace(one_material_until=1.0)
+        if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
-        return self.found[one]._replace(plain=LOOSE)
+        return self.found[one]._replace(one_material_until=LOOSE)
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
@@ -168,7 +168,7 @@ def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
 
-    Colours are relative to the first lamp, which is white: its colour cannot be told from the object's. `harmonics`
+    Colours are relative to the first lamp, taken to be white: the object could have its colour. `harmonics`
     (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
     light: each direction in turn moves to its best place, until none moves.
     """
@@ -179,7 +179,7 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
-        """Strengths (n + 1, C) and what is left."""
+        """Strengths (n + 1, C) of the lamps and of constant light, and the sum of squared residuals."""
         design = np.concatenate([lobes[:, chosen], grey], 1)
         solved = [nnls(design, colour) for colour in colours.T]
         return np.stack([strengths for strengths, _ in solved], 1), sum(rest**2 for _, rest in solved)

@@ -31,7 +31,7 @@ class Lighting(NamedTuple):
     kind: Kind  #: as `Config.light`, except "auto"
     lamps: tuple[Lamp, ...] = ()
     distant: bool = False  #: Are the lamps infinitely far away?
-    plain: float = 0.0  #: progress until which the object has a single material; 0: from the start it varies
+    one_material_until: float = 0.0  #: progress until which the object has one material; 0: never
 
     @classmethod
     def of(cls, capture: Capture, config: Config) -> "Lighting":
@@ -49,14 +49,14 @@ class Lighting(NamedTuple):
         """For people, for instance: environment, 1 lamp, 2 distant lamps."""
         count = len(self.lamps)
         kind = f"{count} {'distant ' * self.distant}lamp{'s' * (count > 1)}" if count else self.kind
-        return kind + " on one material" * (self.plain > 0)
+        return kind + " on one material" * (self.one_material_until > 0)
 
     def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The material (V, …) of a fit at this progress: the mean over all vertices as long as it is `plain`.
+        """The material (V, …) of a fit at this progress: the mean over all vertices until `one_material_until`.
 
         Photographs hardly tell slow changes of albedo from slow changes of light. So the light explains both.
         """
-        if progress >= self.plain:
+        if progress >= self.one_material_until:
             return material
         return {name: value.mean(0, keepdim=True).expand_as(value) for name, value in material.items()}
 
@@ -108,10 +108,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """The lighting with the lamps that a fit has found: those of `capture`, which it has calibrated.
+    """The lighting with the lamps that a fit has found. `capture`: as the fit has calibrated it.
 
-    All lamps are scaled so that the first brings as much light as before to the object at `center` (3,): the albedo
-    is assumed.
+    All lamps are scaled, so that the first brings as much light to the object at `center` (3,) as before: the albedo
+    is an assumption.
     """
     if not lighting.lamps:
         return lighting
@@ -163,6 +163,6 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """Axes in which unknown room light is fixed."""
+    """Axes in which unknown room light is fixed: "world", "camera"."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

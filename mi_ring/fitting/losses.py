@@ -8,6 +8,8 @@ from torch import Tensor
 
 from mi_ring.images import blur
 
+STEP = 0.02  #: of the Laplacian; small against the period of the encoding's highest frequency
+
 
 def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
     """Radiance in units of `exposure`, on the scale on which the colour loss `kind` compares it."""
@@ -57,14 +59,12 @@ def mask_loss(
     return (square / (1 + square / doubt**2)).mean()
 
 
-def velocity_loss(
-    velocity: Callable[[Tensor], Tensor], x: Tensor, laplacian_scale: float, step: float = 0.02
-) -> Tensor:
+def velocity_loss(velocity: Callable[[Tensor], Tensor], x: Tensor, laplacian_scale: float) -> Tensor:
     """L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) on the paths of the flow; α = `laplacian_scale`.
 
-    The Laplacian over ℝ³ is the seven-point stencil of width `step`, small against the period of the highest frequency.
+    The Laplacian over ℝ³ is computed by differences to six points at the distance `STEP`.
     """
-    offsets = step * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
+    offsets = STEP * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
     v = velocity(torch.cat([x[None], x + offsets[:, None]]))
-    laplacian = (v[1:] - v[0]).sum(0) / step**2
+    laplacian = (v[1:] - v[0]).sum(0) / STEP**2
     return (v[0] - laplacian_scale * laplacian).square().sum(-1).mean()

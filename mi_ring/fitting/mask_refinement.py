@@ -1,4 +1,4 @@
-"""Mask refinement: masks are found anew during a fit, by GrabCut near what the surface covers by then."""
+"""Mask refinement: during a fit, GrabCut finds the masks again, near the outline of the current surface."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +14,12 @@ from torch import Tensor
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.grabcut import grabcut, overlap
 from mi_ring.fitting.model import Model
-from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import prediction
 from mi_ring.system.progress import progress
 
-LARGEST = 512  #: largest side of the pictures in which they are found [px]
+LARGEST = 512  #: largest side of the pictures in which masks are found [px]
 BAND = 0.04  #: how far the surface may be off, relative to the object's size
 PLAUSIBLE = 0.8  #: overlap with the surface's coverage below which a mask is not used
 BRIGHTNESS = 0.25  #: linear brightness of the object in these pictures
@@ -28,23 +27,23 @@ BRIGHTNESS = 0.25  #: linear brightness of the object in these pictures
 Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduced size, by photograph
 
 
-def find_masks(capture: Capture, problem: Problem, model: Model, renderer: Renderer, level: int) -> Masks:
+def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
     """New masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
 
-    `level`: of the surface.
+    `exposure`: mean radiance of the object. `level`: of the surface.
     """
     capture = model.calibrated(capture)
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     places: dict[tuple, list[int]] = {}
     for k, shot in enumerate(capture.shots):
         places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture, coverage of the surface, and pixels that are certainly background."""
+        """Picture (h, w, 3), coverage of the surface (h, w), and pixels (h, w) that are certainly background."""
         scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
-        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / problem.exposure)))
+        picture = to_bytes(linear_to_srgb(seen.rgb.mean(0).numpy() * (BRIGHTNESS / exposure)))
         background = np.zeros(picture.shape[:2], bool)
         if seen.valid is not None:
             background |= ~seen.valid.numpy().any(0)
@@ -69,7 +68,7 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape
-        scale = width // columns  # the rest is narrower than a pixel of the mask
+        scale = width // columns  # what remains at the border is narrower than a pixel of the mask
         whole = cv2.resize(255 * mask.numpy(), (scale * columns, scale * rows), interpolation=cv2.INTER_LINEAR)
         return np.pad(whole, ((0, height - scale * rows), (0, width - scale * columns)), "edge")
 

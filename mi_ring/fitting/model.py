@@ -7,8 +7,9 @@ from torch import nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
+from mi_ring.fitting.lighting import room_frames
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.refinement import initial_power, refined_of
+from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Sphere
 from mi_ring.objects.fitted_object import FittedObject
 
@@ -22,25 +23,25 @@ class Model(nn.Module):
         super().__init__()
         self.ring = ring
         center = ring.center.cpu().numpy()
-        self.albedo = problem.albedo(center)  #: of the object, according to the lights' intensities
+        refinement = Refinement.of(problem, center)
+        self.albedo = refinement.albedo  #: of the object, according to the lights' intensities
         self.calibration = None
-        lighting, config = problem.lighting, problem.config
-        if refined := refined_of(problem.seen, config, lighting.kind, self.albedo):
-            power, ahead = initial_power(refined, self.albedo), "light" in config.refine
-            rig = Rig(problem.capture, center, problem.exposure, problem.fitted, power, bool(lighting.lamps), ahead,
-                      lamps="lamps" in refined)  # fmt: skip
-            self.calibration = Calibration(problem.capture, refined, rig, problem.room_frames)
+        capture, lighting = problem.capture, problem.lighting
+        if refined := refinement.refined:
+            rig = Rig(capture, center, problem.exposure, problem.fitted, refinement.power, bool(lighting.lamps),
+                      "light" in problem.config.refine, lamps="lamps" in refined)  # fmt: skip
+            self.calibration = Calibration(capture, refined, rig, room_frames(capture, lighting))
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:
-        """Whether the surface stays as it is. Parameters that were frozen from the start stay frozen."""
+        """Fix the surface, or let it move. Parameters that were frozen at the start stay frozen."""
         for parameter in self.to_freeze:
             parameter.requires_grad_(not fixed)
 
     def update_albedo(self) -> None:
-        """Scale the material's brightness by what the fit has found of the power of all lights."""
+        """Scale the material's brightness by the power of all lights that the fit has found."""
         if self.calibration and "scale" in self.calibration.refined:
             net, initial = self.ring.brdf_net, self.albedo / self.calibration.rig.power / math.pi
             net.set_parameters(net.bsdf_parameters, initial * self.calibration.albedo_factor)

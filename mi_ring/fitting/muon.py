@@ -11,21 +11,22 @@ from mi_ring.nets.chunks import in_parallel
 #: Coefficients of the quintic of Newton and Schulz, and how often it is applied (Jordan et al. 2024, "Muon: an
 #: optimizer for hidden layers in neural networks").
 COEFFICIENTS, ITERATIONS = (3.4445, -4.775, 2.0315), 5
+MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """`torch.optim.Muon` without weight decay, that orthogonalises in a `dtype` of one's choice.
+    """`torch.optim.Muon` without weight decay, with a choice of the `dtype` in which it orthogonalises.
 
-    PyTorch's own does so in bfloat16, which most processors emulate: there it takes 20 times as long as in float32.
+    PyTorch's own takes bfloat16. Most processors emulate it, 20 times as slow as float32.
     """
 
-    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype, momentum: float = 0.95) -> None:
-        super().__init__(params, {"lr": lr, "momentum": momentum})
+    def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
+        super().__init__(params, {"lr": lr})
         self.dtype = dtype
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step. A tall matrix takes a longer one, by the root of how much taller it is."""
+        """One step. That of a tall matrix is longer, by the root of height / width."""
         for group in self.param_groups:
             params = [p for p in group["params"] if p.grad is not None]
             updates = []
@@ -33,8 +34,8 @@ class Muon(torch.optim.Optimizer):
                 state = self.state[p]
                 if not state:
                     state["momentum_buffer"] = torch.zeros_like(p.grad)
-                momentum = state["momentum_buffer"].lerp_(p.grad, 1 - group["momentum"])
-                updates.append(p.grad.lerp(momentum, group["momentum"]))
+                momentum = state["momentum_buffer"].lerp_(p.grad, 1 - MOMENTUM)
+                updates.append(p.grad.lerp(momentum, MOMENTUM))
             if updates and updates[0].device.type == "cpu":  # small matrices: one per thread is faster than one by all
                 updates = in_parallel(torch.no_grad()(partial(orthogonalised, dtype=self.dtype)), updates)
             else:
@@ -45,7 +46,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """About the nearest matrix with orthonormal rows or columns: singular values are brought to between 0.7 and 1.2."""
+    """About the nearest matrix with orthonormal rows or columns: its singular values are between 0.7 and 1.2."""
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

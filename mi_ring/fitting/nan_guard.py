@@ -19,7 +19,7 @@ class NanGuard:
     def __init__(
         self, model: nn.Module, optimizers: Sequence[torch.optim.Optimizer], state: dict[str, Any] | None = None
     ) -> None:
-        """The parameters are good at the beginning. `state`: what `state()` of an interrupted fit returned."""
+        """The parameters must be finite now. `state`: what `state()` of an interrupted fit returned."""
         self.model, self.optimizers = model, optimizers
         self.factor: float = 1.0  #: of all learning rates
         self.retreats: int = 0  #: how often the copy was restored
@@ -36,9 +36,9 @@ class NanGuard:
         return all(bool(t.sum().isfinite()) for t in tensors)
 
     def note(self, healthy: bool) -> bool:
-        """Record an iteration, which made its step if it was `healthy`. Restore the copy if necessary.
+        """Record an iteration, and restore the copy if necessary. Returns False if that has happened too often.
 
-        Returns False when that has happened too often.
+        `healthy`: loss and gradients were finite, and the optimisers have made their steps.
         """
         self.failures = 0 if healthy else self.failures + 1
         if self.failures < PATIENCE and self.finite():
@@ -52,10 +52,10 @@ class NanGuard:
         return self.retreats <= RETREATS
 
     def keep(self) -> None:
-        """Copy parameters and optimiser states, which are good now."""
+        """Copy parameters and optimiser states. They must be finite now."""
         parts: list[Any] = [self.model, *self.optimizers]
         self.copy, self.steps = copy.deepcopy([part.state_dict() for part in parts]), 0
 
     def state(self) -> dict[str, Any]:
-        """Numbers for a checkpoint. The copy is not needed: parameters in a checkpoint are good."""
+        """Numbers for a checkpoint. It needs no copy: its parameters are finite."""
         return {"factor": self.factor, "retreats": self.retreats, "failures": self.failures}

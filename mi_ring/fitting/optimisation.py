@@ -1,6 +1,6 @@
 """The optimisation: Muon for hidden weights, Adam for the rest, and one guarded step of all."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -17,13 +17,12 @@ from mi_ring.fitting.nan_guard import NanGuard
 from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import START
-from mi_ring.fitting.room_solver import RoomSolver
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.terms import Term
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
-CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped, lest it diverges
+CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
 
 def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
@@ -32,14 +31,8 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
     Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear layers.
     """
     lists = [getattr(part, "hidden", None) for part in networks.modules()]
-    hidden: list[Any] = [
-        layer.weight
-        for layers in lists
-        if isinstance(layers, nn.ModuleList)
-        for layer in layers
-        if isinstance(layer, nn.Linear)
-    ]
-    hidden = hidden if config.optimizer == "muon" else []
+    layers = [layer for some in lists if isinstance(some, nn.ModuleList) for layer in some]
+    hidden = [layer.weight for layer in layers if isinstance(layer, nn.Linear) and config.optimizer == "muon"]
     rest = [p for p in networks.parameters() if not any(p is h for h in hidden)]
     adam = torch.optim.Adam(rest, lr=config.learning_rate)
     result = [Stepper(adam, [Rate(config.learning_rate, config.decay)])]
@@ -59,34 +52,47 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
     return [Stepper(adam, [Rate(CALIBRATION_RATE, config.decay, START)] * len(groups))]
 
 
+@torch.no_grad()
+def solve_room(calibration: Calibration, it: Iteration) -> None:
+    """Add an iteration's photographs to the normal equations of the room's light and solve them, once it is time."""
+    other, seen, batch = it.prediction.other_light, it.observation, it.batch
+    if other is None or not calibration.solves_room(it.progress):
+        return
+    pixels = it.object_pixels() & ~seen.clipped.any(-1)
+    observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
+    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum)
+
+
 class Optimisation:
-    """All optimisers of a model with their learning rates, solvers of calibration, and the guard against NaN."""
+    """The optimisers of a model with their learning rates, the solvers of calibration, and the guard against NaN."""
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
         """`terms`: of the loss."""
         self.problem, self.model = problem, model
         self.steppers = network_steppers(model.ring, problem.config, problem.device)
-        self.solvers: list[RoomSolver | ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
+        self.solvers: list[ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
         if calibration := model.calibration:
-            self.solvers.append(RoomSolver(calibration))
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
             if "cameras" in calibration.refined:
                 self.solvers.append(PoseSolver(calibration, model.starts_near, terms))
             self.steppers += calibration_steppers(calibration, problem.config)
-            self.steppers += [s.stepper() for s in self.solvers if isinstance(s, torch.optim.Optimizer)]
+            self.steppers += [Stepper(solver, [solver.rate]) for solver in self.solvers]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]
         self.guard = NanGuard(model, self.optimizers)
 
-    def step(self, loss: Tensor, it: Iteration) -> None:
-        """Backpropagate the loss of an iteration and step all optimisers; no step if anything is not finite.
+    def step(self, evaluate: Callable[[], tuple[Tensor, Iteration]]) -> Iteration:
+        """Evaluate the loss of an iteration, backpropagate it, and step all optimisers. Returns the iteration.
 
-        Nothing happens if no term applies, for instance masks alone and photographs without masks. Raises InputError
-        if the fit diverges.
+        No optimiser steps if a number is not finite, or if no term of the loss applies: for instance masks alone, and
+        photographs without masks. Optimisers may `evaluate` again. Raises InputError if the fit diverges.
         """
+        loss, it = evaluate()
+        if self.model.calibration:
+            solve_room(self.model.calibration, it)
         for solver in self.solvers:
             solver.look(it)
         if not it.terms:
-            return
+            return it
         self.backward(loss, it)
         clip = torch.nn.utils.clip_grad_norm_
         ring, calibration = self.model.ring, self.model.calibration
@@ -94,27 +100,30 @@ class Optimisation:
         others = [p.grad for p in calibration.parameters() if p.grad is not None] if calibration else []
         # The renderer may lose a NaN on the way back, so the loss is checked, too.
         healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
-        for optimizer, rates in self.steppers:
+        for optimizer, rates, evaluates in self.steppers:
             for group, rate in zip(optimizer.param_groups, rates):
                 group["lr"] = learning_rate(rate, it.progress) * self.guard.factor
-            if healthy:
+            if healthy and evaluates:
+                optimizer.step(lambda: self.backward(*evaluate()))
+            elif healthy:
                 optimizer.step()
         if not self.guard.note(healthy):
             option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
             path = self.problem.capture.path
             raise InputError(f"{path}: diverged at iteration {it.number - 1}; try a lower {option}")
         self.model.update_albedo()
+        return it
 
     def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Fix the surface during the settling stage, and start the room's normal equations anew at its beginning."""
-        fixed = schedule.surface_fixed(iteration)
+        """Fix the surface during the settling stage. At its start, reset the room light's equations."""
+        fixed = schedule.shaping <= iteration < schedule.iterations
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()
-            self.guard.keep()  # so that a retreat does not bring it back
+            self.guard.keep()  # so that a retreat does not restore the old equations
 
-    def backward(self, loss: Tensor, it: Iteration) -> None:
-        """Gradients of the loss, summed over all processes."""
+    def backward(self, loss: Tensor, it: Iteration) -> float:
+        """Compute the gradients of the loss, summed over all processes. Returns the loss of all processes."""
         processes = self.problem.processes
         for optimizer in self.optimizers:
             optimizer.zero_grad()
@@ -124,6 +133,7 @@ class Optimisation:
             with torch.autograd.set_multithreading_enabled(False):  # Dr.Jit has one state per thread
                 loss.backward()
         processes.sum_gradients([p for o in self.optimizers for group in o.param_groups for p in group["params"]])
+        return it.loss
 
     @property
     def learning_rate(self) -> float:

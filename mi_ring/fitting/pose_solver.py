@@ -1,7 +1,7 @@
 """Solves for the poses of cameras by Gauss-Newton, from how a picture moves with its camera.
 
-An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps, which do not depend on
-the size of an error, move right cameras away or arrive too late. The gradient is that of the loss; this module computes
+An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps do not depend on the size
+of an error: they move correct cameras away, or arrive too late. The gradient is that of the loss. This module computes
 the curvature to divide it by. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews,
 IJCV 2004), with the surface in place of a template.
 """
@@ -16,7 +16,7 @@ from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
-from mi_ring.fitting.schedule import Rate, Stepper
+from mi_ring.fitting.schedule import Rate
 from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.images import blur
 
@@ -25,8 +25,8 @@ from mi_ring.images import blur
 DAMPING, FLOOR = 0.1, 0.01
 LONGEST = 3.0  #: longest step [standard deviations]
 INITIAL, DECAY = 1.0, 0.5  #: factor of the steps: it decreases to average over iterations
-LEAST = 1e-9  #: least curvature: what no photograph determines stays
-NEAR, FAR = 0.2, 0.4  #: progress at which they begin, for a start near the object and far from it
+LEAST = 1e-9  #: least curvature: what photographs do not determine stays unchanged
+NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the object and far from it
 
 
 def slopes(picture: Tensor) -> Tensor:
@@ -40,10 +40,10 @@ def slopes(picture: Tensor) -> Tensor:
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
     """How far the pixels of a sphere move with the camera: (H, W, 2, 6) [px], right and down.
 
-    For a turn [rad] about each axis of the camera and a step [scene units] along each, Mitsuba's axes. `intrinsics`
-    (4,) fx, fy, cx, cy [px], of a pinhole: distortion changes little of it; `size` (width, height); `center` (3,) of
-    the sphere, in the camera's axes, of which a camera inside it sees a smaller one. Where a ray misses it, the depth
-    is that of the point next to it.
+    The six columns: a turn [rad] about each axis of the camera, and a step [scene units] along each (Mitsuba's axes).
+    `intrinsics` (4,): fx, fy, cx, cy [px]; distortion hardly matters. `size`: (width, height). `center` (3,): of the
+    sphere, in the camera's axes. It is made smaller if the camera is inside. Rays that miss it have the depth of their
+    point nearest to it.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
@@ -81,18 +81,15 @@ class PoseSolver(torch.optim.Optimizer):
         self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
 
-    def stepper(self) -> Stepper:
-        """With its rate."""
-        return Stepper(self, [self.rate])
-
     def look(self, it: Iteration) -> None:
         """Remember the photographs of an iteration and the curvature of its loss."""
-        begun = it.progress >= self.rate.start
-        self.seen = (torch.from_numpy(it.batch.all_photographs), it.batch.gathered(curvature(it))) if begun else None
+        self.seen = None
+        if it.progress >= self.rate.start:
+            self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """One step along the gradients that the parameters have; none before refinement begins."""
+        """One step along the current gradients. Nothing moves before refinement begins."""
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:
@@ -111,8 +108,9 @@ class PoseSolver(torch.optim.Optimizer):
 def curvature(it: Iteration) -> Tensor:
     """Second derivatives (n, 6, 6) of the loss of an iteration by `turn` and `move` of its photographs.
 
-    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. Absolute differences count as
-    squares of the same slope (iteratively reweighted least squares); those below the mean count as the mean.
+    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. An absolute difference counts
+    as a square with the same slope (iteratively reweighted least squares). The slope of the mean difference is used
+    for those below the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape
@@ -123,7 +121,7 @@ def curvature(it: Iteration) -> Tensor:
         weight = 2 * torch.ones_like(error)
     else:
         covered = error[prediction.coverage > 0.5]
-        total, count = it.batch.total(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
+        total, count = it.batch.share.sum(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
         mean = (total / count).nan_to_num(1.0).clamp(min=1e-6)
         weight = 1 / error.maximum(mean)
     weight *= ~seen.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
@@ -132,7 +130,7 @@ def curvature(it: Iteration) -> Tensor:
     weight *= it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * weight[0].numel())
     colours = perceived(prediction.rgb, context.exposure, kind)
     silhouettes = blur(prediction.coverage, it.outline_blur())
-    masked = max(1.0, float(it.batch.total(seen.masked.sum())))
+    masked = max(1.0, float(it.batch.share.sum(seen.masked.sum())))
     mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * height * width)
 
     at, radius = calibration(it.batch.scale), float(context.model.ring.radius)

@@ -1,7 +1,5 @@
-"""The problem that a fit solves: photographs as they are lit, and settings. Fixed from the first iteration on."""
+"""The problem that a fit solves: photographs, their lights, and settings. It does not change during the fit."""
 
-import math
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -12,7 +10,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.reduction import WIDTH, reduced
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, room_frames, with_lighting
+from mi_ring.fitting.lighting import Lighting, environment_as_harmonics, with_lighting
 from mi_ring.fitting.processes import Processes, current
 from mi_ring.system.machine import device
 
@@ -23,11 +21,11 @@ class Problem:
 
     given: Capture  #: the capture as it was handed in, with photographs of any size
     capture: Capture  #: lit by `lighting`
-    seen: Capture  #: of it the photographs that are fitted
-    scene: mi.Scene  #: to render, without an environment that is among the room's harmonics
+    seen: Capture  #: the photographs of `capture` that are fitted
+    scene: mi.Scene  #: without the environment, if `environment` has it
     config: Config
     lighting: Lighting
-    environment: np.ndarray | None  #: (BASIS, 3) harmonics of the scene's own environment, if it was made one
+    environment: np.ndarray | None  #: (BASIS, 3) of the scene's environment, see `environment_as_harmonics`
     fitted: np.ndarray  #: indices of the photographs that are fitted
     held_out: np.ndarray  #: indices of the others
     exposure: float  #: mean radiance of the object in the fitted photographs
@@ -44,15 +42,6 @@ class Problem:
         seen = as_lit.part(fitted) if len(held_out) else as_lit
         return cls(given, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
                    current(), device())  # fmt: skip
-
-    @property
-    def room_frames(self) -> Collection[str]:
-        """Axes in which unknown room light is fixed: "world", "camera"."""
-        return room_frames(self.capture, self.lighting)
-
-    def albedo(self, center: np.ndarray) -> float:
-        """Albedo of an object at `center` (3,) according to the lights' intensities; above 1 they cannot be true."""
-        return math.pi * self.seen.reflectance(center, self.exposure)
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:

@@ -80,13 +80,13 @@ class Team(Processes):
         self.distributed = distributed
         self.rank, self.count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
         self.on_this_machine = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
-        # NCCL wants a GPU of its own for each process; what is no tensor goes through the processor.
+        # NCCL needs a GPU of its own for each process. Objects that are no tensors go through the processor.
         own = self.on_this_machine == 1 or os.environ.get(OWN) == "1"
         self.nccl = own and torch.cuda.is_available() and distributed.is_nccl_available()
         distributed.init_process_group("cpu:gloo,cuda:nccl" if self.nccl else "gloo")
-        atexit.register(self.part)
+        atexit.register(self.leave)
 
-    def part(self) -> None:
+    def leave(self) -> None:
         """Leave the process group when the process ends. A process cannot join twice."""
         with contextlib.suppress(RuntimeError):
             self.distributed.destroy_process_group()
@@ -100,7 +100,7 @@ class Team(Processes):
                               "checkpoint with the same command and --resume") from error  # fmt: skip
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """As of one process."""
+        """See `Processes`."""
         place = device() if self.nccl else torch.device("cpu")
         total = tensor.detach().to(place, copy=True).contiguous()
         self.exchanged, self.exchanges = self.exchanged + total.numel() * total.element_size(), self.exchanges + 1
@@ -108,13 +108,13 @@ class Team(Processes):
         return total.to(tensor.device)
 
     def broadcast(self, value: Value) -> Value:
-        """As of one process."""
+        """See `Processes`."""
         box = [pickle.dumps(value) if self.rank == 0 else None]
         self.attempt(lambda: self.distributed.broadcast_object_list(box))
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """As of one process; if several processes fail, the message of the first of them is used."""
+        """See `Processes`. If several processes fail, the message of the first of them is used."""
         result: Any = None
         error: InputError | None = None
         try:
@@ -130,16 +130,15 @@ class Team(Processes):
         return result
 
     def on_first(self, work: Callable[[], Value]) -> Value:
-        """As of one process."""
-        outcome: tuple[str, Any] | None = None
+        """See `Processes`."""
+        outcome: Any = None
         try:
             outcome = ("value", work()) if self.rank == 0 else None
         except InputError as error:
             outcome = ("error", str(error))
         except SystemExit as stop:
             outcome = ("exit", stop.code)
-        told: Any = self.broadcast(outcome)
-        kind, value = told
+        kind, value = self.broadcast(outcome)
         if kind == "error":
             raise InputError(value)
         if kind == "exit":
@@ -147,17 +146,17 @@ class Team(Processes):
         return value
 
     def maximum(self, number: int) -> int:
-        """As of one process."""
+        """See `Processes`."""
         numbers = torch.tensor([number])
         self.attempt(lambda: self.distributed.all_reduce(numbers, self.distributed.ReduceOp.MAX))
         return int(numbers)
 
     def barrier(self) -> None:
-        """As of one process."""
+        """See `Processes`."""
         self.maximum(0)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """As of one process, all in one exchange."""
+        """See `Processes`. All gradients go in one exchange."""
         place = device()
         has = torch.tensor([float(p.grad is not None) for p in parameters])
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
@@ -172,7 +171,7 @@ class Rows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, share: "Share") -> Tensor:
-        """As of `Share.gathered`."""
+        """See `Share.gathered`."""
         ctx.share = share
         return share.gathered(own)
 

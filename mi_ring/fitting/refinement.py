@@ -1,10 +1,14 @@
 """Which unknowns of calibration a fit refines, and when."""
 
-from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
 
 from mi_ring.calibration.calibration import OPTIONS
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.problem import Problem
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
@@ -15,6 +19,30 @@ AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
 START = 0.2  #: progress of the fit at which refinement begins
+
+
+class Refinement(NamedTuple):
+    """What a fit refines, and how bright object and lights are at its start."""
+
+    reflectance: float  #: of the object, according to the lights' intensities
+    refined: tuple[str, ...]  #: options of `--refine`
+    power: float  #: initial factor of all lights' strengths
+
+    @classmethod
+    def of(cls, problem: Problem, center: np.ndarray) -> "Refinement":
+        """`center`: (3,) of the object.
+
+        If `scale` is refined and the albedo is impossible, `power` makes it a usual one.
+        """
+        reflectance = problem.seen.reflectance(center, problem.exposure)
+        albedo = math.pi * reflectance
+        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo)
+        return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
+
+    @property
+    def albedo(self) -> float:
+        """Albedo of the object, according to the lights' intensities; above 1 they cannot be true."""
+        return math.pi * self.reflectance
 
 
 def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
@@ -34,8 +62,3 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> t
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
-
-
-def initial_power(refined: Sequence[str], albedo: float) -> float:
-    """Initial factor of all lights' strengths: 1, or what turns an impossible albedo into a usual one for `scale`."""
-    return albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0

@@ -9,7 +9,7 @@ from mi_ring.scene.self_intersections import crossing_triangles
 CROSSING = 1e-3  #: share of self-intersecting triangles above which the regulariser gets stronger
 CROSSING_EVERY = 20  #: iterations between counts of them
 STRONGEST = -0.3  #: smallest value of `weakened`
-RETREAT, CATCH_UP = 2.0, 3.0  #: how fast `weakened` falls then and rises later; progress rises with 1
+RETREAT, CATCH_UP = 2.0, 3.0  #: how fast `weakened` falls then and rises later, relative to progress
 RECENT = 0.1  #: weight of an iteration in the running mean of `unexplained`
 LATE = 0.6  #: progress after which self-intersections mean that the regulariser is too weak
 UNEXPLAINED = 0.2  #: share of unexplained light at which the regulariser has full strength; exact captures end at 0.07
@@ -20,7 +20,7 @@ class RegulariserStrength:
 
     def __init__(self) -> None:
         self.crossing: float = 0.0  #: share of self-intersecting triangles at the last count
-        self.weakened: float = 0.0  #: how far the regulariser has weakened: progress, unless held back
+        self.weakened: float = 0.0  #: how far the regulariser has weakened: equals progress, unless something is wrong
         self.held: bool = False  #: Did the surface intersect itself late?
         self.unexplained: float = 1.0  #: running mean of `Iteration.unexplained`
 
@@ -47,7 +47,7 @@ class RegulariserStrength:
     def strength(self, decay: float) -> float:
         """A factor of the regulariser's weight, which falls to `decay`. It is 1 while much light is unexplained.
 
-        What no surface explains (wrong lights, a room that is not dark), a weak regulariser would explain by folds.
+        With wrong lights, or in a room that is not dark, a weak regulariser would let the surface fold.
         """
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 

@@ -7,7 +7,7 @@ FIT = {
     "held_out": "problem.held_out", "fitted": "problem.fitted", "exposure": "problem.exposure",
     "lighting": "problem.lighting", "environment": "problem.environment", "device": "problem.device",
     "calibration": "model.calibration", "albedo": "model.albedo", "surface": "renderer.surface",
-    "averages": "renderer.average", "stages": "schedule.stages", "terms": "loss.terms", "log": "course.log",
+    "averages": "renderer.averages", "stages": "schedule.stages", "terms": "loss.terms", "log": "course.log",
     "seconds": "course.seconds", "outlines": "course.masks", "confirmed": "course.validation",
     "restraint": "regulariser", "caution": "optimisation.guard", "optimizers": "optimisation.optimizers",
     "rounds": "sampler", "random": "sampler.random", "summary": "result().calibration",
@@ -15,7 +15,8 @@ FIT = {
 }  # fmt: skip
 ITERATION = {
     "fit": "context", "s": "batch.points", "faces": "batch.faces", "index": "batch.photographs",
-    "everything": "batch.all_photographs", "scale": "batch.scale", "share": "batch", "photographs": "prediction.views",
+    "everything": "batch.all_photographs", "scale": "batch.scale", "share": "batch.share",
+    "photographs": "prediction.photographs",
     "vertices": "prediction.vertices", "material": "prediction.material", "predicted": "prediction.rgb",
     "coverage": "prediction.coverage", "observed": "observation.rgb", "clipped": "observation.clipped",
     "mask": "observation.mask", "masked": "observation.masked", "valid": "observation.valid",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.indirect_average import IndirectAverage
+from mi_ring.fitting.indirect_average import Averages, averaged
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.sampler import Batch
@@ -29,10 +29,9 @@ class Prediction:
     material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
     rgb: Tensor  #: (n, H, W, 3) radiance as the camera records it, decoded like the photographs
     coverage: Tensor  #: (n, H, W) of the object, in [0, 1]
-    views: Photographs  #: cameras and lights of these photographs, as refined so far
-    other_light: (
-        GlobalIllumination | None
-    )  #: interreflection and room light in small pictures, where they were rendered
+    photographs: Photographs  #: with their cameras and lights as refined so far
+    other_light: GlobalIllumination | None  #: interreflection and room light; None: not rendered
+    averages: Averages  #: of interreflection, with these photographs; see `Renderer.remember`
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
 
     def detached(self) -> "Prediction":
@@ -47,9 +46,9 @@ class Renderer:
     def __init__(self, problem: Problem, ring: FittedObject) -> None:
         self.surface = Surface(problem.scene, problem.capture.shape, ring)
         self.autocast: Callable[[], Any] = autocast(problem.config.precision, problem.device)
-        self.average = IndirectAverage()
+        self.averages: Averages = {}  #: of interreflection
 
-    def showing(self, model: Model, level: int) -> Surface:
+    def show(self, model: Model, level: int) -> Surface:
         """The surface of a model at this level of the icosphere, under its lamps, to be drawn without gradients."""
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
@@ -58,36 +57,38 @@ class Renderer:
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
         """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
-        photograph = capture.photograph(k, -(-capture.shots[k].size[0] // width))
-        rgb, _ = prediction.draw(self.showing(model, level), photograph, spp, shadows=capture.shadows,
-                                 indirect=model.ring.indirect)  # fmt: skip
+        photograph, surface = capture.photograph(k, -(-capture.shots[k].size[0] // width)), self.show(model, level)
+        rgb, _ = prediction.draw(surface, photograph, spp, shadows=capture.shadows, indirect=model.ring.indirect)
         return rgb[0].numpy()
 
     def predict(self, problem: Problem, model: Model, batch: Batch) -> Prediction:
-        """Evaluate the networks at the batch's points and render its photographs (paper, section 3)."""
+        """Evaluate the networks at the batch's points and render its photographs (paper, section 3).
+
+        The same model and batch give the same prediction, until the next `remember`.
+        """
         config, calibration = problem.config, model.calibration
         vertices, material = self.deform(problem, model.ring, batch)
         self.surface.set_faces(batch.faces)
-        views = problem.capture.photographs.select(batch.photographs, batch.size, batch.scale)
-        views = replace(views, before=batch.share.part.start)
+        photographs = problem.capture.photographs.select(batch.photographs, batch.size, batch.scale)
+        photographs = replace(photographs, before=batch.share.part.start)
         refined = None
         if calibration:
             refined = calibration(batch.scale).to(problem.device)
-            views = calibration.refined_photographs(views, refined)
+            photographs = calibration.refined_photographs(photographs, refined)
         linear, coverage = prediction.render(
-            self.surface, views, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
+            self.surface, photographs, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
             shadows=config.shadows and problem.capture.shadows, views=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
         )  # fmt: skip
-        other = self.other_light(problem, model, batch, views, coverage)
+        other, averages = self.other_light(model, batch, photographs, coverage)
         if other and model.ring.indirect:
             bounced = other.interreflection
             linear = linear + (calibration.indirect(bounced) if calibration else bounced)
         without_room = linear.detach()
-        if other and views.harmonics:
-            linear = linear + other.occlusion(torch.from_numpy(views.room).to(linear))
+        if other and photographs.harmonics:
+            linear = linear + other.occlusion(torch.from_numpy(photographs.room).to(linear))
         rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
-        return Prediction(vertices, material, rgb, coverage, views, other, without_room)
+        return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room)
 
     def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Vertices (V, 3) and material (V, …) at the batch's points. Several processes share the evaluation."""
@@ -98,24 +99,26 @@ class Renderer:
         return vertices, problem.lighting.material_at(batch.progress, dict(zip(material, parameters)))
 
     def other_light(
-        self, problem: Problem, model: Model, batch: Batch, views: Photographs, coverage: Tensor
-    ) -> GlobalIllumination | None:
-        """Interreflection and room light in the photographs; None if neither is part of the prediction."""
-        calibration = model.calibration
-        solving = calibration is not None and calibration.solves_room(batch.progress)
-        harmonics = calibration.room.which if calibration and solving else views.harmonics
-        if not (model.ring.indirect or harmonics):
-            return None
-        other = GlobalIllumination.of(self.surface, views, coverage, batch.seeds["indirect"], harmonics=harmonics,
-                                    indirect=model.ring.indirect)  # fmt: skip
-        if model.ring.indirect and self.surface.table is not None:
-            other = self.average.add(other, batch.all_photographs, batch.gathered, batch.share.part)
-        return other
+        self, model: Model, batch: Batch, photographs: Photographs, coverage: Tensor
+    ) -> tuple[GlobalIllumination | None, Averages]:
+        """Interreflection and room light in the photographs, and new averages; None if there is neither light."""
+        calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
+        if calibration and calibration.solves_room(batch.progress):
+            harmonics = calibration.room.which
+        if not (indirect or harmonics):
+            return None, {}
+        other = GlobalIllumination.of(self.surface, photographs, coverage, batch.seeds["indirect"],
+                                    harmonics=harmonics, indirect=indirect)  # fmt: skip
+        return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
-    def state(self) -> dict[int, tuple[int, Tensor]]:
+    def remember(self, prediction: Prediction) -> None:
+        """Add the interreflection of a prediction to the averages."""
+        self.averages |= prediction.averages
+
+    def state(self) -> Averages:
         """For a checkpoint."""
-        return self.average.pictures
+        return self.averages
 
-    def restore(self, state: dict[int, tuple[int, Tensor]]) -> None:
+    def restore(self, state: Averages) -> None:
         """Continue from `state()`."""
-        self.average.pictures = state
+        self.averages = state

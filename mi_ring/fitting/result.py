@@ -33,7 +33,7 @@ def result_of(
 
     return FitResult(
         ring=ring,
-        surface=renderer.showing(model, ring.subdivisions),
+        surface=renderer.show(model, ring.subdivisions),
         given=problem.given,
         before=capture,
         capture=refined,

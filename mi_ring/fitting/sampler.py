@@ -25,7 +25,7 @@ class Batch:
     """
 
     number: int  #: of the iteration, from 1
-    progress: float  #: share of the shaping iterations before it, in [0, 1]; 1: the surface is fixed
+    progress: float  #: share of the shaping iterations that are done, in [0, 1]; 1: the surface is fixed
     stage: Stage
     points: Tensor  #: (V, 3) domain points
     faces: np.ndarray  #: (F, 3)
@@ -34,26 +34,13 @@ class Batch:
     size: tuple[int, int]  #: of these photographs' files (width, height) [px]
     scale: int  #: photographs are compared this many times smaller
     seeds: dict[str, int]  #: of the renderer, of its indirect light, and of the regulariser
-    share: Share  #: of this process
-
-    @property
-    def weight(self) -> float:
-        """Weight of this process's mean over photographs in the mean over all."""
-        return self.share.weight
-
-    def total(self, tensor: Tensor) -> Tensor:
-        """The sum over all photographs, from the sum over those of this process. Without gradients."""
-        return self.share.sum(tensor)
-
-    def gathered(self, tensor: Tensor) -> Tensor:
-        """(N, …) for all photographs, from (n, …) for those of this process. Without gradients."""
-        return self.share.gathered(tensor)
+    share: Share  #: this process's part of the N photographs; brings results of all processes together
 
 
 class Sampler:
-    """Draws batches. Photographs come in random order, all of one size before one of them comes again.
+    """Draws batches. Photographs come in random order; all of one size come before one of them comes again.
 
-    Each purpose has a random generator of its own: what is switched off changes nothing else that is drawn.
+    Each purpose has its own random generator: to switch one off does not change what others draw.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -63,7 +50,7 @@ class Sampler:
         capture = problem.capture
         self.sizes = [capture.shots[k].size for k in problem.fitted]
         self.alike = {size: np.intersect1d(index, problem.fitted) for size, index in capture.sizes.items()}
-        #: by size (width, height): photographs that have not come yet in this round
+        #: by size (width, height): photographs that are still to come in this round
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
@@ -82,7 +69,7 @@ class Sampler:
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
         count = min(count, len(alike))
-        if len(waiting) < count:  # those that are left come last in the next round
+        if len(waiting) < count:  # the remaining ones come first, and last in the next round
             order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
             waiting = waiting + [k for k in order if k not in waiting] + waiting
         self.waiting[size] = waiting[count:]

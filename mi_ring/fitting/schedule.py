@@ -9,9 +9,9 @@ import torch
 from mi_ring.fitting.config import Config
 
 HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
-EXCHANGE = 0.4  #: iterations of the second stage that replace one of these; with the presets both take the same time
+EXCHANGE = 0.4  #: iterations of the second stage that replace one of the first: they take as long, with the presets
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
-RAMP = 0.05  #: progress during which a learning rate rises from 0, once it starts
+RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after its start
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
@@ -40,6 +40,7 @@ class Stepper(NamedTuple):
 
     optimizer: torch.optim.Optimizer
     rates: Sequence[Rate]
+    evaluates: bool = False  #: Does its `step` take a function that evaluates the loss again, as L-BFGS does?
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,6 @@ class Schedule:
     def final_level(self) -> int:
         """Level of the icosphere in the last stage."""
         return self.stages[-1].level
-
-    def surface_fixed(self, iteration: int) -> bool:
-        """Is the surface fixed in an iteration, counted from 0?"""
-        last = self.stages[-1]
-        return last.settles and last.first <= iteration < last.last
 
     def masks_due(self, iteration: int) -> bool:
         """Are masks to be refined before an iteration, counted from 0?"""

@@ -27,33 +27,33 @@ from mi_ring.system.optional import installed
 from mi_ring.system.progress import progress, tolerating_closed_output
 
 CHECKPOINT_SECONDS = 30.0
-INPUTS_LEVEL = 4  #: of the surface in inputs.png
+INPUTS_LEVEL = 4  #: level of the surface in inputs.png
 WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an iteration takes
 
 
 @contextlib.contextmanager
 def ending_signals() -> Iterator[Callable[[], int]]:
-    """Yields a function that returns the first signal that ends a fit, 0: none. A second Ctrl-C ends it at once.
+    """Yields a function that returns the first signal that has come, or 0. A second Ctrl-C ends the fit at once.
 
-    Shells, schedulers and the kernel send the other signals more than once.
+    Other signals may come repeatedly, from shells, schedulers and the kernel.
     """
-    come: list[int] = []
+    received: list[int] = []
 
     def hear(number: int, frame: object) -> None:
-        come.append(number)  # without printing: it may interrupt a print
+        received.append(number)  # without printing: it may interrupt a print
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    heard = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
-    before = {number: signal.signal(number, hear) for number in heard}
+    handled = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN]  # not under nohup
+    before = {number: signal.signal(number, hear) for number in handled}
     try:
-        yield lambda: come[0] if come else 0
+        yield lambda: received[0] if received else 0
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
 class Keeper:
-    """Writes log, checkpoints and results of a fit into its folder. What cannot be written now is tried again later.
+    """Writes log, checkpoints and results of a fit into its folder. If writing fails, it tries again later.
 
     Of several processes only the first one writes.
     """
@@ -72,12 +72,12 @@ class Keeper:
         if log and log[-1]["iteration"] == it.number:
             self.attempt(lambda: results.add_to_log(self.folder, log[-1]))
         due = it.number == it.stage.last or time.monotonic() - self.saved > CHECKPOINT_SECONDS
-        if due and it.number < self.fit.iterations:  # else it is written in any case
+        if due and it.number < self.fit.iterations:  # after the last iteration it is written in any case
             self.attempt(self.checkpoint)
             self.saved = time.monotonic()
 
     def checkpoint(self) -> None:
-        """Write a checkpoint and the whole log now. Raises InputError or OSError if that is impossible."""
+        """Write a checkpoint and the whole log now. Raises InputError or OSError if that fails."""
         if not self.writes:
             return
         if not self.folder.is_dir():  # somebody has removed it
@@ -86,7 +86,7 @@ class Keeper:
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
-        """Call `write`; if it fails, tell the user once and go on."""
+        """Call `write`. If it fails, tell the user once and go on."""
         try:
             write()
         except (InputError, OSError) as error:
@@ -108,7 +108,7 @@ class Keeper:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
-        """Write checkpoint and results elsewhere, as far as possible. Returns a sentence about where they are."""
+        """Write checkpoint and results to a temporary folder, as far as possible. Returns where, as a sentence."""
         saved = ""
         try:
             elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
@@ -126,7 +126,7 @@ class Keeper:
 
 
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
-    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints."""
+    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints. `costs`: None: measured."""
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
         costs = fit.problem.processes.broadcast(measure(fit, left, interrupted))
@@ -138,9 +138,9 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     )  # fmt: skip
     if keeper.writes:
         results.write_log(keeper.folder, fit.course.log)
-    come = 0
+    stop = 0
     with bar:
-        while fit.iteration < fit.iterations and not (come := interrupted()):
+        while fit.iteration < fit.iterations and not (stop := interrupted()):
             retreats = fit.optimisation.guard.retreats
             it = fit.step()
             if fit.optimisation.guard.retreats > retreats:
@@ -153,7 +153,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
             bar.set_postfix_str(f"loss {it.loss:.4f}", refresh=False)
             bar.update(work[it.number - 1])
             keeper.follow(it)
-    if come:
+    if stop:
         print("Interrupted: writing what there is (Ctrl-C again to drop it)", flush=True)
     keeper.checkpoint()
 
@@ -167,11 +167,6 @@ def resume_hint(folder: Path) -> Iterator[None]:
         if any((folder / name).is_file() for name in ("checkpoint.pt", BEFORE)):
             print(f"Dropped; {folder} has a checkpoint: go on with the same command and --resume")
         raise
-
-
-def write_inputs(fit: Fit, folder: Path) -> None:
-    """inputs.png: the start surface drawn over the photographs."""
-    results.write_inputs(folder / "inputs.png", fit.problem.capture, fit.renderer.showing(fit.model, INPUTS_LEVEL))
 
 
 def start_of(fit: Fit) -> str:
@@ -197,8 +192,7 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
         def interrupted() -> int:
             return processes.maximum(heard())
 
-        somebody = getattr(sys.stdin, "isatty", bool)()
-        keeps = "; Ctrl-C ends early and keeps what there is" * somebody
+        keeps = "; Ctrl-C ends early and keeps what there is" * getattr(sys.stdin, "isatty", bool)()
         print(f"{len(fit.capture)} photographs; results go to {folder}/{keeps}")
         if model.calibration:
             print(f"Refined besides surface and material: {', '.join(model.calibration.refined)}")
@@ -212,7 +206,9 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             print(f"{processes.count} processes share the points and photographs of each iteration")
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
-            processes.on_first(lambda: write_inputs(fit, folder))
+            processes.on_first(lambda: results.write_inputs(
+                folder / "inputs.png", fit.problem.capture, fit.renderer.show(model, INPUTS_LEVEL)
+            ))  # fmt: skip
         keeper = Keeper(fit, folder, prepare)
         with resume_hint(folder):
             try:

@@ -12,7 +12,7 @@ from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.refinement import initial_power, refined_of
+from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
@@ -43,19 +43,18 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
 
     Raises InputError if capture, settings and networks do not go together.
     """
-    capture, config, light = problem.seen, problem.config, problem.lighting.kind
+    capture, config = problem.seen, problem.config
     domain, center, radius = starting_surface(capture, config.domain)
     require_view_from_outside(capture, domain, center, radius)
     parameters, bsdf = predicted_parameters(capture, config.parameters)
-    if light != "capture":
+    if problem.lighting.kind != "capture":
         bsdf = with_fresnel(bsdf)
-    scale = capture.reflectance(center, problem.exposure)
+    reflectance, refined, power = refinement = Refinement.of(problem, center)
     bounded = all(math.isfinite(p.high) for p in parameters)
-    if math.pi * scale >= 1 and bounded:
+    if refinement.albedo >= 1 and bounded:
         raise InputError(f"{capture.path}: emitter: by the lights' intensities the object reflects "
-                         f"{math.pi * scale:.3g} times the light that it gets, which the ranges of --parameters do "
+                         f"{refinement.albedo:.3g} times the light that it gets, which the ranges of --parameters do "
                          "not reach; give the true intensities, or fit cooktorrance")  # fmt: skip
-    refined = refined_of(capture, config, light, math.pi * scale)
     if "scale" in refined and (bounded or not config.indirect):
         raise InputError(f"{capture.path}: --refine scale: what the power of the lights is tells interreflection "
                          "alone, and a reflectance without bounds; it goes neither with --no-indirect nor with "
@@ -63,7 +62,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     if "scale" in refined and has_table(capture.scene):
         raise InputError(f"{capture.path}: --refine scale: the scene has a table, whose reflectance tells how strong "
                          "the lights are; leave scale out, or remove the table")  # fmt: skip
-    scale /= initial_power(refined, math.pi * scale)
+    scale = reflectance / power
     indirect = config.indirect and math.pi * scale < 1
     if networks:
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
@@ -102,7 +101,7 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     except InputError:
         if choice == "hull" or shape.center is None or shape.radius is None:
             raise
-        surface = None  # the masks make no hull, but the scene says where the object is
+        surface = None  # the masks give no hull, but the scene says where the object is
     if surface is None and choice == "hull":
         raise InputError(f"{capture.path}: --domain hull: there are no masks of the whole object from several sides; "
                          "give them, or --domain sphere")  # fmt: skip

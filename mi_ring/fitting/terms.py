@@ -13,7 +13,7 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import mask_loss, rgb_loss, velocity_loss
 from mi_ring.nets.shape_net import Flow
 
-DOUBT, SETTLED = 0.5, 0.5  #: of masks in a lit room: difference above which they are doubted, and progress from then on
+DOUBT, SETTLED = 0.5, 0.5  #: masks of a lit room are doubted above this difference, from this progress on
 PATTERNED = 0.1  #: factor of the weight `settling` if the object is probably not of one material
 REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iteration
 
@@ -31,20 +31,18 @@ TermLike: TypeAlias = Term | Callable[[Iteration], Tensor | None]
 
 def rgb(it: Iteration) -> Tensor:
     """Colours: predicted photographs against observed ones."""
-    seen = it.observation
-    return rgb_loss(
-        it.prediction.rgb, seen.rgb, seen.clipped, it.context.exposure, it.context.config.loss, it.counted()
-    )
+    seen, context = it.observation, it.context
+    return rgb_loss(it.prediction.rgb, seen.rgb, seen.clipped, context.exposure, context.config.loss, it.counted())
 
 
 def mask(it: Iteration) -> Tensor | None:
     """Silhouettes, of the photographs that have a mask.
 
-    Masks of a lit room are guesses. Once the shape has settled, the majority of them outweighs single wrong ones, for
-    instance one that fills a handle with its shadow.
+    Masks of a lit room are guesses. Once the shape has settled, the majority outweighs single wrong masks: for
+    instance one that takes a shadow for a part of the object.
     """
     seen, context = it.observation, it.context
-    masked = float(it.batch.total(seen.masked.sum()))
+    masked = float(it.batch.share.sum(seen.masked.sum()))
     if not masked:
         return None
     coverage, threshold = it.prediction.coverage, context.capture.threshold
@@ -56,7 +54,7 @@ def mask(it: Iteration) -> Tensor | None:
     if not seen.masked.any():  # only photographs of other processes have one
         return 0 * it.prediction.coverage.sum()
     loss = mask_loss(coverage[seen.masked], seen.mask[seen.masked], it.outline_blur(), valid, doubt)
-    return loss * (int(seen.masked.sum()) / masked / it.batch.weight) if it.batch.weight else loss
+    return loss * (int(seen.masked.sum()) / masked / it.batch.share.weight) if it.batch.share.weight else loss
 
 
 def velocity(it: Iteration) -> Tensor | None:
@@ -132,7 +130,7 @@ class Loss:
     def __call__(self, it: Iteration) -> Tensor:
         """This process's part of the loss, a scalar. The iteration gets the loss, terms and weights of all processes.
 
-        A term is a mean over photographs, or is equal in all processes, so that parts add up by their weights.
+        A term is a mean over photographs, or is equal in all processes: parts add up by their weights.
         """
         loss, values = torch.zeros((), device=it.batch.points.device), dict.fromkeys(self.terms, (0.0, 0.0))
         for name, term in self.terms.items():
@@ -146,9 +144,9 @@ class Loss:
             it.weights[name] = weight * (term.schedule(it) if term.schedule else 1.0)
             values[name] = float(value.detach()), 1.0
             loss = loss + it.weights[name] * value
-        loss = loss * it.batch.weight
+        loss = loss * it.batch.share.weight
         found = torch.tensor([*values.values(), (float(loss.detach()), 1.0)], dtype=torch.double)
-        found[:-1, 0] *= it.batch.weight
-        *sums, (it.loss, _) = it.batch.total(found).tolist()
+        found[:-1, 0] *= it.batch.share.weight
+        *sums, (it.loss, _) = it.batch.share.sum(found).tolist()
         it.terms = {name: value for name, (value, times) in zip(values, sums) if times}
         return loss

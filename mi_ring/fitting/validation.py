@@ -1,7 +1,6 @@
 """Validation on held-out photographs: does what was refined explain them better?
 
-Surface and material stay as they were fitted together with what was refined. So the result judges all of it together,
-and what is reset is not fitted again.
+Surface and material are not fitted again when values are reset. So the comparison favours what was refined.
 """
 
 import copy
@@ -29,7 +28,7 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
     Each photograph is compared at its best exposure. `level`: of the surface.
     """
     capture, shares = model.calibrated(problem.capture), []
-    surface = renderer.showing(model, level)
+    surface = renderer.show(model, level)
     for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
         shot = capture.shots[k]
         scale = -(-shot.size[0] // COMPARED_WIDTH)
