@@ -13,6 +13,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.reduction import WIDTH
 from mi_ring.capture.scenefile import room_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.importers.formats import detect
@@ -129,7 +130,7 @@ def main(arguments: Sequence[str]) -> None:
         with command.resumable(), locked(config.out, "DIR"):
             if not scene.exists():
                 make(config, scene)
-            inspection = inspect(load_capture(scene))
+            inspection = inspect(load_capture(scene, width=WIDTH))
     except KeyboardInterrupt as stop:
         # Exit at once, because native threads cannot be stopped. Their files are complete or absent.
         os._exit(command.exit_status(stop))

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -26,6 +27,9 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    folder = tempfile.TemporaryDirectory(prefix="mi_ring-cache-")  # reduced photographs, instead of the user's cache
+    os.environ["MI_RING_CACHE"] = folder.name
+    config.add_cleanup(folder.cleanup)
     if variant := config.getoption("--variant"):
         import mitsuba as mi
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import mi_ring
@@ -179,6 +180,23 @@ def test_what_was_not_used_for_the_longest_time_leaves_the_cache_first():
     assert left == {"00key", "33key", "44key"} and cache.size() == 3000
     cache.empty()
     assert cache.size() == 0
+
+
+def test_the_hull_of_crops_knows_that_nothing_is_outside(tmp_path):
+    """A silhouette of the whole photograph: the mask in its place, with the camera of the whole."""
+    path = capture_of(tmp_path)
+    part, whole = load_capture(path, width=200).silhouettes(), load_capture(path).silhouettes()
+    for silhouette, given, (left, top, right, bottom) in zip(part, whole, BOXES):
+        point = given.camera.position + 4 * given.camera.directions(np.array([[100.0, 80.0]]))
+        pasted, scale = silhouette.whole, given.camera.focal[0] / silhouette.camera.focal[0]
+        rows, columns = np.nonzero(pasted.mask > 127)
+        found = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        expected = np.array([left, top, right, bottom]) / 3  # the silhouettes of 1300 pixels are made 3 times smaller
+        np.testing.assert_allclose(np.array(found) * scale, expected, atol=2 * scale)
+        np.testing.assert_allclose(pasted.camera.project(point)[0] * scale, [[100, 80]], atol=scale)
+    hull = load_capture(path, width=200).hull
+    far = torch.from_numpy(whole[0].camera.position + 4 * whole[0].camera.directions(np.array([[20.0, 20.0]]))).float()
+    assert (hull.depth(far) < 0).all()
 
 
 def test_masks_by_brightness_are_found_in_large_photographs(tmp_path):

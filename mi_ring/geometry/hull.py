@@ -32,6 +32,19 @@ class Silhouette(NamedTuple):
     valid: np.ndarray | None = None  #: (H, W) uint8: the mask is unknown where this is ≤ 127. None: known everywhere
     frame: np.ndarray | None = None  #: (2, 2) corners of the photograph if the mask is a part [px]; no object beyond
 
+    @property
+    def whole(self) -> "Silhouette":
+        """The silhouette of the whole photograph. Nothing is outside of this part."""
+        if self.frame is None:
+            return self
+        before = np.ceil(-self.frame[0]).astype(int)
+        after = np.ceil(self.frame[1]).astype(int) - self.mask.shape[::-1]
+        margins = [(before[1], max(0, after[1])), (before[0], max(0, after[0]))]
+        mask = np.pad(self.mask, margins)
+        camera = self.camera._replace(centre=self.camera.centre + before, size=mask.shape[::-1])
+        valid = None if self.valid is None else np.pad(self.valid, margins, constant_values=255)
+        return Silhouette(mask, camera, self.name, valid)
+
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """A mask (H, W) uint8 reduced by a whole factor to at most this `width` [px]; and the factor."""
