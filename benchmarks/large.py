@@ -1,53 +1,64 @@
-"""What very many photographs, or a very fine mesh, cost in time and memory (Linux).
+"""What large photographs, or a very fine mesh, cost in time and memory (Linux).
 
-    python benchmarks/large.py CAPTURE.xml [--count 2000] [--size 3464] [--out out/large]
+    python benchmarks/large.py CAPTURE.xml [--count 66] [--size 4000] [--share 0.65] [--light] [--out out/large]
     python benchmarks/large.py RUN [--level 9] [--out out/large]
 
-The first opens, checks and fits a capture: its photographs are scaled to --size, written as JPEG, and used again and
-again under other names. The second exports surface and material of a finished fit as PLY.
+The first writes photographs of --size × --size pixels: those of the capture are scaled so that their width is --share
+of the frame, and used again and again. Then each command runs in a process of its own, the first with an empty cache:
+`mi-ring check`, `fit --preset fast` to its first iteration, twice, and with --light also `--light auto`. The second
+exports surface and material of a finished fit as PLY.
 
-Prints processor time and peak memory of each step, with machine and date.
+Prints wall time, processor time and peak memory of each process, with machine and date.
 """
 
 import argparse
-import contextlib
 import copy
 import datetime
-import io
 import os
-import re
-import resource
+import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-from accuracy import processor
 
-import mi_ring
-from mi_ring import check, export
-from mi_ring.fitting.config import Config
 from mi_ring.images import linear_to_srgb, read_image, to_bytes
+from mi_ring.system.machine import computer
 
-STEPS = 2  #: iterations
+FIRST_ITERATION = """
+import sys
+import mi_ring
+from mi_ring.capture.loading import load_capture
+from mi_ring.capture.reduction import WIDTH
+from mi_ring.fitting.config import Config
+from mi_ring.system.machine import keep_memory
+keep_memory()
+fit = mi_ring.Fit(load_capture(sys.argv[1], masks="auto", width=WIDTH), Config.preset("fast"))
+fit.step()
+"""
 
 
-def enlarged(source: Path, target: Path, size: int) -> None:
-    """A photograph or mask, `size` pixels wide, its colours as sRGB."""
+def framed(source: Path, size: int, share: float) -> np.ndarray:
+    """A photograph or mask (size, size, C) of 8 bits, in sRGB: the file, `share` of the width, in the middle."""
     pixels = read_image(source)
     if pixels.dtype != np.uint8:
         pixels = to_bytes(linear_to_srgb(pixels / (65535 if pixels.dtype == np.uint16 else 1)))
-    height = round(size * pixels.shape[0] / pixels.shape[1])
-    target.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(target), cv2.resize(pixels, (size, height))[..., ::-1] if pixels.shape[2] > 1 else
-                cv2.resize(pixels, (size, height)))  # fmt: skip
+    width = round(share * size)
+    height = round(width * pixels.shape[0] / pixels.shape[1])
+    result = np.zeros((size, size, pixels.shape[2]), np.uint8)
+    left, top = (size - width) // 2, (size - height) // 2
+    scaled = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_CUBIC)
+    result[top : top + height, left : left + width] = scaled.reshape(height, width, -1)
+    return result
 
 
-def write(path: Path, count: int, size: int, out: Path) -> Path:
-    """A scene of so many photographs."""
+def write(path: Path, count: int, size: int, share: float, out: Path) -> Path:
+    """The scene of so many photographs. Returns its path."""
     tree = ElementTree.parse(path)
-    root = tree.getroot()
+    root, files = tree.getroot(), {}
     sensors = root.findall("sensor")
     for sensor in sensors:
         root.remove(sensor)
@@ -56,82 +67,75 @@ def write(path: Path, count: int, size: int, out: Path) -> Path:
         sensor.set("id", f"{k:05}")
         for name, suffix in (("filename", ".jpg"), ("mask", ".png")):
             element = sensor.find(f"string[@name='{name}']")
-            first = out / name / (Path(element.get("value")).stem + suffix)
-            if not first.exists():
-                enlarged(path.parent / element.get("value"), first, size)
-            link = first.with_name(f"{k:05}{suffix}")
-            if not link.exists():
-                os.link(first, link)
-            element.set("value", f"{name}/{link.name}")
-        width, height = (sensor.find(f"film/integer[@name='{side}']") for side in ("width", "height"))
-        scale = size / int(width.get("value"))
-        height.set("value", str(round(scale * int(height.get("value")))))
-        width.set("value", str(size))
-        for number in sensor.findall("float"):
-            if number.get("name") in ("fx", "fy", "cx", "cy"):
-                number.set("value", repr(scale * float(number.get("value"))))
+            source, file = path.parent / element.get("value"), out / name / f"{k:05}{suffix}"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if source not in files:
+                pixels = framed(source, size, share)[..., ::-1]
+                files[source] = cv2.imencode(suffix, pixels)[1].tobytes()
+            # Bytes after the end of a picture are ignored. They make each file another one for the cache.
+            file.write_bytes(files[source] + k.to_bytes(4, "little"))
+            element.set("value", f"{name}/{file.name}")
+        numbers = {e.get("name"): e for e in sensor.findall("float")}
+        sides = {side: sensor.find(f"film/integer[@name='{side}']") for side in ("width", "height")}
+        given = {side: int(element.get("value")) for side, element in sides.items()}
+        scale = round(share * size) / given["width"]
+        for centre, side in (("cx", "width"), ("cy", "height")):
+            if centre not in numbers:
+                numbers[centre] = ElementTree.SubElement(sensor, "float", name=centre, value=str(given[side] / 2))
+            corner = (size - round(scale * given[side])) // 2
+            numbers[centre].set("value", repr(scale * float(numbers[centre].get("value")) + corner))
+            sides[side].set("value", str(size))
+        for focal in ("fx", "fy"):
+            numbers[focal].set("value", repr(scale * float(numbers[focal].get("value"))))
         root.append(sensor)
     tree.write(out / "scene.xml")
     return out / "scene.xml"
 
 
-class Costs:
-    """Rows of a table: what took how long since the one before, and the most memory until then."""
-
-    def __init__(self) -> None:
-        print("| | wall, s | processor, s | GiB at most |\n|---|---|---|---|", flush=True)
-        self.before = time.perf_counter(), time.process_time()
-
-    def row(self, what: str) -> None:
-        """Print one."""
-        now, memory = (time.perf_counter(), time.process_time()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        wall, busy = (after - before for after, before in zip(now, self.before))
-        print(f"| {what} | {wall:.1f} | {busy:.1f} | {memory / 2**20:.1f} |", flush=True)
-        self.before = now
-
-
-def measure_fit(scene: Path, costs: Costs) -> None:
-    """Open, check and fit it."""
-    capture = mi_ring.load_capture(scene)
-    costs.row("opened")
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        status = check.main([str(scene), "--out", str(scene.with_name("check.png"))])
-    costs.row(f"`mi-ring check`, {len(said.getvalue().splitlines())} lines, status {status}")
-    fit = mi_ring.Fit(capture, Config.preset("fast", refine=("none",)))
-    costs.row("hull, brightness")
-    for _ in range(STEPS):
-        fit.step()
-    costs.row(f"{STEPS} iterations")
-
-
-def measure_export(run: Path, level: int, out: Path, costs: Costs) -> None:
-    """Write a fine mesh."""
-    path = out / f"level{level}.ply"
-    export.main([str(run), str(path), "--subdivisions", str(level)])
-    with path.open("rb") as file:
-        vertices, faces = (int(n) for n in re.findall(rb"element \w+ (\d+)", file.read(4096)))
-    costs.row(f"{vertices:,} vertices, {faces:,} triangles, {path.stat().st_size / 2**20:,.0f} MiB")
-    path.unlink()
+def row(what: str, *command: str | Path, cache: Path) -> None:
+    """Run a command and print what it costs."""
+    started = time.perf_counter()
+    process = subprocess.Popen([sys.executable, *map(str, command)], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL, env=os.environ | {"MI_RING_CACHE": str(cache)})  # fmt: skip
+    _, status, used = os.wait4(process.pid, 0)
+    wall, failed = time.perf_counter() - started, f" (status {status})" if status else ""
+    busy, memory = used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20
+    print(f"| {what}{failed} | {wall:.0f} | {busy:.0f} | {memory:.1f} |", flush=True)
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, metavar="CAPTURE.xml|RUN")
-    parser.add_argument("--count", type=int, default=2000)
-    parser.add_argument("--size", type=int, default=3464)
+    parser.add_argument("--count", type=int, default=66)
+    parser.add_argument("--size", type=int, default=4000)
+    parser.add_argument("--share", type=float, default=0.65)
+    parser.add_argument("--light", action="store_true")
     parser.add_argument("--level", type=int, default=9)
     parser.add_argument("--out", type=Path, default=Path("out/large"))
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    out, cache = options.out, options.out / "cache"
+    shutil.rmtree(cache, ignore_errors=True)
+    out.mkdir(parents=True, exist_ok=True)
+    what = f"level {options.level}"
+    if not options.source.is_dir():
+        scene = write(options.source, options.count, options.size, options.share, out)
+        what = f"{options.count} photographs of {options.size}²"
+    print(f"{computer()}; {datetime.date.today()}; {what}\n\n| | wall, s | processor, s | GiB |\n|---|---|---|---|")
     if options.source.is_dir():
-        print(f"{processor()}; {datetime.date.today()}; level {options.level}\n")
-        measure_export(options.source, options.level, options.out, Costs())
+        mesh = out / "mesh.ply"
+        row("export", "-m", "mi_ring.export", options.source, mesh, "--subdivisions", str(options.level), cache=cache)
+        mesh.unlink()
         return
-    scene = write(options.source, options.count, options.size, options.out)
-    print(f"{processor()}; {datetime.date.today()}; {options.count} photographs, {options.size} pixels wide\n")
-    measure_fit(scene, Costs())
+    row("`fit --preset fast`, first iteration", "-c", FIRST_ITERATION, scene, cache=cache)
+    row("the same again", "-c", FIRST_ITERATION, scene, cache=cache)
+    row("`check`, photographs in the cache", "-m", "mi_ring.check", scene, "--out", out / "check.png", cache=cache)
+    shutil.rmtree(cache)
+    row("`check`", "-m", "mi_ring.check", scene, "--out", out / "check.png", cache=cache)
+    run = "-m", "mi_ring.fit", scene, "--preset", "fast", "--out", out / "run"
+    row("`fit --preset fast`, all of it", *run, cache=cache)
+    if options.light:
+        row("`fit --preset fast --light auto`, all of it", *run, "--light", "auto", cache=cache)
 
 
 if __name__ == "__main__":

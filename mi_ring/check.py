@@ -12,6 +12,7 @@ from mi_ring.capture.reduction import WIDTH
 from mi_ring.errors import InputError
 from mi_ring.output.inspection import inspect
 from mi_ring.system import command, files
+from mi_ring.system.progress import Step, Steps
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,12 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command. Returns its exit status: 1 if there is something to correct."""
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
+    with Steps(Step(("reading masks", "searching"), 1), Step(("reading",), 5), Step(("inspecting",), 4)):
+        return checked(config, out)
+
+
+def checked(config: CheckConfig, out: Path) -> int:
+    """The command with these options, its picture to be `out`. Returns its exit status."""
     capture = load_capture(config.scene, masks=config.masks, width=WIDTH)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")

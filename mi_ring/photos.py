@@ -31,10 +31,19 @@ from mi_ring.system import command
 from mi_ring.system.files import locked, read_json, write_file
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
-from mi_ring.system.progress import progress
+from mi_ring.system.progress import Step, Steps, progress
 
 OPTIONS = "work/options.json"  #: the options of the command that made the capture
 METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
+
+
+#: of the command, with seconds for a photograph of 13 megapixels, measured on two cores
+STEPS = (
+    Step(("sheet",), 0.5), Step(("features",), 2.0), Step(("matching",), 2.5),
+    Step(("cameras", "all cameras", "bundle adjustment", "principal points"), 1.0),
+    Step(("reading", "masks", "bare table", "a trial fit", "table"), 3.0), Step(("writing",), 1.0),
+    Step(("reading", "inspecting"), 0.5),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -127,7 +136,7 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it again from {config.out}/work")  # fmt: skip
     try:
-        with command.resumable(), locked(config.out, "DIR"):
+        with command.resumable(), locked(config.out, "DIR"), Steps(*STEPS):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene, width=WIDTH))

@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 from tqdm import tqdm
 
@@ -92,6 +92,42 @@ class LogBar(tqdm):
         super().close()
 
 
+class Step(NamedTuple):
+    """A step of a command."""
+
+    bars: tuple[str, ...]  #: what the names of its progress bars begin with
+    seconds: float  #: that it is likely to take; only the ratios of steps matter
+
+
+class Steps:
+    """The steps of a command, as a context manager: progress bars say which step this is and how long all will take."""
+
+    current: ClassVar["Steps | None"] = None  #: those of the command that runs
+
+    def __init__(self, *steps: Step) -> None:
+        self.steps, self.number, self.started = steps, 0, time.monotonic()
+
+    def __enter__(self) -> "Steps":
+        Steps.current = self
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        Steps.current = None
+
+    def named(self, what: str) -> str:
+        """The name of a progress bar with its step. A bar of no step, or of one that is over, keeps its name."""
+        ahead = range(self.number, len(self.steps))
+        found = next((n for n in ahead if what.startswith(self.steps[n].bars)), None)
+        if found is None:
+            return what
+        self.number = found
+        name = f"step {found + 1}/{len(self.steps)}, {what}"
+        done, left = (sum(step.seconds for step in part) for part in (self.steps[:found], self.steps[found:]))
+        if not done or (elapsed := time.monotonic() - self.started) < DELAY:
+            return name  # nothing is known yet of this machine's speed
+        return f"{name}, all steps {tqdm.format_interval(elapsed / done * left)} more"
+
+
 def progress(
     things: Iterable | None, what: str = "", total: float | None = None, leave: bool = False, **options: Any
 ) -> tqdm:
@@ -99,7 +135,7 @@ def progress(
 
     A terminal shows a bar. A log gets a line every 30 seconds, and none for less than two seconds of work.
     """
-    kind = tqdm
+    kind, what = tqdm, Steps.current.named(what) if Steps.current else what
     if not getattr(sys.stderr, "isatty", bool)():
         kind = LogBar
         # At position 0, tqdm would end with a carriage return.
