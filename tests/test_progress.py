@@ -25,11 +25,11 @@ def test_bars_say_their_step_and_how_long_all_steps_take(clock):
         assert steps.named("writing").startswith("step 3/3")
         assert steps.named("table").startswith("step 3/3")  # never back
         assert steps.named("reading") == "reading"
-    assert progress.progress([], "reading", file=io.StringIO()).desc == "reading: "
+    assert progress.progress([], "reading", file=io.StringIO()).desc == "reading"
 
 
 def test_the_step_is_in_the_bar_and_gone_after_an_error():
     with pytest.raises(ZeroDivisionError), Steps(Step(("reading",), 1)):
-        assert progress.progress([], "reading", file=io.StringIO()).desc == "step 1/1, reading: "
+        assert progress.progress([], "reading", file=io.StringIO()).desc == "step 1/1, reading"
         1 / 0  # noqa: B018
     assert Steps.current is None

@@ -1,4 +1,4 @@
-"""The machine and the operating system: LLVM, threads, GPUs, files, progress bars, the command line.
+"""The machine and the operating system: LLVM, threads, GPUs, files, the cache, progress bars, the command line.
 
-May import: mitsuba, drjit, torch, tqdm, tyro, filelock.
+May import: mitsuba, drjit, torch, tqdm, tyro, filelock, platformdirs.
 """
