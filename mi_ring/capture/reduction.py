@@ -33,7 +33,7 @@ SMALL = 512  #: photographs up to this width are never cropped [px]
 COARSE = 512  #: width at which the object is searched in photographs without masks [px]
 ROWS = 256  #: of a photograph that are decoded at once: all of its pixels as floats would take too much memory
 DECODING = 2**30  #: bytes for photographs that are decoded at the same time
-PIXEL_BYTES = 12  #: that decoding takes
+PIXEL_BYTES = 8  #: that decoding a pixel takes
 MORE = np.array([[-1], [1]])  #: by how many pixels bounds are widened that were found in a small picture
 
 

@@ -10,6 +10,9 @@ from mi_ring.images import linear_to_srgb, srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 
 
+AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
+
+
 class Window(NamedTuple):
     """A part of the undistorted photograph, at full size or reduced."""
 
@@ -47,7 +50,20 @@ def undistort(
     is clipped; infinite for masks. A result is clipped if any of the pixels that it interpolates is. `window`: the part
     to compute, of scale 1; None: all.
     """
-    positions = source_positions(lens, window or Window(0, 0, *lens.size))
+    window = window or Window(0, 0, *lens.size)
+    rows = max(1, AT_ONCE // window.width)
+    strips = [window._replace(top=top, height=min(rows, window.top + window.height - top))
+              for top in range(window.top, window.top + window.height, rows)]  # fmt: skip
+    parts = [undistort_part(pixels, lens, srgb, saturation, strip) for strip in strips]
+    images, valid = (np.concatenate(part) for part in zip(*parts))
+    return images, valid
+
+
+def undistort_part(
+    pixels: np.ndarray, lens: Lens, srgb: bool, saturation: float, window: Window
+) -> tuple[np.ndarray, np.ndarray]:
+    """`undistort` of a window that is small enough for arrays of floats."""
+    positions = source_positions(lens, window)
     size = np.array(pixels.shape[:2])
     valid = np.all((positions >= -0.5) & (positions <= size[:, None, None] - 0.5), 0)
     low = np.clip(np.floor(positions.min((1, 2))), 0, size - 1).astype(int)  # first and last source pixels needed
