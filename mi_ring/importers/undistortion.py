@@ -9,7 +9,6 @@ import scipy.ndimage
 from mi_ring.images import linear_to_srgb, srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 
-
 AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
 
 
