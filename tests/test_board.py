@@ -218,7 +218,7 @@ def test_a_sheet_that_was_moved_is_refused(aside):
     for name, (ids, _, pixels) in sightings.items():
         order = np.random.default_rng(2).permutation(96)  # the same in all: corners are in space, but elsewhere
         mixed[name] = SheetDetection(order[ids], MarkerSheet().points[order[ids]], pixels)
-    with pytest.raises(InputError, match="mm off"):
+    with pytest.raises(InputError, match="mm on"):
         align(mixed, cameras)
 
 

@@ -610,7 +610,7 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
     assert state() == (1.0, 0.0)
     # Nothing is where they show nothing of the object, and that is said in words.
     monkeypatch.setattr(validation, "unexplained", lambda *parts: float("nan"))
-    assert "nothing that is surely the object" in held_out_text(validate())
+    assert "no pixel in them is surely of the object" in held_out_text(validate())
     monkeypatch.setattr(validation, "unexplained", unexplained)
     # What was not found is not put back.
     assert validate() == {"unexplained": 0.2, "before": 0.5, "put_back": []}

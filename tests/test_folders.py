@@ -151,7 +151,7 @@ def test_an_interrupt_ends_native_work_in_one_line(number, photographs, tmp_path
     listener = threading.Thread(target=listen)
     listener.start()
     until = time.monotonic() + 120
-    while b"matching:" not in text and time.monotonic() < until:
+    while b"matching" not in text and time.monotonic() < until:
         time.sleep(0.02)
     time.sleep(0.3)
     process.send_signal(number)

@@ -321,7 +321,7 @@ def test_what_settles_does_not_get_darker_for_it(small_capture):
 
 def test_only_light_that_was_unknown_is_said_to_be(tmp_path):
     assert not ambiguity("capture") and not ambiguity_of(tmp_path)  # and where there is no record
-    assert "slow" in ambiguity("environment on one material") and "slow" not in ambiguity("2 distant lamps")
+    assert "smooth" in ambiguity("environment on one material") and "smooth" not in ambiguity("2 distant lamps")
 
 
 def test_a_background_that_is_seen_needs_masks(in_an_environment):

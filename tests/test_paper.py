@@ -234,7 +234,7 @@ def test_results_of_other_settings_have_folders_of_their_own(tmp_path, monkeypat
 
 
 def test_a_capture_without_truth_is_refused(small_capture):
-    with pytest.raises(InputError, match="has no truth, neither"):
+    with pytest.raises(InputError, match="has no true surface, neither"):
         datasets.given(small_capture)
 
 

@@ -71,9 +71,9 @@ def load_capture(
     capture = replace(capture, images=pixels, masks=given, valid=valid)
     by_brightness = masks != "given" and not any(given.given)
     many = sum(math.prod(shot.size) for shot in shots) > MANY
+    for shot in shots if many or width else ():
+        require_headers(shot, path, masks)
     if many:  # the first one shows at once what is wrong with all
-        for shot in shots:
-            require_headers(shot, path, masks)
         read_photograph(shots[0], path), given[0], valid[0]
     if width and (small := reduced(capture, width, by_brightness, crop)) is not capture:
         return small

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
-import torch
 
 from mi_ring.geometry.camera import Camera
 from mi_ring.scene.shot import Shot
@@ -31,8 +30,8 @@ class Views(NamedTuple):
             np.array([shot.falloff for shot in shots]), np.array([camera.distortion for camera in cameras]),
         )  # fmt: skip
 
-    def to(self, device: torch.device) -> "Views":
-        """Tensors on another device."""
+    def to(self, device: Any) -> "Views":
+        """Tensors on another torch device."""
         return Views(*(tensor.to(device) for tensor in self))
 
     def buffers(self) -> "Views":

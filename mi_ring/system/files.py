@@ -123,7 +123,7 @@ def quoted(content: bytes) -> list[str]:
 
 @contextlib.contextmanager
 def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
-    """A context manager that locks a folder. If another process has the lock, it raises InputError or `wait`s.
+    """Lock a folder, as a context manager. If another process has the lock, raise InputError, or wait if `wait`.
 
     The lock file is beside the folder, so the folder may be moved. The lock ends with the process.
     """
