@@ -19,7 +19,7 @@ class BoardConfig:
     """Write a sheet of markers to print and put under the object. With it, mi-ring photos finds scale and light."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write: .pdf or .png."""
+    """File to write: .pdf to print, or .png."""
     paper: Literal["a4", "letter"] = "a4"
     """Size of the paper."""
 

@@ -26,23 +26,24 @@ class Task:
     """Input, output and computing resources."""
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs."""
+    """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
     """Folder for the results. Without it: out/NAME.
     NAME is the name of the scene file, or of its folder if the file is called scene.xml."""
     resume: bool = False
-    """Continue the fit in the results folder from its checkpoint. Give the same options as before."""
+    """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """A set of values for the other options. Options that you give override it. Times are for two processor cores.
     fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
     """Time for the whole command, approximately [min]. 0: no limit.
-    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one."""
+    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one.
+    Less time gives less detail."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
+    """Variant of Mitsuba. llvm_ad_rgb computes on the processor. cuda_ad_rgb computes on a GPU of Nvidia."""
     threads: int = 0
-    """Number of processor threads. 0: all."""
+    """Number of processor threads. 0: all. Give fewer to leave cores to other programs."""
 
 
 @dataclass(frozen=True, kw_only=True)

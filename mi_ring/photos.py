@@ -64,20 +64,20 @@ class PhotosConfig:
     """Position of the flash relative to the lens: right, down and forward.
     With a sheet the unit is mm, and the sheet refines the position.
     Without a sheet the unit is the median distance from the cameras to the object.
-    It is for the orientation of most photographs, upright or sideways; for the others it turns with the camera."""
+    Measure it while the camera is held as in most photographs. For the others the command turns it with the camera."""
     turntable: bool = False
-    """Give it if the object turned, with the sheet under it, while camera and flash stood still."""
+    """Set it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
-    """Where the masks come from.
-    auto: from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
-    rembg: from the package rembg, which must be installed.
-    Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
+    """Where the masks of the object come from. Give another source if the masks of auto are wrong.
+    auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
+    rembg: the package rembg, which must be installed.
+    A folder: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
     Give it if the masks contain something else that touches the object in the photographs."""
     square_mm: float = SQUARE
     """Side of a square of the printed sheet [mm].
-    Give it if the printer does not print at 100 %; measure several squares with a ruler."""
+    Give it if the printer does not print at 100 %: measure several squares with a ruler."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:

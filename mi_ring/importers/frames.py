@@ -59,14 +59,15 @@ class Source:
     """Base of all importers: the options of all formats."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
-    """Data of the other tool: a file or a folder."""
+    """The other tool's data: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
-    """Copy the photographs beside the scene file. Without it the scene file refers to the originals."""
+    """Copy the photographs beside the scene file, to keep everything in one place.
+    Without it the scene file refers to the originals, which must stay where they are."""
     encoding: Encoding = "auto"
-    """How the photographs are encoded.
-    auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
+    """How the pixels of the photographs encode radiance. Set it if auto is wrong.
+    auto: as the format says, otherwise srgb for 8-bit files and linear for others.
     Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""

@@ -26,11 +26,12 @@ class Photogrammetry(Source):
     images: Path | None = None
     """Folder of the photographs. Without it: the nearest folder `images` beside or above SRC, or the folder of SRC."""
     masks: Path | None = None
-    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png. Without it: no masks."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the light relative to the camera: right, down and forward [scene units]."""
+    """Position of the light relative to the camera: right, down and forward [scene units]. Default: at the lens."""
     exif: bool = True
-    """Take different exposures into account, by exposure time, ISO and aperture in EXIF data."""
+    """Correct for different exposures by exposure time, ISO and aperture in EXIF data.
+    Leave it out if EXIF data are wrong or the photographs have been brightened later."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
         """The photographs with a pose, each after the name by which its mask is found."""
