@@ -14,7 +14,7 @@ from mi_ring.scene.xml_elements import load_bsdf
 
 
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
-    """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the XML of the BSDF that reads them.
+    """Choose the BSDF parameters that BRDF-Net predicts. Returns them, and as XML the BSDF that reads them.
 
     `ranges`: lowest and highest value by the parameter's name in the BSDF's documentation; infinity if there is no
     highest value. Empty: the parameters of `cooktorrance` that are no constants. Raises InputError for parameters that

@@ -134,13 +134,13 @@ class SynthesizeConfig:
 
     @property
     def exact(self) -> bool:
-        """Is the calibration in the scene file exact?"""
+        """Is the calibration in the scene file exact: no --wrong-… is given?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def up_axis(self) -> np.ndarray:
-        """(3,) unit vector that points up."""
+        """The unit vector (3,) that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property
