@@ -25,7 +25,7 @@ class BoardConfig:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(BoardConfig, arguments, "mi_ring.board", needs_llvm=False)
     file, kind = config.file, config.file.suffix.lower()
     if kind not in (".pdf", ".png"):

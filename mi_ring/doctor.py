@@ -79,7 +79,7 @@ def computing() -> Iterator[Finding]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if a fit cannot run."""
+    """Run the command. Returns its exit status: 1 if a fit cannot run."""
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
         from mi_ring.system import cache  # which imports torch
 

@@ -59,9 +59,9 @@ def require_options(config: ExportConfig) -> None:
 
 
 def seen_from(run: Path) -> list[MaskedCamera] | None:
-    """Camera and mask of each photograph of a fit: `run` is its folder or a file in it.
+    """Read camera and mask of each photograph of a fit: `run` is its folder or a file in it.
 
-    None, with a warning, if its scene.xml cannot be read.
+    Returns None, with a warning, if its scene.xml cannot be read.
     """
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
@@ -71,7 +71,7 @@ def seen_from(run: Path) -> list[MaskedCamera] | None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)

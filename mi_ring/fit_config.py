@@ -73,7 +73,7 @@ class FitConfig(Config, Task):
 
 
 def parse_options(arguments: Sequence[str]) -> FitConfig:
-    """The configuration: the preset's settings, changed by those on the command line.
+    """Read the configuration: the preset's settings, changed by the options on the command line.
 
     Raises InputError for wrong options. After printing the help it raises SystemExit: --help shows the options that
     users set, --help-all shows all options.
@@ -112,10 +112,10 @@ def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
 
 
 def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
-    """A frozen dataclass with these fields, by name, and those of its bases."""
+    """Make a frozen dataclass with these fields, by name, and those of its bases."""
     return dataclasses.make_dataclass(name, fields.items(), bases=bases, frozen=True, kw_only=True)
 
 
 def built(kind: Any, values: dict[str, Any]) -> Any:
-    """An instance of the dataclass `kind`. `values` may have further names, which are ignored."""
+    """Make an instance of the dataclass `kind`. `values` may have further names, which are ignored."""
     return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

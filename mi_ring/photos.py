@@ -95,7 +95,7 @@ class PhotosConfig:
 
 
 def cameras_report(sparse: SparseModel) -> str:
-    """A line about the cameras, and a line per photograph without a camera."""
+    """Describe the cameras in a line, and each photograph without a camera in a line."""
     count, failed = len(sparse.cameras), sparse.failed
     how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
     how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
@@ -106,7 +106,7 @@ def cameras_report(sparse: SparseModel) -> str:
 
 
 def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
-    """A line about the masks, and a line per photograph without a mask. `source`: `PhotosConfig.masks`."""
+    """Describe the masks in a line, and each photograph without a mask in a line. `source`: `PhotosConfig.masks`."""
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
@@ -116,7 +116,7 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
 
 
 def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
-    """A line about the flash, the room's light and the camera's response."""
+    """Describe the flash, the room's light and the camera's response in a line."""
     x, y, z = flash.offset
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
@@ -128,7 +128,7 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
@@ -159,7 +159,7 @@ def require_apart(config: PhotosConfig) -> None:
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture. Stages with results in work/ are not repeated."""
+    """Make the capture and write it as `scene`. Stages with results in work/ are not repeated."""
     pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")

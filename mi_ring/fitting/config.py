@@ -222,7 +222,7 @@ class Config(Ablation, Tuning, Common):
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Config":
-        """The settings of a preset, `fast`, `default`, `fine` or `paper`, with these changes.
+        """Make the settings of a preset, `fast`, `default`, `fine` or `paper`, with some `changes`.
 
         `weights` changes only the weights that it names. Raises InputError for a preset that does not exist.
         """
@@ -235,7 +235,7 @@ class Config(Ablation, Tuning, Common):
 
     @staticmethod
     def load(path: str | Path) -> "Config":
-        """The settings of an earlier fit, from its results folder or from the config.json in it.
+        """Read the settings of an earlier fit, from its results folder or from the config.json in it.
 
         Settings without an entry have their defaults. Raises InputError, which names file and field, for an unknown
         setting or a wrong value.
@@ -274,7 +274,7 @@ class Config(Ablation, Tuning, Common):
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """A value of JSON as a setting of this type. Raises ValueError if it cannot be one."""
+    """Convert a value of JSON to a setting of the type `kind`. Raises ValueError if that is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
@@ -295,7 +295,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """The value of a setting as on the command line, for messages."""
+    """Write the value of a setting as on the command line, for messages."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

@@ -52,7 +52,7 @@ class RegulariserStrength:
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Collect what a checkpoint needs."""
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:

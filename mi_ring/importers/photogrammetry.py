@@ -21,7 +21,7 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(Source):
-    """Base of the photogrammetry formats. Each format implements `posed`."""
+    """The base class of formats of photogrammetry, with their options. Each format implements `posed`."""
 
     images: Path | None = None
     """Folder of the photographs. Without it: the nearest folder `images` beside or above SRC, or the folder of SRC."""
@@ -34,7 +34,7 @@ class Photogrammetry(Source):
     Leave it out if EXIF data are wrong or the photographs have been brightened later."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs with a pose, each after the name by which its mask is found."""
+        """Read the photographs that have a pose, each after the name by which its mask is found."""
         raise NotImplementedError
 
     @property
@@ -50,7 +50,7 @@ class Photogrammetry(Source):
         return list_images(self.folder)
 
     def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, with any suffix. None if it is not in `photographs`.
+        """Find the photograph of this name, with any suffix; None if it is not in `photographs`.
 
         Without `photographs`, raises InputError if it is not in `folder`.
         """
@@ -82,7 +82,7 @@ class Photogrammetry(Source):
 
 
 def exif_exposure(path: Path) -> float | None:
-    """`exposure_of` an image file. Raises InputError if it is not positive."""
+    """Compute `exposure_of` an image file. Raises InputError if it is not positive."""
     if path.suffix.lower() == ".exr":
         return None
     with reading(path, "image"), open_image(existing(path, "image")) as image:
@@ -96,7 +96,7 @@ def exif_exposure(path: Path) -> float | None:
 
 
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """Exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
+    """Compute exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
     values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
     if not all(values):
         return None

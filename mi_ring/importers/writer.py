@@ -55,7 +55,7 @@ class Writer:
     def finish(self, xml: bytes) -> None:
         """Move all files to their places, then write the scene file.
 
-        Raises InputError if another file is in such a place, because it may be a source. An equal file is from an
+        Raises InputError if another file is in the place of one, because it may be a source. An equal file is from an
         interrupted run.
         """
         for file in self.files:

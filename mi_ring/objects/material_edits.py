@@ -20,7 +20,7 @@ SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """Changes of the material."""
+    """Options that change the material of an object."""
 
     material: Path | None = None
     """Results folder of another fit whose material the object gets. Without it: its own material.

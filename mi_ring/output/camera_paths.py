@@ -94,7 +94,7 @@ class RenderConfig(MaterialOptions):
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A view to render."""
+    """A picture to render: its camera and light, file name and time of the flow."""
 
     shot: Shot
     name: str  #: of the picture's file
@@ -103,7 +103,7 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Mitsuba's integrator to render with; None for `photometric`. Raises InputError if there is none of this name."""
+    """Make Mitsuba's integrator; None for `photometric`. Raises InputError if there is none of this name."""
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
         return None
@@ -117,7 +117,7 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 
 
 def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
-    """The views to render: the photographs of the scene, or the frames of a film."""
+    """List the views to render: the photographs of the scene, or the frames of a film."""
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
@@ -186,7 +186,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """The object in the light of its scene. With --envmap: in that environment and fixed lamps, without a table."""
+    """Light the object by its scene, or with --envmap by that environment and fixed lamps, without a table."""
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -207,7 +207,7 @@ def render_views(
     surface: Surface, ring: FittedObject, views: list[RenderedView], integrator: mi.Integrator | None,
     capture: Capture, config: RenderConfig,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """The pictures, (H, W, 3) linear radiance each."""
+    """Render the views one by one: pictures (H, W, 3) of linear radiance."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
@@ -224,7 +224,7 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """A picture (H, W, 3) by an integrator of Mitsuba. It is the mean of passes, so memory does not grow with `spp`.
+    """Render a picture (H, W, 3) by an integrator of Mitsuba, as the mean of passes: memory does not grow with `spp`.
 
     A pass has at most `LANES` rays, but at least one ray per pixel.
     """

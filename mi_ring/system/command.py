@@ -126,7 +126,7 @@ def one_line(message: str) -> str:
 
 
 class Interrupted(KeyboardInterrupt):
-    """One of the `SIGNALS` has arrived. The argument is its number."""
+    """Raised when one of the `SIGNALS` has arrived. The argument is its number."""
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:

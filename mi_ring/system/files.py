@@ -80,7 +80,7 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """`torch.save` with `write_file` and a checksum, by which `read_state` detects damage."""
+    """Write a dictionary by `torch.save`, with a checksum, by which `read_state` detects damage. See `write_file`."""
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
     seal(buffer)
