@@ -41,7 +41,7 @@ class BatchConfig:
     workers: int = 1
     """Number of fits that run at the same time. More use the cores better, but each fit needs its own memory."""
     cpus: int = 0
-    """Processor cores for each fit. 0: the cores of this machine, shared among --workers."""
+    """Processor cores for each fit. 0: an equal share of this machine's cores for each of the --workers."""
     gpus: float = 0
     """GPUs for each fit. 0.5 lets two fits share a GPU. 0: the fits use processors only.
     With GPUs, also give --variant cuda_ad_rgb after --, among the options of the fits."""
@@ -49,7 +49,7 @@ class BatchConfig:
     """Memory that one fit needs [GiB]. A machine runs only as many fits at a time as its memory allows. 0: no limit."""
     retries: int = 3
     """How many times in a row a fit may stop without progress before it counts as failed.
-    A restarted fit continues from its checkpoint. Raise the number on machines that are often switched off."""
+    A restarted fit continues from its checkpoint. Raise the number where fits are often stopped from outside."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
 

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def checked(config: CheckConfig, out: Path) -> int:
-    """The command with these options, its picture to be `out`. Returns its exit status."""
+    """Check the capture and write the contact sheet to `out`. Returns the exit status of the command."""
     capture = load_capture(config.scene, masks=config.masks, width=WIDTH)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")

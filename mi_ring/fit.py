@@ -81,7 +81,7 @@ def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fi
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
-    """Read the arguments: the configuration; those that --minutes chooses from; the checkpoint's state for --resume."""
+    """Read the arguments: options, the alternatives that --minutes chooses from, the checkpoint for --resume."""
     config = parse_options(arguments)
     choice = choice_of(config, arguments)
     require_scene(config.scene)

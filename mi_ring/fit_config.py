@@ -38,10 +38,9 @@ class Task:
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
     """Time for the whole command, approximately [min]. 0: no limit.
-    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one.
-    Less time gives less detail."""
+    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb computes on the processor. cuda_ad_rgb computes on a GPU of Nvidia."""
+    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
     threads: int = 0
     """Number of processor threads. 0: all. Give fewer to leave cores to other programs."""
 

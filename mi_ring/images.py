@@ -199,7 +199,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """An image encoded as the content of a file. `kind` and `options` are those of Pillow's `save`."""
+    """Encode an image as the content of a file. `kind` and `options` are those of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -59,7 +59,7 @@ class PaperConfig:
     """Make a small version in minutes: few runs, few iterations, small photographs.
     Its results are in OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb computes on the processor. cuda_ad_rgb computes on a GPU of Nvidia."""
+    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
     threads: int = 0
     """Number of processor threads of each fit. 0: all. Give fewer to leave cores to other programs."""
 

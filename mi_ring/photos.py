@@ -56,7 +56,7 @@ class PhotosConfig:
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
-    """Folder of the photographs."""
+    """Folder of the photographs: JPEG, HEIC, PNG, TIFF or raw files."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
     If the command is interrupted, it continues from work/."""
@@ -74,7 +74,7 @@ class PhotosConfig:
     A folder: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
-    Give it if the masks contain something else that touches the object in the photographs."""
+    Give it if the masks contain another thing, one that touches the object in the photographs."""
     square_mm: float = SQUARE
     """Side of a square of the printed sheet [mm].
     Give it if the printer does not print at 100 %: measure several squares with a ruler."""

@@ -146,9 +146,9 @@ class Calibration(nn.Module):
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
-        """Replace cameras and lights of `photographs` by those of `views`, and their room light by the current one.
+        """Give photographs the cameras and lights of `views` and the current light of the room, for the renderer.
 
-        Returns photographs for the renderer, without gradients. `views`: cameras and lights of all P photographs.
+        `views`: cameras and lights of all P photographs. The result is without gradients.
         """
         room = self.room_harmonics().double().numpy(force=True)
         return replace(prediction.with_views(photographs, views), room=room if room.any() else None)

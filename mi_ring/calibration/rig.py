@@ -30,7 +30,7 @@ class Estimate:
     response: CameraResponse
 
     def seen(self, **views: Tensor) -> "Estimate":
-        """A copy of the estimate in which these fields of `views` are replaced by other tensors."""
+        """A copy of the estimate in which some tensors of `views` are replaced by those given, by name."""
         return replace(self, views=self.views._replace(**views))
 
 

@@ -54,11 +54,11 @@ class RoomLight(nn.Module):
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
-        """Add photographs to the normal equations and solve them.
+        """Add photographs to the normal equations and solve them for the harmonics.
 
-        `observed`, `predicted` (N, H, W, 3): linear radiance, predicted with the current room light as if nothing
-        occluded it. `counted` (N, H, W) bool: pixels that show the object. `progress`: of the fit, in [0, 1]. `total`:
-        sums tensors over all processes.
+        `around`: the radiance that each harmonic adds to the photographs. `observed`, `predicted` (N, H, W, 3): linear
+        radiance, predicted with the current room light as if nothing occluded it. `counted` (N, H, W) bool: pixels that
+        show the object. `progress`: of the fit, in [0, 1]. `total`: sums tensors over all processes.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

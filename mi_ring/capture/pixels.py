@@ -19,7 +19,7 @@ class Pixels(Sequence):
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
-        """`kept`: the cache, arrays by their readers."""
+        """Take a reader for each array. `kept`: the cache of arrays by their readers; default: an empty one."""
         self.readers = tuple(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
 
@@ -48,7 +48,7 @@ class Pixels(Sequence):
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """The sequence of only these indices."""
+        """The sequence of the arrays with these indices alone."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":

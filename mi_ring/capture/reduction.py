@@ -252,7 +252,7 @@ def decoded_by(shot: Shot) -> tuple:
 
 
 def same_files(shot: Shot) -> tuple[bool, bool]:
-    """Whether the mask is the photograph itself, by its alpha channel; the same of the map of valid pixels."""
+    """Does a photograph's alpha channel hold its mask; does it hold the map of valid pixels?"""
     return shot.files.mask == shot.files.filename, shot.files.valid == shot.files.filename
 
 

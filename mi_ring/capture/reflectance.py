@@ -72,7 +72,7 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """The output of BRDF-Net that gives the mean of `value`, by the inverse sigmoid; 0 if there is no highest value."""
+    """The output with which BRDF-Net predicts the mean of `value` between `low` and `high`; 0 if `high` is infinite."""
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

@@ -78,7 +78,7 @@ class CachedDataset(Dataset):
 
     @classmethod
     def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
-        """Make the dataset in a folder. `fields`: those of the subclass."""
+        """Make the dataset in a folder. `fields`: values of the fields that the subclass adds."""
         return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
 
     def prepare(self) -> None:

@@ -28,7 +28,7 @@ Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """The labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
+    """Write the labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 

@@ -13,7 +13,7 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Our rows, their means, and published rows below our rows of the same labels.
+    """Collect the rows of the table: ours, their means, and below ours the published rows of the same labels.
 
     The entry `state` says why a run has no numbers.
     """

@@ -47,7 +47,7 @@ class Common:
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. It starts from the scene file.
     auto: light, power and ambient, and scale if it is needed. If the light is unknown: gain and ambient.
-    none: nothing. Set it if the calibration is exact. Add cameras and focal if the predicted photographs look shifted.
+    none: nothing. Set it if the calibration is exact. If predicted photographs look shifted, set auto cameras focal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.
@@ -89,7 +89,7 @@ class Common:
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How fine and how fast the fit is. Presets set most of these."""
+    """How fine and how fast the fit is. Presets set most of these options."""
 
     levels: tuple[int, ...] = (4, 5, 6)
     """Level of the mesh in each stage, 0 to 8. Level n has about 10 · 4^n vertices.
@@ -99,7 +99,7 @@ class Tuning:
     Larger widths give finer detail and take longer."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
     """How the iterations are divided among the stages, from coarse to fine: one number above 0 for each stage.
-    Only their ratios count. More for the last stage gives finer detail and takes longer.
+    Only the ratios count. A larger last number gives finer detail and takes longer.
     A fit from a hull or a mesh skips two thirds of the first stage and adds 40 % of the skipped ones to the second."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. It does not change the fit.
@@ -108,7 +108,7 @@ class Tuning:
     """Photographs in each iteration. More photographs make an iteration slower and its gradient less noisy."""
     steps: int = 3
     """Number of steps in which the network moves the start surface to the object (Euler steps; the paper's T).
-    Time and memory grow with it. Raise it if the surface folds over; more steps make this less likely."""
+    Time and memory grow with it. Raise it if the surface folds over: more steps make folds less likely."""
     spp: int = 1
     """Samples per pixel of predicted photographs. More samples make an iteration slower and its gradient less noisy."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
@@ -118,10 +118,10 @@ class Tuning:
     velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
     calibration: refined calibration stays near that of the scene file.
     settling: the material varies little in the last stage, under an unknown environment.
-    normal_variation: the surface has flat faces and sharp edges. Start with 0.01 if the object has them.
-    material_rank: the material mixes a few materials. Start with 0.01 if that of the object does."""
+    normal_variation: the surface has flat faces and sharp edges. Start with 0.01 for objects like this.
+    material_rank: the material is a mixture of few materials. Start with 0.01 for objects like this."""
     velocity_decay: float = 0.03
-    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: it stays.
+    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: the weight stays equal.
     A small share gives finer detail, but the surface may fold over if the fit is short."""
     laplacian_scale: float = 0.01
     """How much the term velocity penalises high frequencies of the deformation, 0 or more (the paper's alpha).
@@ -132,11 +132,11 @@ class Tuning:
     """Learning rate of Muon at the start. Muon trains the hidden layers unless --optimizer is adam.
     Raise it for faster progress; lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """Share of the learning rates that is left at the end, above 0. 1: they stay. Smaller shares give a steadier end.
-    Learning rates of cameras fall to a half instead."""
+    """Share of the learning rates that is left at the end, above 0. 1: the rates stay equal.
+    A smaller share gives a steadier end. Learning rates of cameras fall to a half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
-    Set float32 to compare results of different machines."""
+    Set float32 to compare results of different machines; a fit may then take longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,10 +154,11 @@ class Ablation:
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
     log: difference of logarithms, for dark surfaces. l1+log: the mean of l1 and log."""
     optimizer: Literal["muon", "adam"] = "muon"
-    """The optimisers that train the networks.
+    """The optimisers that train the networks. Set adam to compare with the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """The network that deforms the domain. ring: the paper's flow; all steps share one network.
+    """The network that deforms the start surface. The others are for comparison; their surfaces may fold over.
+    ring: the paper's flow; all steps share one network.
     resnet: each step has its own, narrower network, with about as many weights in total.
     wide-resnet: each step has its own network, as wide as that of ring, so there are more weights."""
     encoding: Literal["linear", "octaves", "none"] = "linear"
@@ -167,7 +168,8 @@ class Ablation:
     """Number of frequencies of the positional encoding, 1 to 64 (1 to 16 for octaves).
     More frequencies can represent finer detail, and also more noise."""
     resample: bool = True
-    """Sample other points of the start surface in each iteration, so that the networks are trained everywhere."""
+    """Sample other points of the start surface in each iteration, so that the networks are trained everywhere.
+    Without it they are trained at the same points only."""
 
 
 @dataclass(frozen=True, kw_only=True)

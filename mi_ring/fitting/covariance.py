@@ -121,7 +121,7 @@ class CovarianceGroup:
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict radiance (n, H, W, 3) by interreflection of direct light `lit`, and that by the room's light."""
+        """Predict radiance (n, H, W, 3) by interreflection and by the room's light, to add to direct light `lit`."""
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
         room = calibration.room_harmonics()

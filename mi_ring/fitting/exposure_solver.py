@@ -24,7 +24,7 @@ class ExposureSolver(torch.optim.Optimizer):
     rate = Rate(0.5, 0.1, START)  #: share of the measured difference by which an estimate moves
 
     def __init__(self, calibration: Calibration, name: str) -> None:
-        """`name`: the unknown that is solved for, "power" or "gain"."""
+        """Solve for the unknown `name` of a calibration: "power" or "gain"."""
         self.tensor, self.width = getattr(calibration, name), calibration.widths[name]
         super().__init__([{"params": [self.tensor]}], {"lr": self.rate.initial})
         #: photographs, and log(observed / predicted brightness) (3,) of each; NaN: a colour without pixels

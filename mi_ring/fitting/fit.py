@@ -144,7 +144,7 @@ class Fit(Renamed):
 
     @property
     def ring(self) -> FittedObject:
-        """The fitted object."""
+        """The object as fitted so far."""
         return self.model.ring
 
     @property

@@ -51,12 +51,12 @@ class Iteration(renamed.Renamed):
 
     @property
     def progress(self) -> float:
-        """Share of the shaping iterations before this one, in [0, 1]."""
+        """Share of the iterations that shape the surface, in [0, 1], that are done before this one."""
         return self.batch.progress
 
     @property
     def stage(self) -> Stage:
-        """The stage of the schedule."""
+        """The stage of the schedule that this iteration belongs to."""
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:

@@ -81,7 +81,7 @@ class CoarseFits:
     """Coarse fits of a capture under different lights, each made once."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
-        """`config`: of the fit for which the light is chosen."""
+        """Prepare coarse fits of a capture. `config`: of the fit for which the light is chosen."""
         self.capture, self.config = capture, config
         self.center, _ = capture.sphere()
         self.errors: dict[Lighting, float] = {}  #: mean error of each
@@ -91,7 +91,7 @@ class CoarseFits:
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
-        """The mean error of a coarse fit; infinite if it fails."""
+        """The mean error of a coarse fit under this lighting, which runs if it has not yet; infinite if it fails."""
         if lighting in self.errors:
             return self.errors[lighting]
         refine = refined_under(lighting, self.config)

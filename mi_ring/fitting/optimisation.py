@@ -67,7 +67,7 @@ class Optimisation:
     """The optimisers of a model with their learning rates, the solvers of calibration, and the guard against NaN."""
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
-        """`terms`: of the loss."""
+        """Make optimisers and solvers for a model. `terms`: of the loss, by name."""
         self.problem, self.model = problem, model
         self.steppers = network_steppers(model.ring, problem.config, problem.device)
         self.solvers: list[ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients

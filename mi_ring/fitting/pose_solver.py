@@ -69,7 +69,7 @@ class PoseSolver(torch.optim.Optimizer):
     """Finds the poses of cameras, the unknowns `turn` and `move`: `look` at an iteration, then `step`."""
 
     def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
-        """`near`: the fit starts near the object. `terms`: of the loss.
+        """Solve for the poses of a calibration. `near`: the fit starts near the object. `terms`: of the loss.
 
         Raises InputError if `rgb` or `mask` is not the default term: the curvature is that of the default ones.
         """

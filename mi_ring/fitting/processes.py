@@ -114,7 +114,7 @@ class Team(Processes):
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """See `Processes`. If several processes fail, the message of the first of them is used."""
+        """See `Processes.agreed`. If several processes fail, the message of the first of them is used."""
         result: Any = None
         error: InputError | None = None
         try:

@@ -25,7 +25,7 @@ class RegulariserStrength:
         self.unexplained: float = 1.0  #: running mean of `Iteration.unexplained`
 
     def note(self, it: Iteration) -> None:
-        """Update after an iteration.
+        """Update the strength after an iteration.
 
         Where photographs disagree with the model, a weak regulariser lets the surface fold. So it gets stronger while
         the surface intersects itself. Early intersections of growing limbs are normal, and the regulariser catches up

@@ -19,7 +19,7 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss."""
+    """A term of the loss: its function, its weight, and a factor of the weight that may change during the fit."""
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -102,7 +102,7 @@ class Loss:
     """The weighted sum of terms."""
 
     def __init__(self, terms: Mapping[str, TermLike] | None, weights: Mapping[str, float]) -> None:
-        """`terms`: default is `default_terms`. `weights`: by name.
+        """Make a loss of `terms`, by default `default_terms`, with `weights` by their names.
 
         Raises InputError for a reserved name, for a weight without a term, and if no term compares with photographs.
         """

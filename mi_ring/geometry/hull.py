@@ -133,7 +133,7 @@ class Hull:
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """Distances (N, pixels) [px], 0 or more, of silhouettes from the projected hull. Default: its own silhouettes.
+        """How far silhouettes reach beyond the projected hull: (N, pixels) [px]. Default: the hull's own silhouettes.
 
         For `pixels` random pixels of each mask, or of its `outline`: the distance of the hull from the ray through the
         pixel, sampled at `samples` points.

@@ -39,7 +39,7 @@ class Photogrammetry(Source):
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs, unless the format has a rule of its own."""
+        """The folder of the photographs. Formats with another rule replace this property."""
         own = self.src if self.src.is_dir() else self.src.parent
         candidates = (own / "images", own.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), own)

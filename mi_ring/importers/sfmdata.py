@@ -115,7 +115,7 @@ def file_name(view: dict, field: str, what: str) -> str:
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """The object in a smart pointer of cereal, with the fields of its base class."""
+    """Read the object in a smart pointer of cereal, with the fields of its base class."""
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
@@ -163,9 +163,9 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """A lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
+    """Make a lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
 
-    `given`: its coefficients; 0 if they are missing.
+    `given`: the model's coefficients; 0 if they are missing.
     """
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")

@@ -49,7 +49,7 @@ class Writer:
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """The path relative to the scene file."""
+        """Make a path relative to the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:

@@ -30,7 +30,7 @@ class MaterialOptions:
     roughness_add: float = 0.0
     """Number to add to the roughness, which stays in its range. Above 0: wider highlights. Below 0: sharper ones."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors for red, green and blue of the object's colour."""
+    """Factors for red, green and blue of the object's colour, 0 or more. 1 1 1: no change."""
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:

@@ -23,7 +23,7 @@ ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
-    """The content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
+    """Make the content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
     domain = None
     if not isinstance(ring.domain, Sphere):  # as tensors: torch loads no numpy arrays with `weights_only`
         domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}

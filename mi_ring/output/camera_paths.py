@@ -83,7 +83,7 @@ class RenderConfig(MaterialOptions):
 
     @property
     def count(self) -> int:
-        """The number of pictures of the turntable, the light orbit or the flow; 0 without these."""
+        """The number of pictures of --turntable, --light-orbit or --flow; 0 if none of them is given."""
         return self.turntable or self.light_orbit or self.flow
 
     @property
@@ -164,7 +164,7 @@ def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """A camera at the same position that is centred on the object and shows it and the start surface of the fit.
+    """Turn and zoom a camera, at its position, so that it shows object and start surface of the fit, centred.
 
     Also returns the centre (3,) of the object [scene units].
     """

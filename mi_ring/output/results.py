@@ -168,9 +168,9 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of these photographs, each named like its photograph with .png added.
+    """Write the masks of photographs `index` as PNG, each named like its photograph with .png added.
 
-    Returns their names, by index, as a scene beside `folder` has them.
+    Returns the masks' names, by index, as a scene beside `folder` has them.
     """
     names = {}
     for k in index:

@@ -47,7 +47,7 @@ OUTLINES = RefinementSettings(0.96, 0.04, 2)
 
 @dataclass
 class VoxelObject:
-    """The voxels of the object."""
+    """The object as a set of voxels in a grid."""
 
     corner: np.ndarray  #: (3,) centre of the first voxel
     spacing: float

@@ -83,7 +83,7 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """The EXIF orientation by which stored pixels are turned: 1 for HEIF, whose reader has turned them."""
+        """The EXIF orientation by which `stored` is turned: 1 for HEIF, whose reader has turned the pixels already."""
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property

@@ -132,7 +132,7 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Read the user's masks and find the object by them. Raises InputError if too few or without a common object."""
+    """Read the user's masks and find the object by them. Raises InputError if masks are too few or disagree."""
     masks = {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(known.masks)

@@ -74,7 +74,7 @@ def sphere_outline(e, w, t):
 
 
 def cylinder_outline(e, w, t, side=1.0):
-    """One of both lines on the cylinder x² + y² = 1, 0 < z < 1, where its normal is perpendicular to the view."""
+    """One of two lines of the outline of the cylinder x² + y² = 1, 0 < z < 1, as a curve; `side`, 1 or -1: which."""
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
     p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)

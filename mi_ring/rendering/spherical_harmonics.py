@@ -71,9 +71,10 @@ def world_harmonics(directions: np.ndarray, order: int = MAX_ORDER) -> np.ndarra
 
 
 def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (2 rows², 3) and solid angles (2 rows²,) of the pixels of an environment map of 2 rows columns.
+    """Unit directions and solid angles of the pixels of an environment map with `rows` rows and 2 rows columns.
 
-    In latitude and longitude like Mitsuba's `envmap`: y is up, and -z is in the middle of the left and right borders.
+    Returns (2 rows², 3) and (2 rows²,). In latitude and longitude like Mitsuba's `envmap`: y is up, and -z is in the
+    middle of the left and right borders.
     """
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
     theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()

@@ -10,7 +10,7 @@ LAMP_CLASSES = "PointLight", "DirectionalEmitter"  #: Mitsuba's classes of emitt
 
 
 class Light(NamedTuple):
-    """The light of one photograph, or a lamp, in the world."""
+    """A point light or distant light: that of one photograph, or a lamp, in the world."""
 
     kind: Literal["point", "directional"]
     vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels

@@ -67,7 +67,10 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph of a capture. It is immutable; use `dataclasses.replace` for one with changed fields."""
+    """A photograph of a capture: camera, light, response and files, as plain values.
+
+    It is immutable; use `dataclasses.replace` for one with changed fields.
+    """
 
     name: str  #: the sensor's id in the scene file
     camera: Camera

@@ -32,7 +32,7 @@ class ObjectOnTable:
     """An object with its BSDF, and the shapes on which it stands."""
 
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
-        """`vertices` (V, 3): of the object; without a table, only the pixels around them are rendered."""
+        """Join object and tables. `vertices` (V, 3): of the object; without tables, only its pixels are rendered."""
         self.object, self.vertices, self.tables = mesh, vertices, list(tables)
 
     def under(self, emitter: mi.Object) -> mi.Scene:

@@ -92,7 +92,7 @@ class SynthesizeConfig:
     """Render each view a second time, under the light of --room alone.
     The scene file names these second photographs (`ambient`), and a fit subtracts them."""
     environment: Path | None = None
-    """Environment map (EXR or HDR, latitude and longitude) that lights the object instead of --light and --room."""
+    """Environment map that lights the object instead of --light and --room: EXR or HDR, latitude and longitude."""
     table: Literal["none", "plain", "sheet"] = "none"
     """Table below the object, which hides its underside from cameras and reflects light.
     none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres."""
@@ -104,7 +104,7 @@ class SynthesizeConfig:
     """Brightness of the photographs: linear pixel value of a white surface at the object that faces the light.
     Without it: chosen by --clipped."""
     clipped: float = 0.02
-    """Share of the object's pixels that are overexposed, 0 to 0.9. It sets the exposure. Not used with --exposure."""
+    """Share of the object's pixels that are overexposed, 0 to 0.9, to choose the exposure. Not used with --exposure."""
     electrons: float = 0.0
     """Electrons that a pixel counts at full scale. Fewer electrons give more shot noise. 0: no shot noise."""
     read: float = 0.0
@@ -128,7 +128,8 @@ class SynthesizeConfig:
     spp: int = 64
     """Light paths per pixel, rounded up to a square number. More paths give less noise and take longer."""
     depth: int = 5
-    """Largest length of light paths, 2 or more (`max_depth` of Mitsuba's path tracer). 2: no interreflection."""
+    """Largest length of light paths, 2 to 100 (`max_depth` of Mitsuba's path tracer). 2: no interreflection.
+    Longer paths make concave parts brighter, as in reality, and take longer."""
     seed: int = 0
     """Random seed of cameras, lights, noise and paths. Another seed gives another capture of the same kind."""
 

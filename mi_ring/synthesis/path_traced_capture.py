@@ -138,7 +138,7 @@ class Studio:
         return picture
 
     def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Render linear radiance (H, W, 3) under the room's light alone, as arguments of `radiance` say."""
+        """Render linear radiance (H, W, 3) under the room's light alone. Arguments: those of `radiance`."""
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
             return np.zeros((*reversed(view.camera.size), 3))

@@ -144,7 +144,7 @@ def interrupted() -> bool:
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can resume. On one of the `SIGNALS` it prints this.
+    """A context manager for work that the same command can resume. On a signal of `SIGNALS` it prints that hint.
 
     It raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
     """

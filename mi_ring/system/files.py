@@ -97,7 +97,7 @@ def seal(archive: io.BytesIO) -> None:
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Whether a zip file ends with the checksum of `seal`, and it is right."""
+    """Does a zip file end with the checksum of `seal`, and is the checksum right?"""
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 

@@ -92,7 +92,7 @@ def cores() -> int:
 
 
 def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
-    """`map` in threads, one per core and at most `most`; for functions that release Python's global lock."""
+    """Call `function` like `map`, in threads, one per core and at most `most`; it must release Python's global lock."""
     with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
 
