@@ -96,7 +96,7 @@ def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection matrix (3, 4): calibration matrix (3, 3) and pose (4, 4). Raises InputError if it is singular."""
+    """Split a projection matrix (3, 4) into calibration (3, 3) and pose (4, 4). Raises InputError if it is singular."""
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])
