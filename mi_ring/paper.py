@@ -49,7 +49,7 @@ class PaperConfig:
     """Folder for the results of all experiments and for the captures that they make.
     Each experiment has a folder of its name and preset."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
-    """Preset of the fits, as in mi-ring fit.
+    """Preset of the fits, as in mi-ring fit: finer presets take longer.
     Without it: default, or fast with --quick, which allows no other."""
     seeds: tuple[int, ...] = (0,)
     """Random seeds. Each run is made once with each seed, and the table has the means. More seeds give surer means."""

@@ -45,7 +45,8 @@ class ValidateConfig:
     spp: int = 64
     """Samples per pixel, rounded up to a multiple of 16. More samples find smaller differences and take longer."""
     depth: int = 6
-    """Maximum path length of the path tracer, Mitsuba's max_depth: 3 or more (2 is direct light). -1: no limit."""
+    """Largest length of the path tracer's light paths, Mitsuba's max_depth: 3 or more. -1: no limit.
+    Longer paths find more interreflection and take longer. With 2 there would be direct light only."""
     significance: float = 0.01
     """Probability of a false alarm, above 0 and below 1: a reported difference although both renderers agree."""
     seed: int = 0

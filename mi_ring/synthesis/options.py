@@ -116,12 +116,12 @@ class SynthesizeConfig:
     N rotates each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
     wrong_light: float = 0.0
     """Error of the positions of point lights in the scene file [% of the camera's distance]. 0: exact positions.
-    It is the same for all lights, in the axes of their cameras."""
+    All lights have the same error, in the axes of their cameras."""
     wrong_power: float = 0.0
     """Standard deviation of errors of each light's power in the scene file [%]. 0: exact powers."""
     wrong_exposure: float = 0.0
     """Standard deviation of the photographs' exposures, which the scene file does not say [%]. 0: equal exposures.
-    A third of it varies the white balance."""
+    The white balance varies by a third of this number."""
     wrong_room: bool = False
     """Leave --room, --environment and further --lamps out of the scene file, to test fits in unknown light."""
 
