@@ -36,19 +36,20 @@ class BatchConfig:
     scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE.xml")]]
     """Mitsuba XML files, each with the photographs of one object."""
     out: Path = Path("out")
-    """Folder for all results. Each scene gets a folder of its name, and index.html shows them all.
+    """Folder for all results. Each scene gets a folder of its name, and index.html shows all results.
     batch/ keeps what each fit has printed. On a cluster, scenes and this folder have the same path on all machines."""
     workers: int = 1
-    """Number of fits that run at the same time."""
+    """Number of fits that run at the same time. More use the cores better, but each fit needs its own memory."""
     cpus: int = 0
-    """Processor cores for each fit. 0: the cores of this machine, shared among --workers."""
+    """Processor cores for each fit. 0: an equal share of this machine's cores for each of the --workers."""
     gpus: float = 0
-    """GPUs for each fit. 0.5 lets two fits share one.
-    Give --variant cuda_ad_rgb after -- as well."""
+    """GPUs for each fit. 0.5 lets two fits share a GPU. 0: the fits use processors only.
+    With GPUs, also give --variant cuda_ad_rgb after --, among the options of the fits."""
     memory: float = 0
-    """Memory that a fit needs [GiB]. A machine runs only as many fits at a time as its memory allows. 0: no limit."""
+    """Memory that one fit needs [GiB]. A machine runs only as many fits at a time as its memory allows. 0: no limit."""
     retries: int = 3
-    """How many times in a row a fit may die without progress before it counts as failed."""
+    """How many times in a row a fit may stop without progress before it counts as failed.
+    A restarted fit continues from its checkpoint. Raise the number where fits are often stopped from outside."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
 

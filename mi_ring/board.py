@@ -19,13 +19,13 @@ class BoardConfig:
     """Write a sheet of markers to print and put under the object. With it, mi-ring photos finds scale and light."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write: .pdf or .png."""
+    """File to write: .pdf to print, or .png."""
     paper: Literal["a4", "letter"] = "a4"
-    """Size of the paper."""
+    """Size of the paper in the printer."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(BoardConfig, arguments, "mi_ring.board", needs_llvm=False)
     file, kind = config.file, config.file.suffix.lower()
     if kind not in (".pdf", ".png"):

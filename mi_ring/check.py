@@ -27,14 +27,14 @@ class CheckConfig:
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs."""
+    """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
-    """Contact sheet to write, .png. Without it: out/check/NAME.png."""
+    """Contact sheet to write, a .png file with all photographs and masks. Without it: out/check/NAME.png."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """Masks to use.
-    given: those of the scene, if it has any. auto: the same; if it has none, masks by brightness in a dark room.
-    none: masks by brightness in a dark room, those of the scene are ignored.
-    Give none if the scene's masks are wrong and the background is dark."""
+    """Which masks to check.
+    given: the masks of the scene file. auto: the same; if there are none and the room was dark, masks by brightness.
+    none: masks by brightness in a dark room. The masks of the scene file are ignored.
+    Set none if the masks of the scene file are wrong and the background is dark."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def checked(config: CheckConfig, out: Path) -> int:
-    """The command with these options, its picture to be `out`. Returns its exit status."""
+    """Check the capture and write the contact sheet to `out`. Returns the exit status of the command."""
     capture = load_capture(config.scene, masks=config.masks, width=WIDTH)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")

@@ -19,7 +19,7 @@ Formats: Any = Union[  # noqa: UP007
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in FORMATS:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)

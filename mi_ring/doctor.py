@@ -26,8 +26,8 @@ class DoctorConfig:
     """Say what mi_ring lacks on this machine and how to get it. The exit status is 1 if a fit cannot run."""
 
     empty_cache: bool = False
-    """Remove the reduced photographs from the cache folder. Use it to get disk space back. The next fit makes those it
-    needs again."""
+    """Remove the reduced photographs from the cache folder. Use it to get disk space back.
+    The next fit of a capture makes its reduced photographs again, which takes longer."""
 
 
 class Finding(NamedTuple):
@@ -79,7 +79,7 @@ def computing() -> Iterator[Finding]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command. Returns its exit status: 1 if a fit cannot run."""
+    """Run the command. Returns its exit status: 1 if a fit cannot run."""
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
         from mi_ring.system import cache  # which imports torch
 

@@ -34,19 +34,20 @@ class EvaluateConfig:
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit."""
     mesh: Path
-    """True surface in the units and the frame of the scene: PLY, OBJ or GLB."""
+    """File of the true surface, in the units and the frame of the scene: PLY, OBJ or GLB."""
     novel: Path | None = None
-    """Scene file of photographs that the fit has not seen."""
+    """Scene file of photographs that the fit has not seen, to compare predictions with. Without it: none."""
     seen: bool = False
-    """Compute Chamfer distance and F-score only of parts that a photograph of the fit shows."""
+    """Compute Chamfer distance and F-score only of parts that a photograph of the fit shows.
+    Use it if the photographs do not show the whole object, for example not its underside."""
     align: Literal["rigid", "similarity"] | None = None
     """Align the true surface and the photographs of --novel with the fit before the comparison.
     rigid: by rotation and translation. similarity: also by scale. Numbers of the fit's own photographs do not change.
     Use it after a fit with --refine cameras, in which the whole object may move."""
     spp: int = SPP
-    """Samples per pixel of the predicted photographs. More give less noise."""
+    """Samples per pixel of the predicted photographs. More samples give less noise and take longer."""
     out: Path | None = None
-    """JSON file to write. Without it: evaluation.json in the results folder."""
+    """JSON file for the numbers. Without it: evaluation.json in the results folder."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -40,12 +40,13 @@ class ExportConfig(MaterialOptions):
     """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
     Without it: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
     resolution: int = RESOLUTION
-    """Width and height of the textures [texels]."""
+    """Width and height of the textures [texels], 64 to 4096. More texels keep finer detail and make larger files.
+    A .ply has no textures."""
     time: float = 1.0
-    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
+    """Which surface to write, as a time of the deformation: 0 is where the fit started, 1 is the finished object."""
     metres: float | None = None
-    """Length of a scene unit [m]; only for .glb. Without it: as the capture says.
-    Captures of mi-ring photos with the printed sheet are in millimetres."""
+    """Length of a scene unit [m]; only for .glb. Without it: the length that the capture gives.
+    Set it to give the object its real size. Captures of mi-ring photos with the printed sheet know their unit."""
 
 
 def require_options(config: ExportConfig) -> None:
@@ -58,9 +59,9 @@ def require_options(config: ExportConfig) -> None:
 
 
 def seen_from(run: Path) -> list[MaskedCamera] | None:
-    """Camera and mask of each photograph of a fit: `run` is its folder or a file in it.
+    """Read camera and mask of each photograph of a fit: `run` is its folder or a file in it.
 
-    None, with a warning, if its scene.xml cannot be read.
+    Returns None, with a warning, if its scene.xml cannot be read.
     """
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
@@ -70,7 +71,7 @@ def seen_from(run: Path) -> list[MaskedCamera] | None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)

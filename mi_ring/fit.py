@@ -71,7 +71,7 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
 
 
 def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fit:
-    """A new fit. Its time includes the coarse fits that find the kind of an unknown light."""
+    """Start a new fit. Its time includes the coarse fits that find the kind of an unknown light."""
     began = time.perf_counter()
     lighting = processes.broadcast(processes.agreed(lambda: choose_lighting(capture, config)))
     seconds = time.perf_counter() - began
@@ -81,7 +81,7 @@ def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fi
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
-    """The configuration; the configurations that --minutes chooses from; with --resume, the state of the checkpoint."""
+    """Read the arguments: options, the alternatives that --minutes chooses from, the checkpoint for --resume."""
     config = parse_options(arguments)
     choice = choice_of(config, arguments)
     require_scene(config.scene)
@@ -111,7 +111,7 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
-    """The configuration of `choice` that --minutes allows, and the measured costs of iterations.
+    """Choose the configuration of `choice` that --minutes allows. Also returns the measured costs of iterations.
 
     `started`: start of the command, by `time.monotonic`. Raises InputError if none can be done in that time.
     """

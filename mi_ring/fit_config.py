@@ -26,12 +26,12 @@ class Task:
     """Input, output and computing resources."""
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs."""
+    """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
     """Folder for the results. Without it: out/NAME.
     NAME is the name of the scene file, or of its folder if the file is called scene.xml."""
     resume: bool = False
-    """Continue the fit in the results folder from its checkpoint. Give the same options as before."""
+    """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """A set of values for the other options. Options that you give override it. Times are for two processor cores.
     fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
@@ -40,9 +40,9 @@ class Task:
     """Time for the whole command, approximately [min]. 0: no limit.
     The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU if there is one."""
+    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
     threads: int = 0
-    """Number of processor threads. 0: all."""
+    """Number of processor threads. 0: all. Give fewer to leave cores to other programs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class FitConfig(Config, Task):
 
 
 def parse_options(arguments: Sequence[str]) -> FitConfig:
-    """The configuration: the preset's settings, changed by those on the command line.
+    """Read the configuration: the preset's settings, changed by the options on the command line.
 
     Raises InputError for wrong options. After printing the help it raises SystemExit: --help shows the options that
     users set, --help-all shows all options.
@@ -111,10 +111,10 @@ def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
 
 
 def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
-    """A frozen dataclass with these fields, by name, and those of its bases."""
+    """Make a frozen dataclass with these fields, by name, and those of its bases."""
     return dataclasses.make_dataclass(name, fields.items(), bases=bases, frozen=True, kw_only=True)
 
 
 def built(kind: Any, values: dict[str, Any]) -> Any:
-    """An instance of the dataclass `kind`. `values` may have further names, which are ignored."""
+    """Make an instance of the dataclass `kind`. `values` may have further names, which are ignored."""
     return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

@@ -31,10 +31,7 @@ except (ImportError, OSError, ValueError):
 
 @contextlib.contextmanager
 def reading(where: Path | str, what: str) -> Iterator[None]:
-    """A context manager that turns every error of a reader into an InputError.
-
-    `where` is the file, `what` its expected content.
-    """
+    """Turn every error of a reader, in this context, into an InputError: file `where`, expected content `what`."""
     try:
         yield
     except InputError:
@@ -67,14 +64,14 @@ def require_readable(read: str, path: Path, size: int, what: str) -> None:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file by name. Raises InputError if it cannot be read."""
+    """Read the arrays of a .npz file by name. Raises InputError if it cannot be read."""
     with reading(path, "arrays of NumPy's, .npz"), zipfile.ZipFile(path) as archive:
         require_plausible_size(path, sum(member.file_size for member in archive.infolist()))
         return {name.removesuffix(".npy"): parse_npy(archive.read(name)) for name in archive.namelist()}
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """The array of a .npy file. Raises InputError if it cannot be read."""
+    """Read the array of a .npy file. Raises InputError if it cannot be read."""
     with reading(path, "an array of NumPy's, .npy"):
         return parse_npy(path.read_bytes())
 

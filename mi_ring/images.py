@@ -37,12 +37,12 @@ Pictures = TypeVar("Pictures", np.ndarray, Tensor)
 
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
-    """sRGB values to linear ones (IEC 61966-2-1), as float32."""
+    """Convert sRGB values to linear ones (IEC 61966-2-1), as float32."""
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(v: np.ndarray) -> np.ndarray:
-    """Linear values, clipped to [0, 1], to sRGB values."""
+    """Convert linear values, clipped to [0, 1], to sRGB values."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
 
@@ -62,12 +62,12 @@ def contrasted(linear: Pictures, contrast: Any) -> Pictures:
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:
-    """Values, clipped to [0, 1], as uint8 from 0 to 255."""
+    """Convert values, clipped to [0, 1], to uint8 from 0 to 255."""
     return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def box_filter(image: Tensor, scale: int) -> Tensor:
-    """Means over blocks of `scale` × `scale` pixels: (H, W, C) → (H // scale, W // scale, C)."""
+    """Average blocks of `scale` × `scale` pixels: (H, W, C) → (H // scale, W // scale, C)."""
     if scale == 1:
         return image
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
@@ -83,7 +83,7 @@ class BoundedFile(io.BufferedReader):
 
 @contextlib.contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """An image file opened by Pillow.
+    """Open an image file by Pillow, in a context manager.
 
     Raises ValueError if it is no image or declares an implausible size, InputError if it is HEIF and pillow_heif is not
     installed, and other errors if it is damaged.
@@ -103,7 +103,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) [px] that an image file declares. Raises the same errors as `open_image`."""
+    """Read the width and height [px] that an image file declares. Raises the same errors as `open_image`."""
     suffix = path.suffix.lower()
     if suffix == ".exr":
         return exr_size(path)[:2]
@@ -115,7 +115,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def exr_size(path: Path) -> tuple[int, int, int]:
-    """Width [px], height [px] and number of channels that the header of an OpenEXR file declares.
+    """Read width [px], height [px] and number of channels from the header of an OpenEXR file.
 
     The header is a list of attributes ("OpenEXR File Layout"): name and type, which end in a zero byte, size, value.
     """
@@ -145,7 +145,7 @@ def exr_size(path: Path) -> tuple[int, int, int]:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """The pixels (H, W, C) of an image file: uint8, uint16, or float32 for all other types.
+    """Read the pixels (H, W, C) of an image file: uint8, uint16, or float32 for all other types.
 
     Raises ValueError for CMYK and, before it allocates memory, for an implausible size; other errors for damaged files.
     """
@@ -177,7 +177,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of images (..., H, W) by `sigma` > 0 [px]. Pixels outside count as zero."""
+    """Blur images (..., H, W) by a Gaussian of `sigma` > 0 [px]. Pixels outside count as zero."""
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
@@ -199,7 +199,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """An image encoded as the content of a file. `kind` and `options` are those of Pillow's `save`."""
+    """Encode an image as the content of a file. `kind` and `options` are those of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -31,7 +31,7 @@ class PaperConfig:
     """
 
     name: Positional[Annotated[Name, arg(metavar="NAME")]]
-    """The experiment.
+    """The experiment to repeat.
     table1: accuracy. table2: DiLiGenT-MV. table3: wrong camera poses, refined.
     specularity: materials from dull to glossy. stripes: two materials on one object. swap: materials exchanged.
     views: 5 to 50 photographs. genus: from a sphere and from the visual hull.
@@ -41,27 +41,27 @@ class PaperConfig:
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]] = ()
     """Captures (folders with scene.xml and truth/mesh.ply) or meshes. specularity and stripes take one mesh.
     table2 takes the folder of DiLiGenT-MV, single takes .npz files.
-    Without it, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
+    Without data, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
     materials: tuple[str, ...] = ()
-    """Materials of the meshes, as mi-ring synthesize takes them.
-    Meshes get them in turn. specularity puts all of them on its one mesh, stripes needs two."""
+    """Materials of the meshes, in the form that mi-ring synthesize takes.
+    The meshes get the materials in turn. specularity puts all of them on its one mesh, stripes needs two."""
     out: Path = Path("out/paper")
     """Folder for the results of all experiments and for the captures that they make.
     Each experiment has a folder of its name and preset."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
-    """Preset of the fits, as in mi-ring fit.
+    """Preset of the fits, as in mi-ring fit: finer presets take longer.
     Without it: default, or fast with --quick, which allows no other."""
     seeds: tuple[int, ...] = (0,)
-    """Random seeds. Each run is made once with each, and the table has the means."""
+    """Random seeds. Each run is made once with each seed, and the table has the means. More seeds give surer means."""
     only: tuple[str, ...] = ()
-    """Names of the runs to make now. Without it: all."""
+    """Names of the runs to make now, to spread an experiment over several times or machines. Without it: all."""
     quick: bool = False
     """Make a small version in minutes: few runs, few iterations, small photographs.
     Its results are in OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb computes on the processor, cuda_ad_rgb on a GPU."""
+    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
     threads: int = 0
-    """Number of processor threads of each fit. 0: all."""
+    """Number of processor threads of each fit. 0: all. Give fewer to leave cores to other programs."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -56,7 +56,7 @@ class PhotosConfig:
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
-    """Folder of the photographs."""
+    """Folder of the photographs: JPEG, HEIC, PNG, TIFF or raw files."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
     If the command is interrupted, it continues from work/."""
@@ -64,20 +64,20 @@ class PhotosConfig:
     """Position of the flash relative to the lens: right, down and forward.
     With a sheet the unit is mm, and the sheet refines the position.
     Without a sheet the unit is the median distance from the cameras to the object.
-    It is for the orientation of most photographs, upright or sideways; for the others it turns with the camera."""
+    Measure it while the camera is held as in most photographs. For the others the command turns it with the camera."""
     turntable: bool = False
-    """Give it if the object turned, with the sheet under it, while camera and flash stood still."""
+    """Set it if the object turned, with the sheet under it, while camera and flash stood still."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
-    """Where the masks come from.
-    auto: from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
-    rembg: from the package rembg, which must be installed.
-    Otherwise a folder of masks: photo.jpg has the mask photo.jpg.png or photo.png."""
+    """Where the masks of the object come from. Give another source if the masks of auto are wrong.
+    auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
+    rembg: the package rembg, which must be installed.
+    A folder: photo.jpg has the mask photo.jpg.png or photo.png."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
-    Give it if the masks contain something else that touches the object in the photographs."""
+    Give it if the masks contain another thing, one that touches the object in the photographs."""
     square_mm: float = SQUARE
     """Side of a square of the printed sheet [mm].
-    Give it if the printer does not print at 100 %; measure several squares with a ruler."""
+    Give it if the printer does not print at 100 %: measure several squares with a ruler."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
@@ -95,7 +95,7 @@ class PhotosConfig:
 
 
 def cameras_report(sparse: SparseModel) -> str:
-    """A line about the cameras, and a line per photograph without a camera."""
+    """Describe the cameras in a line, and each photograph without a camera in a line."""
     count, failed = len(sparse.cameras), sparse.failed
     how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
     how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
@@ -106,7 +106,7 @@ def cameras_report(sparse: SparseModel) -> str:
 
 
 def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
-    """A line about the masks, and a line per photograph without a mask. `source`: `PhotosConfig.masks`."""
+    """Describe the masks in a line, and each photograph without a mask in a line. `source`: `PhotosConfig.masks`."""
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
@@ -116,7 +116,7 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
 
 
 def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
-    """A line about the flash, the room's light and the camera's response."""
+    """Describe the flash, the room's light and the camera's response in a line."""
     x, y, z = flash.offset
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
@@ -128,7 +128,7 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
@@ -159,7 +159,7 @@ def require_apart(config: PhotosConfig) -> None:
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture. Stages with results in work/ are not repeated."""
+    """Make the capture and write it as `scene`. Stages with results in work/ are not repeated."""
     pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")

@@ -20,7 +20,7 @@ from mi_ring.system.files import writing
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
+    """Run the command."""
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
     require_options(config)
     ring = load_fit(config.run)

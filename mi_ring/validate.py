@@ -35,21 +35,22 @@ class ValidateConfig:
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
-    """Mitsuba XML file with photographs, or results folder of a fit."""
+    """Mitsuba XML file that names the photographs, or results folder of a fit."""
     out: Path | None = None
     """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file."""
     photographs: tuple[str, ...] = ()
-    """Ids or image names of the photographs to compare. Without it: all."""
+    """Ids or image names of the photographs that are rendered and compared. Without it: all."""
     width: int = 128
-    """Largest width and height of the pictures [px]."""
+    """Largest width and height of the pictures [px]. Larger pictures take longer and show smaller details."""
     spp: int = 64
-    """Samples per pixel, rounded up to a multiple of 16. With more, smaller differences are found."""
+    """Samples per pixel, rounded up to a multiple of 16. More samples find smaller differences and take longer."""
     depth: int = 6
-    """Maximum path length of the path tracer, Mitsuba's max_depth: 3 or more (2 is direct light). -1: no limit."""
+    """Largest length of the path tracer's light paths, Mitsuba's max_depth: 3 or more. -1: no limit.
+    Longer paths find more interreflection and take longer. With 2 there would be direct light only."""
     significance: float = 0.01
-    """Probability of a false alarm: a reported difference although both renderers agree."""
+    """Probability of a false alarm, above 0 and below 1: a reported difference although both renderers agree."""
     seed: int = 0
-    """Random seed of all samples."""
+    """Random seed of all samples. Another seed shows whether a reported difference is chance."""
 
     def __post_init__(self) -> None:
         for name in ("width", "spp"):

@@ -37,12 +37,15 @@ ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light 
 
 
 class Calibration(nn.Module):
-    """The values of the unknowns, each in units of its prior's standard deviation: 0 where the capture is right."""
+    """Unknowns of calibration and their values, in standard deviations of their priors: 0 is what the capture says."""
 
     def __init__(
         self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
     ) -> None:
-        """`refined`: options of `--refine`. `frames`: axes in which the room's light is fixed.
+        """Start from the capture: every unknown is 0.
+
+        `refined`: options of `--refine` whose unknowns are refined. `rig`: cameras and lights of the capture. `frames`:
+        axes ("world", "camera") in which the room's light is fixed.
 
         Raises InputError if `falloff` is refined without a flash that moves with the camera.
         """
@@ -61,62 +64,63 @@ class Calibration(nn.Module):
         self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
-        """An unknown in its own unit; 0 if it is not refined."""
+        """The value of the unknown `name` in its own unit; 0 if it is not refined."""
         return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
 
     def estimate(self) -> Estimate:
-        """Cameras, lights and response with the current values."""
+        """Apply all unknowns to the rig: its cameras, lights and response with the current values."""
         now = self.rig.estimate()
         for name, unknown in self.unknowns.items():
             now = unknown.apply(now, self.value(name), self.rig)
         return now
 
     def forward(self, scale: int = 1) -> Views:
-        """Cameras and lights with the current values, for photographs `scale` times smaller."""
+        """The cameras and lights with the current values, for photographs that are `scale` times smaller."""
         views = self.rig.views_of(self.estimate())
         return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
 
     def lamps(self) -> LightTensors:
-        """The scene's own lamps with the current values."""
+        """The scene's own lamps with the current values of their unknowns."""
         return self.rig.lamps_of(self.estimate())
 
     def lamp_tensors(self) -> list[Tensor]:
-        """Places and strengths of the lamps for the renderer; empty if they are not refined."""
+        """Places and strengths (L, 3) of the scene's L lamps for the renderer; empty if lamps are not refined."""
         if "lamps" not in self.refined:
             return []
         now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
 
     def solves_room(self, progress: float) -> bool:
-        """Is the room's light solved for at this progress? From the start if there is no other light."""
+        """Does the fit solve for the room's light at this progress (0 to 1)? Always if there is no other light."""
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
     @torch.no_grad()
     def relight(self, surface: Surface) -> None:
-        """Light a surface by the scene's lamps with their current values."""
+        """Give the lamps of a surface's scene their current values; nothing if lamps are not refined."""
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
 
     @property
     def albedo_factor(self) -> float:
-        """Factor of the albedo that keeps directly lit surfaces as bright as they are, whatever `scale` is."""
+        """The factor of the albedo by which directly lit surfaces keep their brightness when `scale` changes."""
         return math.exp(-float(self.value("scale").detach()))
 
     @property
     def power_factor(self) -> float:
-        """Factor of all lights' strengths that was found."""
+        """The factor that the fit has found for the strengths of all lights."""
         return self.rig.power / self.albedo_factor
 
     def indirect(self, light: Tensor) -> Tensor:
-        """Interreflection (n, H, W, 3), attached to `scale`.
+        """Interreflection `light` (n, H, W, 3) of the current surface, attached to the unknown `scale`.
 
-        Stronger lights mean a darker surface. Each further bounce loses one factor of the albedo.
+        Only the gradient is new: stronger lights mean a darker surface, and each bounce after the first loses one
+        factor of the albedo.
         """
         scale = self.value("scale").to(light)
         return light * (scale.detach() - scale).exp()
 
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """(N, H, W, 1) cosines between the optical axis and the rays of photographs, `scale` times smaller."""
+        """Cosines (N, H, W, 1) between the optical axis and the rays of photographs `index`, `scale` times smaller."""
         width, height = (size // scale for size in self.rig.sizes[index[0]])
         views = self(scale)
         fx, fy, cx, cy = (views.intrinsics[index].detach().T)[..., None, None]
@@ -131,31 +135,35 @@ class Calibration(nn.Module):
         return self.estimate().response
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """`CameraResponse.recorded` of photographs `index`, `scale` times smaller: radiance (N, H, W, 3)."""
+        """What cameras record of radiance (N, H, W, 3): photographs `index`, which are `scale` times smaller."""
         response = self.response()
         return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """The inverse of `recorded`, without gradients."""
+        """The radiance of which cameras record `recorded` (N, H, W, 3), without gradients; inverse of that method."""
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
-        """Photographs with these cameras and lights, and the current room light; without gradients."""
+        """Give photographs the cameras and lights of `views` and the current light of the room, for the renderer.
+
+        `views`: cameras and lights of all P photographs. The result is without gradients.
+        """
         room = self.room_harmonics().double().numpy(force=True)
         return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
 
     def room_harmonics(self) -> Tensor:
-        """(BASIS, 3) current harmonics of the room light; if only the scene says them, `scale` applies to them."""
+        """Current harmonics (BASIS, 3) of the room light. If they are not refined, `scale` applies to them."""
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
 
     @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """(3,) the room's mean irradiance relative to the flash's on a surface that faces it.
+        """Compare the light of a room, harmonics (BASIS, 3), with the photographs' own lights at the object.
 
-        Without a flash: the room's mean radiance.
+        Returns the room's mean irradiance (3,) relative to that of a surface which faces the light. If photographs have
+        no lights of their own: the room's mean radiance.
         """
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
@@ -164,11 +172,11 @@ class Calibration(nn.Module):
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
-        """Half the sum of squares of all unknowns, in standard deviations, divided by the number of photographs."""
+        """The loss of all unknowns: half the sum of their squares, divided by the number of photographs."""
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
     def parameters_without_solver(self) -> list[list[Tensor]]:
-        """Parameters of unknowns that have no solver of their own, grouped by option."""
+        """The tensors of unknowns that have no solver of their own and follow their gradients, one list per option."""
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
             if not unknown.solved:
@@ -176,7 +184,7 @@ class Calibration(nn.Module):
         return list(groups.values())
 
     def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
-        """Of each unknown of an option: its tensor, to be changed in place, and its value as the capture says."""
+        """Pairs of tensors for the unknowns of an `option`: current value, to be changed in place; capture's value."""
         if option == "ambient":
             return [(self.room.harmonics, self.room.given)]
         own = [getattr(self, name) for name, unknown in self.unknowns.items() if unknown.option == option]
@@ -184,7 +192,7 @@ class Calibration(nn.Module):
 
     @torch.no_grad()
     def applied(self, capture: Capture) -> Capture:
-        """The capture with the current cameras, lights and response."""
+        """A capture like the given one, with the current cameras, lights, lamps and response."""
         estimate = self.estimate()
         views, lamps = self.rig.views_of(estimate), self.rig.lamps_of(estimate)
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))

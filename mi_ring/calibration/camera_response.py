@@ -14,7 +14,7 @@ DARKEST = 1e-4  #: radiance, in units of the exposure, below which the power cur
 
 
 class CameraResponse(NamedTuple):
-    """The response of all photographs: vignetting, gains, and one tone curve. None: as the capture says."""
+    """The camera response of P photographs: vignetting, gains and one tone curve. A field of None is not refined."""
 
     exponent: Tensor | None  #: logarithm of the curve's exponent: the decoded value is radiance to this power
     contrast: Tensor | None  #: logarithm of the steepness of the curve's S
@@ -27,27 +27,28 @@ class CameraResponse(NamedTuple):
 
     @property
     def has_vignetting(self) -> bool:
-        """Is any vignetting known or unknown? Then `recorded` and `linear` need the cosines of the pixels."""
+        """Is there any vignetting, known or refined? Then `recorded` and `linear` need the cosines of the pixels."""
         return self.vignetting is not None or bool(self.known_vignetting.any())
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """The decoded photographs of this radiance (N, ..., 3): decoded by what the capture knows of the response.
+        """What cameras record of radiance (N, ..., 3), after decoding by what the capture knows of their response.
 
-        `index` (N,): which photographs. `cosines` (N, ..., 1): of the pixels' rays, needed with vignetting.
+        `index` (N,): the photographs. `cosines` (N, ..., 1): between the pixels' rays and the optical axis, needed with
+        vignetting.
         """
         known, unknown = self.factors(radiance, index, cosines)
         return self.with_curve(radiance * known * unknown, self.gammas[index]) / known
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Radiance of decoded photographs (N, ..., 3), the inverse of `recorded`; without gradients."""
+        """The radiance of decoded photographs (N, ..., 3), without gradients; the inverse of the method `recorded`."""
         known, unknown = self.factors(recorded, index, cosines)
         return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
 
     def factors(
         self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
     ) -> tuple[Tensor | float, Tensor | float]:
-        """Factors (N, ..., 3) of lens and gain: known from the capture, and found by the fit."""
+        """Factors (N, ..., 3) of vignetting and gain, in the type of `like`: what the capture knows, what was found."""
         ones = [1] * (like.ndim - 2)
 
         def by_photograph(values: Tensor) -> Tensor:
@@ -62,7 +63,7 @@ class CameraResponse(NamedTuple):
         return known, unknown
 
     def with_curve(self, radiance: Tensor, gammas: Tensor) -> Tensor:
-        """Radiance (N, ...) after the tone curve; `gammas` (N,): the exponents that the capture knows."""
+        """Apply the tone curve to radiance (N, ...). `gammas` (N,): the exponents that the capture knows."""
         if self.exponent is not None:
             relative = radiance / self.exposure
             radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
@@ -70,7 +71,7 @@ class CameraResponse(NamedTuple):
 
     @torch.no_grad()
     def without_curve(self, recorded: Tensor, gammas: Tensor) -> Tensor:
-        """The inverse of `with_curve`."""
+        """Undo the tone curve in recorded values (N, ...): the inverse of `with_curve`."""
         if self.contrast is not None:
             recorded = with_contrast(recorded, (-self.contrast).exp(), gammas)
         if self.exponent is None:
@@ -80,7 +81,7 @@ class CameraResponse(NamedTuple):
 
 
 def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
-    """Values (N, ...), decoded by the capture with `gammas` (N,), after an S curve of this steepness.
+    """Apply an S curve to values (N, ...) that the capture decoded with `gammas` (N,). `contrast`: steepness of the S.
 
     Two S curves in a row are one, whose steepness is the product. So the capture's own contrast is not needed.
     """

@@ -12,7 +12,7 @@ from mi_ring.scene.lights import Light
 
 
 class LightTensors(NamedTuple):
-    """L lights."""
+    """L point lights or distant lights as tensors."""
 
     places: Tensor  #: (L, 3) positions [scene units], of distant lights unit directions toward them
     finite: Tensor  #: (L, 1) bool: a point light? Else it is distant
@@ -20,7 +20,7 @@ class LightTensors(NamedTuple):
 
     @classmethod
     def of(cls, lights: Sequence[Light]) -> "LightTensors":
-        """These lights as tensors."""
+        """Convert lights to tensors."""
         finite = [light.kind == "point" for light in lights]
         places = [light.vector if point else -light.vector for light, point in zip(lights, finite)]
         numbers = (np.array(part, float).reshape(-1, 3) for part in (places, [light.rgb for light in lights]))
@@ -28,12 +28,12 @@ class LightTensors(NamedTuple):
         return cls(at, torch.tensor(finite, dtype=torch.bool)[:, None], rgb)
 
     def moved(self, offset: Tensor, distance: float) -> "LightTensors":
-        """Moved by offsets (L, 3) in units of `distance` [scene units]; distant lights by angles [rad]."""
+        """Move lights by `offset` (L, 3) in units of `distance` [scene units]; turn distant lights by it [rad]."""
         moved = self.places + offset * torch.where(self.finite, distance, 1.0)
         return self._replace(places=torch.where(self.finite, moved, F.normalize(moved, dim=-1)))
 
     def lights(self) -> list[Light]:
-        """The lights as numbers."""
+        """Convert the tensors to lights."""
         places, strengths = (part.detach().double().numpy(force=True) for part in (self.places, self.strengths))
         return [Light("point", place, rgb) if point else Light("directional", -place, rgb)
                 for place, point, rgb in zip(places, self.finite[:, 0].tolist(), strengths)]  # fmt: skip

@@ -20,7 +20,7 @@ INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an `Unknown` changes: cameras and lights, starting from those of the capture."""
+    """The cameras, lights and response that unknowns change, one after the other, from what the capture says."""
 
     views: Views  #: lights as in the capture
     offset: Tensor  #: (light places, 3) or (): of the lights [rig's distance], of distant ones [rad]
@@ -30,12 +30,12 @@ class Estimate:
     response: CameraResponse
 
     def seen(self, **views: Tensor) -> "Estimate":
-        """The estimate with other tensors of its `views`."""
+        """A copy of the estimate in which some tensors of `views` are replaced by those given, by name."""
         return replace(self, views=self.views._replace(**views))
 
 
 class Rig:
-    """Cameras and lights of a capture, fixed during a fit.
+    """The cameras and lights of a capture as tensors, as the capture says. They do not change during a fit.
 
     Photographs share a `lens` if focal lengths and distortion are equal, and a light's `place` if that is equal. A
     flash that moves with the camera has one place for all photographs, in the cameras' axes.
@@ -45,7 +45,7 @@ class Rig:
         self, capture: Capture, center: np.ndarray, exposure: float, fitted: np.ndarray | None = None,
         power: float = 1.0, guessed: bool = False, ahead: bool = True, lamps: bool = False,
     ) -> None:  # fmt: skip
-        """`center` (3,): of the object. `exposure`: the object's mean radiance.
+        """Take cameras and lights from a capture. `center` (3,): of the object. `exposure`: the object's mean radiance.
 
         `fitted`: indices of the photographs that are fitted; default: all. `power`: initial factor of all lights.
         `guessed`: nobody measured the lights' places. `ahead`: a flash may also move along the camera's axis. `lamps`:
@@ -95,18 +95,18 @@ class Rig:
         return len(self.lens)
 
     def count(self, per: str) -> int:
-        """Number of photographs, lenses, lights or lamps."""
+        """How many photographs, lenses, lights or lamps there are. `per`: "photograph", "lens", "light" or "lamp"."""
         several = {"photograph": len(self), "lens": int(self.lens.max()) + 1, "light": int(self.place.max()) + 1,
                    "lamp": len(self.lamps.places)}  # fmt: skip
         return several[per]
 
     def estimate(self) -> Estimate:
-        """Cameras and lights as the capture says."""
+        """An estimate that equals the capture; unknowns are applied to it."""
         none = torch.zeros(())
         return Estimate(self.views, none, none, none, none, self.response)
 
     def views_of(self, estimate: Estimate) -> Views:
-        """Cameras and lights of an estimate."""
+        """The cameras and lights of an estimate, with its offsets and factors applied."""
         now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
@@ -122,6 +122,6 @@ class Rig:
         return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 
     def lamps_of(self, estimate: Estimate) -> LightTensors:
-        """The scene's own lamps of an estimate."""
+        """The scene's own lamps of an estimate, with its offsets and factors applied."""
         strengths = self.power * estimate.log_lamp_power.exp() * self.lamps.strengths
         return self.lamps._replace(strengths=strengths).moved(estimate.lamp_offset, self.distance)

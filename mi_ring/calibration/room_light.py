@@ -20,7 +20,7 @@ FINE = 0.3  #: progress from which the only light has its full order
 
 
 class RoomLight(nn.Module):
-    """The harmonics of `mi_ring.rendering.spherical_harmonics`, and the normal equations that determine them."""
+    """The light of a room as an unknown: its spherical harmonics, and the normal equations that determine them."""
 
     which: list[int]  #: numbers of the harmonics that may be non-zero
     given: Tensor  #: (BASIS, 3) from the capture
@@ -29,10 +29,11 @@ class RoomLight(nn.Module):
     vector: Tensor  #: (3, BASIS) right sides of the normal equations
 
     def __init__(self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",), alone: bool = False) -> None:
-        """`exposure`: mean radiance of the object. `frames`: axes whose harmonics are unknown; others stay as given.
+        """Start from harmonics `given` (BASIS, 3). `exposure`: mean radiance of the object.
 
-        Harmonics of world and camera together could replace a flash elsewhere and another reflectance. `alone`: there
-        is no other light. Then its order is higher, once the shape is no longer coarse.
+        `frames`: axes ("world", "camera") whose harmonics are unknown; others stay as given. Unknown in both, they
+        could replace a flash elsewhere and another reflectance. `alone`: there is no other light. Then the harmonics
+        have a higher order, once the shape is no longer coarse.
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
@@ -44,7 +45,7 @@ class RoomLight(nn.Module):
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
     def forget(self) -> None:
-        """Reset the normal equations and keep the harmonics."""
+        """Reset the normal equations. The harmonics stay."""
         self.matrix.zero_()
         self.vector.zero_()
 
@@ -53,11 +54,11 @@ class RoomLight(nn.Module):
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
-        """Add photographs to the normal equations and solve them.
+        """Add photographs to the normal equations and solve them for the harmonics.
 
-        `observed`, `predicted` (N, H, W, 3): linear radiance, predicted with the current room light as if nothing
-        occluded it. `counted` (N, H, W) bool: pixels that show the object. `progress`: of the fit, in [0, 1]. `total`:
-        sums tensors over all processes.
+        `around`: the radiance that each harmonic adds to the photographs. `observed`, `predicted` (N, H, W, 3): linear
+        radiance, predicted with the current room light as if nothing occluded it. `counted` (N, H, W) bool: pixels that
+        show the object. `progress`: of the fit, in [0, 1]. `total`: sums tensors over all processes.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

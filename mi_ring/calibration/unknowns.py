@@ -27,7 +27,7 @@ VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measu
 
 
 class Found(NamedTuple):
-    """What a fit has found, to be described."""
+    """The result of a calibration that `Unknown.describe` puts into words: the capture before and after the fit."""
 
     rig: Rig
     before: Capture  #: as the capture says
@@ -37,14 +37,14 @@ class Found(NamedTuple):
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
 
     def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Means of a number of all photographs, before and after."""
+        """Means over all photographs of the number that `of` gives for each: before and after the fit."""
         before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
         return before, after
 
 
 @dataclass(frozen=True)
 class Unknown(ABC):
-    """An unknown of calibration, `components` numbers for each photograph, lens, light or lamp."""
+    """An unknown of calibration, with `components` numbers for each photograph, lens, light or lamp."""
 
     name: str
     option: str  #: of `--refine`
@@ -59,16 +59,16 @@ class Unknown(ABC):
     solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
-        """Shape of its parameter."""
+        """The shape of the parameter for a rig: (several, components), without the dimensions that are 1."""
         several = () if self.per == "capture" else (rig.count(self.per),)
         return several + (self.components,) * (self.components > 1)
 
     def width_for(self, rig: Rig) -> float:
-        """Standard deviation of its prior for the photographs of this rig."""
+        """The standard deviation of the prior for a rig, in the unknown's own unit."""
         return self.width
 
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
-        """Rows of the parameter on which photographs `index` depend, each (n,)."""
+        """The rows of the parameter on which photographs `index` (n,) depend: arrays (n,), one for each such row."""
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
         numbers = {"lens": rig.lens, "light": rig.place}
@@ -78,14 +78,17 @@ class Unknown(ABC):
 
     @abstractmethod
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        """The estimate with this unknown at `value`, in its own unit."""
+        """The estimate `now`, changed by this unknown. `value`: of the unknown in its own unit."""
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
-        """For people: what it is, its value before and after the fit, and the standard deviation. None: nothing."""
+        """Describe the result for people: name, value before the fit, value after it, standard deviation; or None.
+
+        `value`, `std`: of the parameter, in the unknown's own unit.
+        """
         return None
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
-        """For people, of one photograph: a key of calibration.json, its value and the standard deviation."""
+        """Describe the result of one photograph: key in calibration.json, value, standard deviation; or None."""
         return None
 
 
@@ -104,7 +107,7 @@ class Turn(Unknown):
 
 
 class Move(Unknown):
-    """Motion of each camera along its own axes [rig's distance]."""
+    """Motion of each camera along its own axes [distance of the rig]."""
 
     solved = True
 
@@ -144,7 +147,7 @@ class Principal(Unknown):
 
 
 class Distortion(Unknown):
-    """First radial distortion of each lens, added to the known one."""
+    """First radial distortion coefficient of each lens, to be added to the one that the capture knows."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(distortion=now.views.distortion + value[rig.lens])
@@ -155,7 +158,7 @@ class Distortion(Unknown):
 
 
 class LightPlace(Unknown):
-    """Offset of each light's place [rig's distance], of a distant light [rad]."""
+    """Offset of the place of each light [distance of the rig], or of the direction of a distant light [rad]."""
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
@@ -177,7 +180,7 @@ class LightPlace(Unknown):
 
 
 class Exposure(Unknown):
-    """Logarithm of a factor of each photograph, by colour. Their mean over all photographs is 0."""
+    """Logarithm of a factor for each photograph and colour, the base class of `Power` and `Gain`. Their mean is 0."""
 
     solved = True
 
@@ -187,7 +190,7 @@ class Exposure(Unknown):
 
 
 class Power(Exposure):
-    """Logarithm of a factor of each photograph's light, by colour."""
+    """Logarithm of the factor of each photograph's light, by colour."""
 
     changes = "light"
 
@@ -196,7 +199,7 @@ class Power(Exposure):
 
 
 class Falloff(Unknown):
-    """Exponent of the cosine about the flash's axis, added to the known one."""
+    """Exponent of the cosine about the flash's axis, to be added to the one that the capture knows."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(falloff=now.views.falloff + value)
@@ -206,7 +209,7 @@ class Falloff(Unknown):
 
 
 class Vignetting(Unknown):
-    """Exponent of the cosine about the optical axis, added to the known one."""
+    """Exponent of the cosine about the optical axis, to be added to the one that the capture knows."""
 
     changes = "recording"
 
@@ -253,7 +256,7 @@ class Gain(Exposure):
 
 
 class Scale(Unknown):
-    """Logarithm of a factor of all lights. The albedo undoes it in direct light, so it is found from indirect light."""
+    """Logarithm of one factor of all lights. Albedo cancels it in direct light, so indirect light determines it."""
 
     changes = "indirect"
 
@@ -266,7 +269,7 @@ class Scale(Unknown):
 
 
 class LampPlace(LightPlace):
-    """Offset of each lamp of the scene, as `LightPlace`."""
+    """Offset of the place of each lamp of the scene, in the units of `LightPlace`."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, lamp_offset=value)
@@ -317,13 +320,13 @@ OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lig
 
 
 def centred(value: Tensor, rig: Rig) -> Tensor:
-    """(P, 3) logarithms of factors with mean 0 over the fitted photographs; 0 for photographs that are held out."""
+    """Subtract from `value` (P, 3), logarithms of factors, the mean over fitted photographs; 0 for those held out."""
     result = torch.zeros_like(value)
     result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
     return result
 
 
 def lens_cameras(found: Found) -> Iterable[list]:
-    """Before and after the fit: of each lens the camera of its first photograph."""
+    """For each lens, the camera of its first photograph: once before, once after the fit."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
     return ([side.shots[k].whole.camera for k in first] for side in (found.before, found.after))

@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 
 
 def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
-    """The photographs (H, W, 3), checked. Raises InputError if there are none or one is invalid."""
+    """Check photographs and return them as arrays (H, W, 3). Raises InputError if there are none or one is invalid."""
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
     found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
@@ -38,7 +38,7 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
 
 
 def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
-    """The masks of these images, 255 inside. Raises InputError, which begins with `what`, if one is invalid."""
+    """Check the masks of images: 255 inside. Raises InputError, which begins with `what`, if one is invalid."""
     several = zip(one_each(masks, len(images), what), images)
     return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
 
@@ -47,7 +47,7 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """The `Shot` of each image, by the arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
+    """Make the `Shot` of each image from arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
     count = len(images)
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:
@@ -61,7 +61,7 @@ def shots_of(
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
-    """The items as a list; None for each photograph if `items` is None. Raises InputError unless there are `count`."""
+    """List one item per photograph; None for each if `items` is None. Raises InputError unless there are `count`."""
     found: list[Item | None] = [None] * count if items is None else list(items)
     if len(found) != count:
         raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
@@ -69,7 +69,7 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 
 
 def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
-    """A photograph (H, W, 3), checked. Raises InputError, which begins with `what`, if it is invalid."""
+    """Check a photograph and return it as (H, W, 3). Raises InputError, which begins with `what`, if it is invalid."""
     array = np.asarray(image)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
@@ -84,7 +84,7 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
 
 def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
-    """The mask (H, W) uint8 of an image, 255 inside. Raises InputError, which begins with `what`, if it is invalid."""
+    """Check a mask: (H, W) uint8, 255 inside, of the size of `image`. Raises InputError, which begins with `what`."""
     if mask is None:
         return None
     array = np.asarray(mask)
@@ -97,7 +97,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 
 def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
-    """The camera of an image, in float32. Raises InputError, which begins with `what`, if it is invalid."""
+    """Check the camera of an image and round it to float32. Raises InputError, which begins with `what`."""
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
     to_world, focal, centre, distortion = (
@@ -118,7 +118,7 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
 
 
 def light_of(light: object, what: str) -> Light | None:
-    """A light, in float32 precision. Raises InputError, which begins with `what`, if it is invalid."""
+    """Check a light and round it to float32; None stays None. Raises InputError, which begins with `what`."""
     if light is None:
         return None
     if not isinstance(light, Light) or light.kind not in ("point", "directional"):
@@ -131,7 +131,7 @@ def light_of(light: object, what: str) -> Light | None:
 
 
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Finite numbers of this shape, in float32. Raises InputError, which begins with `what`, for anything else."""
+    """Check that a value is finite numbers of this shape, and return them in float32. Otherwise raises InputError."""
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -144,7 +144,7 @@ def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
-    """The names of photographs; None: 000, 001, …. Raises InputError if one is no valid file name or occurs twice."""
+    """Check names of `count` photographs; None gives 000, 001, …. Raises InputError if one is invalid or twice."""
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
     for k, name in enumerate(one_each(names, count, "names")):
@@ -156,7 +156,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 
 
 def room_of(room: ArrayLike) -> np.ndarray:
-    """Spherical harmonics (n, 3) of a room's light, with zeros up to (BASIS, 3). Raises InputError for a wrong n."""
+    """Pad spherical harmonics (n, 3) of a room's light with zeros to (BASIS, 3). Raises InputError for a wrong n."""
     array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
@@ -165,12 +165,12 @@ def room_of(room: ArrayLike) -> np.ndarray:
 
 
 def sides(image: np.ndarray) -> str:
-    """Width and height of an image (H, W, …)."""
+    """Width and height of an image (H, W, …), as text."""
     return "{} x {}".format(*image.shape[1::-1])
 
 
 def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
-    """The files of a photograph, relative to its scene file: float32 as EXR, everything else as PNG."""
+    """Name the files of a photograph, relative to its scene file: EXR for float32, PNG for everything else."""
     suffix = "exr" if image.dtype == np.float32 else "png"
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
                    for folder, there in (("masks", masked), ("valid", valid)))  # fmt: skip
@@ -181,7 +181,7 @@ def scene_xml(
     shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
     room: ArrayLike | None,
 ) -> bytes:  # fmt: skip
-    """The content of the scene file for `Capture.from_arrays`. Raises InputError for an invalid argument."""
+    """Make the content of the scene file for `Capture.from_arrays`. Raises InputError for an invalid argument."""
     middle = None if center is None else numbers(center, (3,), "center")
     reach = None if radius is None else float(numbers(radius, (), "radius"))
     if reach is not None and not reach > 0:

@@ -14,7 +14,7 @@ from mi_ring.images import box_filter
 
 
 def with_masks_by_brightness(capture: Capture) -> Capture:
-    """The capture with masks of pixels above `dark_threshold`; the same capture if the room was lit.
+    """Give a capture masks of the pixels above `dark_threshold`. If the room was lit, returns the same capture.
 
     Such a mask contains the lit part of the object. Its shadowed part may be as dark as the room.
     """
@@ -29,7 +29,7 @@ def with_masks_by_brightness(capture: Capture) -> Capture:
 
 
 def dark_threshold(capture: Capture) -> float | None:
-    """The radiance above which a pixel is not the dark room; None if the room was lit."""
+    """Find the radiance above which a pixel is not the dark room; None if the room was lit."""
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
@@ -47,13 +47,13 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """Mask (H, W) uint8, 0 or 255: pixels above the threshold, in pieces of at least 1 % of the largest one."""
+    """Mask pixels of photograph `k` above a threshold: (H, W) uint8, 0 or 255. Small pieces are left out."""
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Connected components of a mask (...) bool: labels (...), 0 outside, and the size of each; 0 for label 0."""
+    """Label the connected pieces of a mask (...) bool: labels (...), 0 outside, and sizes by label; 0 for label 0."""
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
@@ -61,12 +61,12 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """`brightness`, reduced by block means so that the shorter side has 256 pixels or a little more."""
+    """Reduce `brightness` of photograph `k` by block means: its shorter side gets 256 pixels or a little more."""
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 
 
 def brightness(capture: Capture, k: int) -> np.ndarray:
-    """Radiance (H, W) of the brightest channel."""
+    """Radiance (H, W) of photograph `k` in the brightest channel of each pixel."""
     image = capture.images[k]
     return decode(image, is_linear(capture.shots[k].encoding, image), 1.0)[0].max(-1)

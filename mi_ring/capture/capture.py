@@ -115,11 +115,11 @@ class Capture:
 
     @property
     def in_memory(self) -> bool:
-        """Are the photographs in memory, without files?"""
+        """Are the photographs arrays in memory, without files?"""
         return any(shot.files.filename is None for shot in self.shots)
 
     def save(self, path: str | Path) -> "Capture":
-        """Write a capture from arrays as a scene file, with its photographs and masks beside it.
+        """Write a capture from arrays as the scene file `path`, with its photographs and masks beside it.
 
         Returns the capture with these files. Raises InputError if they cannot be written, or if the capture already has
         a scene file.
@@ -147,7 +147,7 @@ class Capture:
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Indices of the photographs by their size (width, height), because one launch renders one size."""
+        """Group the photographs by size, because one launch renders one size: indices by (width, height)."""
         sizes = [shot.size for shot in self.shots]
         return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
@@ -173,38 +173,38 @@ class Capture:
         return [file.relative_to(common).as_posix() for file in files]
 
     def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
-        """A capture of the photographs with these indices."""
+        """A capture of only the photographs with these indices."""
         pixels = {name: getattr(self, name).part(index) for name in ("images", "masks", "valid") if self.images}
         return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
-        """The capture after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,) of cameras and lights.
+        """Move cameras and lights to another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
 
         Use it for small motions: the rest of the scene (a room, a table, lamps) does not move.
         """
         return replace(self, shots=tuple(shot.moved(scale, rotation, shift) for shot in self.shots))
 
     def spread(self, most: int = 200) -> list[int]:
-        """Indices of at most `most` photographs, evenly spaced."""
+        """Choose at most `most` photographs, evenly spaced: their indices."""
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Groups of at most `most` photographs of `index`, each of one size, to render in one launch."""
+        """Split the photographs `index` into groups to render in one launch: of one size, at most `most` each."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Photograph `k`, to be rendered `scale` times smaller."""
+        """Photograph `k` for the renderer, `scale` times smaller."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
-        """Photographs `index`, all of one size, to be rendered `scale` times smaller."""
+        """Photographs `index`, all of one size, for the renderer, `scale` times smaller."""
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
-        """Photographs `index`, all of one size, box-filtered `scale` times smaller."""
+        """Read the pixels of photographs `index`, all of one size, box-filtered to be `scale` times smaller."""
         return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
@@ -239,9 +239,9 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Rough reflectance of a surface at `center` (3,) whose radiance under the photographs' lights is `exposure`.
+        """Rough reflectance of a surface at `center` (3,) whose mean radiance in the photographs is `exposure`.
 
-        That of `ALBEDO` if the photographs have no lights of their own.
+        If the photographs have no lights of their own, it is that of `ALBEDO`.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
@@ -254,7 +254,7 @@ class Capture:
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
-        """Reduced masks with their cameras, without duplicates; at most `most`, evenly spaced."""
+        """The reduced masks with their cameras, without duplicates; at most `most`, evenly spaced."""
         return [
             small_silhouette(Silhouette(
                 self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k],
@@ -290,11 +290,11 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """Do masks contain the whole object? Masks by brightness lack its shadowed part."""
+        """Do masks contain the whole object? Masks by brightness do not: they lack its shadowed part."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """The file with the mask of photograph `k`, for messages."""
+        """The name of the file with the mask of photograph `k`, for messages."""
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
@@ -311,7 +311,7 @@ class Capture:
 
 
 def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
-    """The cameras of photographs with their valid pixels, both reduced to at most `MAX_WIDTH`."""
+    """Pair the cameras of photographs with their valid pixels, both reduced to at most `MAX_WIDTH`."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
@@ -321,7 +321,11 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
-    """The point nearest to all optical axes, and half the radius of the ball there that all photographs contain."""
+    """Estimate a sphere around the object from the cameras alone: centre (3,) and radius [scene units].
+
+    The centre is the point nearest to all optical axes, the radius half that of the ball there that all photographs
+    contain.
+    """
     cameras = [shot.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])
     center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))

@@ -13,21 +13,21 @@ from mi_ring.scene.shot import Encoding, Shot
 
 
 class LinearImage(NamedTuple):
-    """A photograph that is decoded already."""
+    """A photograph whose pixels are decoded to linear radiance already."""
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance, float16 or float32
     clipped: np.ndarray  #: (H, W, 3) bool
 
     @property
     def nbytes(self) -> int:
-        """Bytes of both."""
+        """The number of bytes of radiance and clipped pixels together."""
         return self.rgb.nbytes + self.clipped.nbytes
 
 
 def decode(
     image: np.ndarray | LinearImage, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (float32) and clipped pixels (bool) of encoded pixels, both in the shape of `image`.
+    """Decode pixels to linear radiance (float32) and clipped pixels (bool), both in the shape of `image`.
 
     `linear`: are the pixels linear, not sRGB? `saturation`: encoded value from which a pixel is clipped. `gamma` and
     `contrast`: of the camera's `Response`, which is inverted. A `LinearImage` is returned as it is.
@@ -48,7 +48,7 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Vignetting times gain, (H, W, 3) or (3,), of a photograph `scale` times smaller; 1 if it has neither."""
+    """Vignetting times gain of a photograph `scale` times smaller, (H, W, 3) or (3,); 1 if it has neither."""
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
@@ -57,15 +57,16 @@ def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
 
 
 def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
-    """Linear values that a photograph's camera records for radiance (H, W, 3). It is `scale` times smaller."""
+    """Linear values that the camera of a photograph, `scale` times smaller, records for radiance (H, W, 3)."""
     curved = (radiance * shade(shot, scale)) ** shot.response.gamma
     return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 
 
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
+    """Read encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    Raises InputError as `require_header` does, and if the pixels are damaged, infinite, NaN or too large.
+    `field` and `scene` name the file's entry in the scene file for messages. Raises InputError as `require_header`
+    does, and if the pixels are damaged, infinite, NaN or too large.
     """
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
@@ -89,7 +90,7 @@ def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph. An `ambient` file is subtracted; the result is then float32."""
+    """Read encoded pixels (H, W, 3) of a photograph. An `ambient` file is subtracted; the result is then float32."""
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
         return image
@@ -106,7 +107,7 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Encoded pixels (H, W, 3) of a photograph's file. Grey is repeated; transparent pixels become black."""
+    """Read encoded pixels (H, W, 3) of a photograph's file. Grey is repeated; transparent pixels become black."""
     file = getattr(shot.files, field)
     pixels = read_pixels(file, field, shot, scene)
     if shot.encoding == "linear" and pixels.dtype == np.uint8:
@@ -130,7 +131,7 @@ def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Mask (H, W) uint8 from the file of this `field`; from the alpha channel if that is the photograph itself."""
+    """Read the mask (H, W) uint8 in the file of a `field`: its alpha channel if that is the photograph itself."""
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)
     if itself and pixels.shape[2] not in (2, 4):

@@ -5,7 +5,7 @@ import numpy as np
 
 
 def disk(radius: float) -> np.ndarray:
-    """A disk of this radius [px], at least 1, as a structuring element."""
+    """Make a disk of this radius [px], at least 1, as a structuring element."""
     r = max(1, round(radius))
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
@@ -36,6 +36,6 @@ def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band:
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks; 1 if both are empty."""
+    """Intersection over union of the masks `a` and `b`; 1 if both are empty."""
     union = int(((a > 0) | (b > 0)).sum())
     return int(((a > 0) & (b > 0)).sum()) / union if union else 1.0

@@ -84,23 +84,20 @@ def load_capture(
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:
-    """Raise InputError if the header of a photograph's file is wrong. `masks`: as for `load_capture`."""
+    """Raise InputError if a header among a photograph's files is wrong. `masks`: as for `load_capture`."""
     for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
             require_header(file, field, shot, scene)
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Check a scene file and the headers of its photographs, not their pixels. Raises InputError.
-
-    `masks`: as for `load_capture`.
-    """
+    """Check a scene file and the headers of its images; raises InputError. `masks`: as for `load_capture`."""
     for shot in load_capture(path, images=False).shots:
         require_headers(shot, path, masks)
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """The masks (H, W) in this field of photographs. Equal files share their pixels."""
+    """Read on demand the masks (H, W) in this `field` of photographs. Equal files share their pixels."""
     readers: dict[tuple, Reader] = {}
 
     def reader(shot: Shot) -> Reader | None:
@@ -112,7 +109,7 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError if a path is no file or a photograph; the message says what to give."""
+    """Raise InputError if a path is not a scene file, but a photograph or no file. The message says what to give."""
     photographs = path.is_dir() or path.suffix.lower() in PLAIN + HEIF + RAW
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
@@ -122,7 +119,7 @@ def require_scene(path: Path) -> None:
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
-    """The scene in a file and its photographs. Raises InputError if it cannot be read or has no photographs."""
+    """Load the scene in a file and its photographs. Raises InputError if it cannot be read or has no photographs."""
     require_scene(path)
     try:
         require_xml(path)
@@ -166,7 +163,7 @@ def require_xml(path: Path) -> None:
 
 
 def load_views(path: Path) -> list[MaskedCamera]:
-    """The cameras of a scene file with their valid pixels. Raises InputError if it cannot be read."""
+    """Read the cameras of a scene file with their valid pixels. Raises InputError if it cannot be read."""
     _, shots = open_scene(path)
     return views_of(shots, masks_of(shots, "valid", path))
 

@@ -16,7 +16,7 @@ REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
-    """The pixels of n photographs of one size for a fit."""
+    """The pixels of n photographs of one size, as a fit compares them: radiance, clipped pixels, masks."""
 
     rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
     clipped: Tensor  #: (n, H, W, 3) bool: the true radiance is at least this
@@ -25,17 +25,17 @@ class Observation(NamedTuple):
     valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """(n, H, W) bool: pixels that only show the object, by the mask, if there is one, and by a `coverage`."""
+        """Find pixels that only show the object, (n, H, W) bool, by the mask, if there is one, and by a `coverage`."""
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
 
     def to(self, device: torch.device) -> "Observation":
-        """The same tensors on a device."""
+        """Move the tensors to a device."""
         return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
 
     @classmethod
     def joined(cls, several: Sequence["Observation"]) -> "Observation":
-        """Several observations of one size as one."""
+        """Join several observations of one size to one."""
         *parts, valid = zip(*several)
         rgb, clipped, mask, masked = map(torch.cat, parts)
         if all(v is None for v in valid):
@@ -47,9 +47,9 @@ class Observation(NamedTuple):
 def observed(
     shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
-    """The observation of one photograph, from its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
+    """Make the observation of one photograph from its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
 
-    `mask`, `valid`: (H, W) uint8 as in the files; None if it has none.
+    `mask`, `valid`: (H, W) uint8 as in the files; None if the photograph has none.
     """
     curve = shot.response.gamma, shot.response.contrast
     linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
@@ -71,13 +71,13 @@ def observed(
 
 
 class ObservationCache:
-    """Keeps observations of single photographs at their last scale, up to `REMEMBERED_PIXELS`; none at scale 1."""
+    """Keeps observations of single photographs at the scale last used, up to `REMEMBERED_PIXELS`; none at scale 1."""
 
     def __init__(self) -> None:
         self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
-        """The observation of photograph `k` at a scale; `observe` makes it if it is not kept."""
+        """Return the observation of photograph `k` at a scale. If it is not kept, `observe` makes it."""
         if k in self.kept and self.kept[k][0] == scale:
             return self.kept[k][1]
         self.kept.pop(k, None)

@@ -12,20 +12,20 @@ Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """A sequence of arrays, each read by its reader; None where there is no reader.
+    """A sequence of arrays, each read by its reader when it is needed; None where there is no reader.
 
     Equal readers share one array, and parts share the cache. The cache keeps the arrays that are read first: a fit
     draws photographs at random, so that no other rule is better.
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
-        """`kept`: the cache, arrays by their readers."""
+        """Take a reader for each array. `kept`: the cache of arrays by their readers; default: an empty one."""
         self.readers = tuple(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """A sequence of arrays in memory."""
+        """Make a sequence of arrays that are in memory."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -48,7 +48,7 @@ class Pixels(Sequence):
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """The arrays of these indices."""
+        """The sequence of the arrays with these indices alone."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":

@@ -38,7 +38,7 @@ MORE = np.array([[-1], [1]])  #: by how many pixels bounds are widened that were
 
 
 class Reduced(NamedTuple):
-    """A photograph through its window; None where it has no such file."""
+    """A photograph cropped and reduced to a window, with its masks; None where it has no such file."""
 
     image: LinearImage
     mask: np.ndarray | None  #: (H, W) uint8, the object's coverage
@@ -46,7 +46,7 @@ class Reduced(NamedTuple):
 
 
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
-    """The capture with photographs of at most this `width` [px], cropped to the object where that helps.
+    """Reduce the photographs of a capture to at most this `width` [px], and crop them to the object where that helps.
 
     `by_brightness`: masks are found by brightness, as `with_masks_by_brightness` does. Without `crop` photographs are
     only made smaller. Returns the capture itself if no photograph changes, or if it was reduced before. Raises
@@ -75,12 +75,12 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 
 
 def fitting(size: tuple[int, ...], width: int) -> float:
-    """By which factor a picture (width, height) [px] must be reduced to be at most `width` [px] wide; at least 1."""
+    """The factor, at least 1, by which a picture (width, height) [px] must be reduced to be at most `width` wide."""
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
-    """The window of a photograph of size `whole` from `low` on, reduced to at most this `width` [px]."""
+    """Make a window of a photograph of size `whole` [px]: corner `low`, size `extent`, reduced to `width` or less."""
     scale = fitting(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
     extent = [blocks * (side // blocks) for side in extent]
@@ -90,10 +90,10 @@ def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], widt
 
 
 def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], width: int) -> list[Window]:
-    """The windows around the object. `bounds`: lowest and highest corner (2, 2) [px] of each mask, None without one.
+    """Choose a window around the object in each photograph, reduced to at most `width` [px].
 
-    Photographs of one size get windows of one size, so that they are rendered together. They are not cropped if one of
-    them has no mask.
+    `bounds`: lowest and highest corner (2, 2) [px] of each mask, None without one. Photographs of one size get windows
+    of one size, so that they are rendered together. They are not cropped if one of them has no mask.
     """
     windows = []
     sizes = [shot.size for shot in shots]
@@ -110,9 +110,9 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """The lowest and the highest corner (2, 2) [px] of each mask; None without one, or if it is empty.
+    """The lowest and the highest corner (2, 2) [px] of each mask; None if there is no mask or it is empty.
 
-    Those of `large` masks are kept in the cache folder.
+    Results of `large` masks are kept in the cache folder.
     """
 
     def bounds(k: int) -> np.ndarray | None:
@@ -146,12 +146,12 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
-    """The capture through these windows of its photographs. All photographs are read at once."""
+    """Cut a capture down to one window of each photograph, all read at once. `doing`: name of the progress bar."""
     shots = [shot.through(window) for shot, window in zip(capture.shots, windows)]
     of_files = not capture.in_memory
 
     def made(k: int) -> Callable[[], Reduced]:
-        """A reader of the reduced photograph, which is in the cache folder now, if that can be written."""
+        """Make a reader of photograph `k` through its window, and keep the result in the cache folder if possible."""
         make = partial(reduce, capture, k, windows[k])
         if not of_files:
             return make
@@ -181,7 +181,7 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
 
 
 def member(read: Callable[[], Reduced], field: str) -> Any:
-    """A field of a reduced photograph."""
+    """Read one field of a reduced photograph."""
     return getattr(read(), field)
 
 
@@ -191,7 +191,7 @@ def concurrent(size: tuple[int, int]) -> int:
 
 
 def reduce(capture: Capture, k: int, window: Window) -> Reduced:
-    """Photograph `k` of a capture through a window."""
+    """Read photograph `k` of a capture, and crop and reduce it to a window."""
     shot = capture.shots[k]
     read = capture.images.readers[k]
     assert read is not None
@@ -218,26 +218,26 @@ def reduce(capture: Capture, k: int, window: Window) -> Reduced:
 
 
 def covered(mask: np.ndarray, window: Window) -> np.ndarray:
-    """The means of a mask (H, W) through a window."""
+    """Reduce a mask (H, W) to a window: the mean of the mask over each pixel of the window."""
     (left, top), (width, height) = window.corner, window.extent
     part = mask[top : top + height, left : left + width, None]
     return resized(averaged(part, int(window.scale.min())), window)[..., 0]
 
 
 def averaged(pixels: np.ndarray, blocks: int) -> np.ndarray:
-    """The means of squares of so many pixels, float32."""
+    """Reduce pixels to the means of squares of `blocks` × `blocks` pixels, float32."""
     return box_filter(torch.from_numpy(np.ascontiguousarray(pixels, np.float32)), blocks).numpy()
 
 
 def resized(pixels: np.ndarray, window: Window) -> np.ndarray:
-    """Pixels (H, W, C) at the size of a window, by the means of areas."""
+    """Resize pixels (H, W, C) to the size of a window, by the means of areas."""
     if pixels.shape[1::-1] == window.size:
         return pixels
     return cv2.resize(pixels, window.size, interpolation=cv2.INTER_AREA).reshape(*window.size[::-1], -1)
 
 
 def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
-    """A mask (h, w) uint8 in a window as that of the whole photograph (H, W); nothing is outside the window."""
+    """Extend a mask (h, w) uint8 in a window to the whole photograph (H, W); nothing is outside the window."""
     if window is None:
         return mask
     (left, top), (width, height) = window.corner, window.extent
@@ -247,17 +247,17 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
 
 
 def decoded_by(shot: Shot) -> tuple:
-    """What a photograph's pixels are decoded by, beside its files."""
+    """The settings by which a photograph's pixels are decoded, for the key of the cache."""
     return shot.encoding, shot.saturation, shot.response.gamma, shot.response.contrast, *same_files(shot)
 
 
 def same_files(shot: Shot) -> tuple[bool, bool]:
-    """Is the mask, is the map of valid pixels the photograph itself, by its alpha channel?"""
+    """Does a photograph's alpha channel hold its mask; does it hold the map of valid pixels?"""
     return shot.files.mask == shot.files.filename, shot.files.valid == shot.files.filename
 
 
 def digest(file: Path | None) -> str:
-    """Of the content of a file; empty without one."""
+    """A hash of the content of a file; empty if there is no file."""
     if file is None:
         return ""
     result = hashlib.blake2b(digest_size=16)
@@ -268,12 +268,12 @@ def digest(file: Path | None) -> str:
 
 
 def key_of(*parts: Any) -> str:
-    """The cache's key of what is made of these parts."""
+    """The key in the cache for a result that is made of these parts."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 
 def packed(photograph: Reduced) -> memoryview:
-    """The content of the cache's file of a reduced photograph."""
+    """Convert a reduced photograph to the content of its file in the cache."""
     image, mask, valid = photograph
     arrays: dict[str, Any] = {"rgb": image.rgb, "clipped": np.packbits(image.clipped), "mask": mask, "valid": valid}
     buffer = io.BytesIO()
@@ -282,7 +282,7 @@ def packed(photograph: Reduced) -> memoryview:
 
 
 def unpacked(key: str, make: Callable[[], Reduced]) -> Reduced:
-    """The reduced photograph with this key; made anew if its file is gone or damaged."""
+    """Read the reduced photograph with this key from the cache, or `make` it if its file is gone or damaged."""
     try:
         with np.load(cache.place_of(key)) as file:
             rgb = file["rgb"]

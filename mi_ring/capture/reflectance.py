@@ -14,7 +14,7 @@ from mi_ring.scene.xml_elements import load_bsdf
 
 
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
-    """The parameters of the shapenet's BSDF that BRDF-Net predicts, and the XML of the BSDF that reads them.
+    """Choose the BSDF parameters that BRDF-Net predicts. Returns them, and as XML the BSDF that reads them.
 
     `ranges`: lowest and highest value by the parameter's name in the BSDF's documentation; infinity if there is no
     highest value. Empty: the parameters of `cooktorrance` that are no constants. Raises InputError for parameters that
@@ -72,7 +72,7 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """The output of BRDF-Net that gives the mean of `value`, by the inverse sigmoid; 0 if there is no highest value."""
+    """The output with which BRDF-Net predicts the mean of `value` between `low` and `high`; 0 if `high` is infinite."""
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

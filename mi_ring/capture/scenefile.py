@@ -33,7 +33,7 @@ REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """A whole photograph as XML. The shot's file names must be relative to the scene file."""
+    """Write a whole photograph as XML. The shot's file names must be relative to the scene file."""
     shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
@@ -65,7 +65,7 @@ def scene_element(
     photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
     ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
-    """A scene of photographs to fit, with the integrator `photometric` and a `shapenet` with `cooktorrance`.
+    """Write a scene of photographs to fit as XML, with `photometric` and a `shapenet` with `cooktorrance`.
 
     `center` (3,), `radius`: of the normalising sphere [scene units]; `ground` (3,): a point on the table; `up` (3,):
     the table's normal, or the up direction; `metres`: length of a scene unit [m]; None if unknown. `fresnel`: of
@@ -89,7 +89,7 @@ def scene_element(
 
 
 def table_element(picture: str, square: np.ndarray) -> Element:
-    """A diffuse `table` as XML. `picture`: file of its albedo; `square` (4, 4): its to_world."""
+    """Write a diffuse `table` as XML. `picture`: file of its albedo; `square` (4, 4): its to_world."""
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)
     bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
@@ -100,13 +100,13 @@ def table_element(picture: str, square: np.ndarray) -> Element:
 
 
 def scene_bytes(root: Element) -> bytes:
-    """A scene as the content of its file."""
+    """Convert the XML of a scene to the content of its file."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, "utf-8")
 
 
 def emitter_element(light: Light) -> Element:
-    """A light as XML: `point` or `directional`."""
+    """Write a light as XML: `point` or `directional`."""
     emitter = ElementTree.Element("emitter", type=light.kind)
     tag, where, strength = {
         "point": ("point", "position", "intensity"), "directional": ("vector", "direction", "irradiance")
@@ -118,7 +118,7 @@ def emitter_element(light: Light) -> Element:
 
 
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
-    """A camera without its distortion as Mitsuba's `perspective`. The clipping planes enclose the points (n, 3).
+    """Write a camera without its distortion as Mitsuba's `perspective`. The clipping planes enclose `points` (n, 3).
 
     Its pixels are square: if those of the camera are not, the number of rows is changed.
     """
@@ -152,7 +152,7 @@ def add_film(sensor: Element, width: int, height: int) -> None:
 
 
 def numbers(values: ArrayLike) -> str:
-    """Numbers as text for XML."""
+    """Write numbers as text for XML."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
@@ -160,7 +160,7 @@ def recalibrated_xml(
     scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
     lamps: Iterable[Light] | None = None,
 ) -> bytes:  # fmt: skip
-    """A scene file with the cameras, lights and responses of `shots`. Photographs without id are matched by order.
+    """Rewrite a scene file with the cameras, lights and responses of `shots`, matched by id, else by order.
 
     `room`: light of the room, see `mi_ring.rendering.spherical_harmonics`; `frames`: axes ("world", "camera") in which
     a `room` is written even if it is black, by default those of the file's rooms; `lamps`: point and directional lights
@@ -190,7 +190,7 @@ def recalibrated_xml(
 
 
 def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
-    """A scene file with these photographs instead of its own."""
+    """Rewrite a scene file with these photographs instead of its own."""
     root = ElementTree.fromstring(scene)
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
@@ -199,7 +199,7 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """A scene file of these photographs with new `masks`: files relative to it, by the photograph's index."""
+    """Rewrite a scene file of `shots` with new `masks`: files relative to it, by the photograph's index."""
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
         if k in masks:
@@ -210,7 +210,7 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """The photographs of a scene file with their indices in `shots`, by name, or by order if they have no id.
+    """Find the photographs of a scene file: elements with their indices in `shots`, by name, else by order.
 
     Photographs that are not in `shots` are removed from `root`. Raises InputError if ids to find them are missing.
     """
@@ -227,7 +227,7 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """The light of a room (BASIS, 3) as XML: the part fixed to the world and the part fixed to the camera.
+    """Write the light of a room (BASIS, 3) as XML: the part fixed to the world and the part fixed to the camera.
 
     A black part is left out, unless `frames` contains "world" or "camera", respectively.
     """
@@ -240,7 +240,7 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """A `room` as XML. `frame`: "world" or "camera"; `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes."""
+    """Write a `room` as XML. `frame`: "world" or "camera"; `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes."""
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
@@ -260,9 +260,10 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """The scene file `path` with the fitted object and its `bsdf` (XML). File names become relative to `folder`.
+    """Rewrite the scene file `path` for `folder`, with the fitted object and its `bsdf` (XML).
 
-    Raises InputError for a scene that cannot be rewritten, and for a shapenet that cannot be fitted.
+    File names become relative to `folder`. Raises InputError for a scene or a shapenet that cannot be rewritten or
+    fitted.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
@@ -281,7 +282,7 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
-    """The shapenet's <bsdf> or <ref>, and the <bsdf> itself, in the XML of the scene file `path`.
+    """Find in the XML of the scene file `path` the shapenet's <bsdf> or <ref>, and the <bsdf> that this means.
 
     Raises InputError if there is none, or if a part of the scene is in another file.
     """

@@ -42,7 +42,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name of the results folder."""
+        """The name of the results folder."""
         return self.folder.name
 
     @property

@@ -49,7 +49,7 @@ def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequenc
 
 
 def table2(options: ExperimentOptions) -> list[Run]:
-    """Each object of DiLiGenT-MV that is in the paper or in DATA. Runs of objects that are not in DATA fail."""
+    """List the runs: each object of DiLiGenT-MV that is in the paper or in DATA. Objects that are not in DATA fail."""
     require_no_materials(options)
     if len(options.data) != 1:
         raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
@@ -68,7 +68,7 @@ def table2(options: ExperimentOptions) -> list[Run]:
 
 
 def table3(options: ExperimentOptions) -> list[Run]:
-    """Each dataset with exact cameras, with wrong cameras, and with wrong cameras that are refined."""
+    """List the runs: each dataset with exact cameras, with wrong cameras, and with wrong cameras that are refined."""
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:
@@ -84,7 +84,7 @@ def table3(options: ExperimentOptions) -> list[Run]:
 
 
 def specularity(options: ExperimentOptions) -> list[Run]:
-    """One mesh with each of the materials."""
+    """List the runs: one mesh with each of the materials."""
     mesh = one_mesh(options)
     materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
     names = [short_name(material) for material in materials]
@@ -97,7 +97,7 @@ def specularity(options: ExperimentOptions) -> list[Run]:
 
 
 def stripes(options: ExperimentOptions) -> list[Run]:
-    """One mesh with stripes of two materials."""
+    """List the runs: one mesh with stripes of two materials."""
     mesh, materials = one_mesh(options), options.materials or STRIPED
     if len(materials) != 2:
         raise InputError(f"--materials: are {len(materials)}, stripes need two")
@@ -109,7 +109,7 @@ def stripes(options: ExperimentOptions) -> list[Run]:
 
 
 def views(options: ExperimentOptions) -> list[Run]:
-    """Each dataset with several numbers of photographs, up to all."""
+    """List the runs: each dataset with several numbers of photographs, up to all."""
     runs = []
     for source in datasets(options):
         fewer = {count for count in (VIEWS[:1] if options.quick else VIEWS) if count < source.photographs}
@@ -120,7 +120,7 @@ def views(options: ExperimentOptions) -> list[Run]:
 
 
 def swap(options: ExperimentOptions) -> list[Run]:
-    """Two or more datasets, each fitted from a sphere."""
+    """List the runs: two or more datasets, each fitted from a sphere."""
     if not options.data:
         require_no_materials(options)
     found = datasets(options)
@@ -132,7 +132,7 @@ def swap(options: ExperimentOptions) -> list[Run]:
 
 
 def single(options: ExperimentOptions) -> list[Run]:
-    """Each object of DiLiGenT, with photographs of one camera."""
+    """List the runs: each object of DiLiGenT, with photographs of one camera."""
     require_no_materials(options)
     if not options.data:
         raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "

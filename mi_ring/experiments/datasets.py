@@ -78,7 +78,7 @@ class CachedDataset(Dataset):
 
     @classmethod
     def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
-        """The dataset in a folder. `fields`: those of the subclass."""
+        """Make the dataset in a folder. `fields`: values of the fields that the subclass adds."""
         return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
 
     def prepare(self) -> None:
@@ -92,7 +92,7 @@ class CachedDataset(Dataset):
                     shutil.rmtree(folder, ignore_errors=True)  # outdated or incomplete
 
     def origin(self) -> dict[str, Any]:
-        """Its sources and their modification times, as JSON values."""
+        """The dataset's sources and their modification times, as JSON values."""
         raise NotImplementedError
 
     def write(self, folder: Path) -> None:

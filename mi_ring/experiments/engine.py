@@ -90,7 +90,7 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
 
 
 def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """The rows of a finished fit. They are read from `NUMBERS` if the files have not changed since."""
+    """Measure a finished fit: its rows, read from `NUMBERS` if the files have not changed since."""
     measure = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": options.spp, "written": modified(folder / "ring.pt"),
           "compared": [[str(file.resolve()), modified(file)] for file in run.dataset.truth_files],

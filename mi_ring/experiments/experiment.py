@@ -51,7 +51,7 @@ class ExperimentOptions:
 
 @dataclass(frozen=True)
 class Run:
-    """One fit of an experiment."""
+    """One fit of an experiment: its dataset, settings and measures."""
 
     name: str  #: of the results folder
     dataset: Dataset
@@ -80,7 +80,7 @@ class Run:
 
 @dataclass
 class Outcome:
-    """The result of a run."""
+    """The result of a run: its rows of the table, or the reason why there are none."""
 
     run: Run
     folder: Path = Path()  #: of the results
@@ -91,7 +91,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table."""
+    """A column of a table: its heading, and how its numbers are written."""
 
     heading: str
     digits: int = 2  #: after the point
@@ -123,7 +123,7 @@ class Experiment:
 
 
 def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
-    """Each run with each seed; a run that sets its own seed once. Names do not depend on the other seeds."""
+    """Repeat each run with each seed; a run that sets its own seed once. Names do not depend on the other seeds."""
     result = []
     for run in runs:
         for seed in [None] if "seed" in run.changes else seeds:

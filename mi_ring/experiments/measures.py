@@ -61,14 +61,14 @@ def surface_errors(
 
 
 def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """`evaluated` only where photographs show the surface; depth and Chamfer distance also in mm, the scene unit."""
+    """Numbers of `evaluated`, only where photographs show the surface; depth and Chamfer distance also in mm."""
     percent = load_true_mesh(run.dataset.truth / "mesh.ply")[0].scale / 100
     (row,) = evaluated(run, folder, options, seen=True)
     return [row | {"depth_mm": row["depth_mean"] * percent, "chamfer_mm": row["chamfer"] * percent}]
 
 
 def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """`evaluated` after rigid alignment; `turned`: root mean square of the cameras' rotation errors [°]."""
+    """Numbers of `evaluated` after rigid alignment; `turned`: root mean square of the cameras' rotation errors [°]."""
     (row,) = evaluated(run, folder, options, align="rigid")
     exact = run.dataset.source if isinstance(run.dataset, PerturbedCameras) else run.dataset
     return [row | {"turned": rotation_error(exact.scene, folder / "scene.xml")}]
@@ -122,7 +122,7 @@ def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """`evaluated` and the numbers of `compare_slices`. For one material, writes slices.npz for the figure."""
+    """Numbers of `evaluated` and of `compare_slices`. For one material, writes slices.npz for the figure."""
     (row,) = evaluated(run, folder, options)
     found, truth, other = slices_of(run, folder)
     if other is None:

@@ -28,7 +28,7 @@ Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """The labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
+    """Write the labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 
@@ -87,7 +87,7 @@ def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) ->
 
 @of_finished
 def slices(outcomes: list[Outcome]) -> Figure:
-    """For each run, the true and the fitted median BRDF over the angle of light and camera from the normal."""
+    """Draw for each run the true and the fitted median BRDF over the angle of light and camera from the normal."""
     figure = Figure(figsize=(4 * len(outcomes), 3.6), layout="constrained")
     for axes, outcome in zip(np.ravel(figure.subplots(1, len(outcomes), squeeze=False)), outcomes):
         with np.load(outcome.folder / "slices.npz") as arrays:
@@ -101,7 +101,7 @@ def slices(outcomes: list[Outcome]) -> Figure:
 
 @of_finished
 def pictures(outcomes: list[Outcome]) -> Figure:
-    """For each run its first photograph, the prediction of the fit, and the error of its normals."""
+    """Draw for each run its first photograph, the prediction of the fit, and the error of its normals."""
     rows = []
     for outcome in outcomes:
         folder, dataset = outcome.folder, outcome.run.dataset
@@ -122,7 +122,7 @@ def pictures(outcomes: list[Outcome]) -> Figure:
 
 @of_finished
 def swapped(outcomes: list[Outcome]) -> Figure:
-    """Every shape with every material. Shapes are rows, materials are columns."""
+    """Draw every shape with every material. Shapes are rows, materials are columns."""
     rows = []
     for shape in outcomes:
         cells = []
@@ -136,7 +136,7 @@ def swapped(outcomes: list[Outcome]) -> Figure:
 
 
 def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> Figure:
-    """A table of pictures (H, W, 3) and error maps (H, W) [deg]. `rows`: title, pictures; `heads`: of the columns."""
+    """Draw a table of pictures (H, W, 3) and error maps (H, W) [deg]. `rows`: title, pictures; `heads`: of columns."""
     figure = Figure(figsize=(2.6 * len(heads), 2.7 * len(rows)), layout="constrained")
     for line, (title, images) in zip(figure.subplots(len(rows), len(heads), squeeze=False), rows):
         for axes, image in zip(line, images):

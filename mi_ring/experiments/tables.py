@@ -13,7 +13,7 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Our rows, their means, and published rows below our rows of the same labels.
+    """Collect the rows of the table: ours, their means, and below ours the published rows of the same labels.
 
     The entry `state` says why a run has no numbers.
     """
@@ -30,7 +30,7 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Mean rows over seeds, and over seeds and `mean_over`: of finished runs, and of numbers that all these have."""
+    """Average rows over seeds, and over seeds and `mean_over`: of finished runs, and of numbers that all have."""
     result = []
     for over in dict.fromkeys(("seed", experiment.mean_over)):
         groups = dict[tuple, list[Outcome]]()
@@ -49,7 +49,7 @@ def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence[Row]) -> dict[str, str]:
-    """Headings of the columns by name: labels, `by`, numbers, `state`. Empty columns are left out."""
+    """Name the columns of the table: labels, `by`, numbers, `state`. Empty columns are left out."""
     labels = [label for labelled in (*(o.run.labels for o in outcomes), *experiment.published) for label in labelled]
     own = {label: label for label in labels if label not in experiment.columns and label != "by"}
     numbers = {name: column.heading for name, column in experiment.columns.items() if any(name in row for row in rows)}

@@ -20,7 +20,7 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """Seconds of an iteration at each level and width of the stages. The second of two iterations is measured.
+    """Measure the seconds of an iteration at each level and width of the stages, by the second of two iterations.
 
     Another fit runs them, from the state of this one. Returns an empty dictionary if `interrupted`.
     """
@@ -52,12 +52,12 @@ def replan(fit: Fit, config: Config) -> None:
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
-    """The stages of fits with these settings, from the start of this one."""
+    """List the stages of fits with each of `configs`, from the start of this fit."""
     return [stage for config in configs for stage in fit.plan(config).stages]
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, costs: Costs) -> Settings:
-    """Of these settings those whose fit takes about `seconds`, with as many iterations as that time allows."""
+    """Choose the settings whose fit takes about `seconds`, with as many iterations as that time allows."""
     config = min(configs, key=lambda config: abs(math.log(seconds_of(config, plan, costs) / seconds)))
     around = seconds_around(config, plan, costs)
     share = (seconds - around) / (seconds_of(config, plan, costs) - around)
@@ -65,17 +65,17 @@ def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, cos
 
 
 def fewest_seconds(configs: Sequence[Config], plan: Planner, costs: Costs) -> float:
-    """The time of the shortest useful fit with any of these settings."""
+    """Estimate the time [s] of the shortest useful fit with any of these settings."""
     return min(seconds_of(replace(config, iterations=FEWEST), plan, costs) for config in configs)
 
 
 def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
-    """The time of a fit, with the pictures before it and its results."""
+    """Estimate the time [s] of a fit, with the pictures before it and its results."""
     iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in plan(config).stages)
     return iterations + seconds_around(config, plan, costs)
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
-    """The time of the pictures before a fit and of its results, which have the size of the last stage."""
+    """Estimate the time [s] of the pictures before a fit and of its results, which have the size of the last stage."""
     last = plan(config).stages[-1]
     return AROUND * costs[last.level, last.width]

@@ -20,7 +20,7 @@ ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
-    """The content of a checkpoint. If it is damaged: of the one before, and a line is printed.
+    """Read the checkpoint in a folder. If it is damaged, reads the one before and prints a line.
 
     Raises InputError if there is none, or if it was made with other settings.
     """
@@ -58,7 +58,7 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
 
 
 def by_option(settings: dict) -> dict:
-    """Settings with one entry for each weight, as on the command line."""
+    """Settings as on the command line: each weight is an entry of its own."""
     weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
     return {name: value for name, value in settings.items() if name != "weights"} | weights
 
@@ -73,7 +73,7 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
-    """The fit of a checkpoint. Raises InputError if it holds none, or if its files have changed."""
+    """Make the fit of a checkpoint. Raises InputError if it holds none, or if its files have changed."""
     require_same_files(state, capture, config, folder)
     try:
         fit = Fit(capture, config, state=state["fit"])

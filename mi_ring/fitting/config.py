@@ -38,95 +38,105 @@ class Common:
     """Settings for every user."""
 
     light: Literal["capture", "environment", "turntable", "lamps", "auto"] = "capture"
-    """The kind of light in the photographs. Set it if the light is unknown.
+    """The kind of light in the photographs. Choose another than capture if the lights are not in the scene file.
     capture: the lights of the scene file.
-    environment: unknown light from all sides, fixed in the world. turntable: the same, but fixed to the camera.
+    environment: unknown light from all sides, fixed in the world.
+    turntable: unknown light from all sides, fixed to the camera, because the object turned.
     lamps: one to three unknown lamps, fixed in the world.
-    auto: coarse fits try all kinds and choose the one that explains the photographs best."""
+    auto: coarse fits try all kinds and choose the one that explains the photographs best. This takes longer."""
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. It starts from the scene file.
     auto: light, power and ambient, and scale if it is needed. If the light is unknown: gain and ambient.
-    none: nothing.
+    none: nothing. Set it if the calibration is exact. If predicted photographs look shifted, set auto cameras focal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.
-    light: position of a flash that moves with the camera. For other lights: position or direction of each.
+    light: position of a flash that moves with the camera. For other lights: position or direction of each light.
     power: intensity and colour of the light of each photograph.
-    gain: exposure and white balance of each photograph. It excludes power.
-    falloff: decrease of the flash away from its axis.
-    vignetting: decrease of the lens towards the corners of the image.
+    gain: exposure and white balance of each photograph. It cannot be combined with power.
+    falloff: how fast the flash gets weaker away from its axis.
+    vignetting: how much darker the lens makes the corners of the image.
     curve, contrast: exponent of the camera's response curve, and steepness of its S shape.
     scale: one factor for all light intensities, found by interreflection.
-    ambient: light of the room.
+    ambient: light of the room, from all sides.
     lamps: position and intensity of the scene's own point and directional emitters.
-    masks: outlines of the object. They are found again after a half and after three quarters of the fit."""
+    masks: outlines of the object. The fit finds them again after a half and after three quarters of its iterations."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """The masks that the fit uses.
-    given: the masks of the scene file. auto: the same; without any, masks by brightness if the room was dark.
-    none: masks by brightness; the masks of the scene file are ignored.
+    """The masks that the fit uses. Set none if the masks of the scene file are wrong and the background is dark.
+    given: the masks of the scene file. auto: the same; if there are none and the room was dark, masks by brightness.
+    none: masks by brightness in a dark room. The masks of the scene file are ignored.
     --weights.mask 0 fits without any mask."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
-    """The surface that the fit deforms. The result has the same number of handles (genus).
+    """The start surface that the fit deforms. The result has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
-    auto: the domain that the scene file names; without one, the hull; without masks, a sphere."""
+    auto: the domain that the scene file names; without one, the hull; without masks, a sphere.
+    A start near the object saves time. Give a mesh if the masks do not show a handle of the object."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the BSDF that the fit finds, each with its lowest and highest value (inf: no limit).
     Set it if the BSDF of the scene is not cooktorrance, for example: base_color 0 1 roughness 0.05 1"""
     holdout: int = 0
-    """Leave every n-th photograph out of the fit and test the result on them. 0: use all photographs.
-    For example, 8 leaves out the fifth, the thirteenth, and so on.
+    """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
+    For example, 8 leaves out the fifth, the thirteenth, and so on. The test needs photographs that the fit then lacks.
     Calibration that all photographs share is reset if its correction by --refine does not improve this test."""
     iterations: int = 460
     """Number of iterations, all stages together. More iterations take longer and give finer detail.
-    A fit from a hull or a mesh does fewer, a fit under an unknown environment 15 % more."""
+    A fit from a hull or a mesh makes fewer iterations, a fit under an unknown environment 15 % more."""
     seed: int = 0
     """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False
-    """Make fits on one machine equal bit for bit. The fit then uses one thread and takes longer."""
+    """Make repeated fits on one machine equal bit for bit. The fit then uses one thread and takes longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How fine and how fast the fit is. Presets set most of these."""
+    """How fine and how fast the fit is. Presets set most of these options."""
 
     levels: tuple[int, ...] = (4, 5, 6)
-    """Level of the mesh in each stage. Level n has about 10 · 4^n vertices."""
+    """Level of the mesh in each stage, 0 to 8. Level n has about 10 · 4^n vertices.
+    Higher levels give finer detail; each takes up to four times the time and memory of the one before."""
     widths: tuple[int, ...] = (128, 256, 512)
-    """Largest width of the photographs in each stage [px]. Wider photographs are reduced."""
+    """Largest width of the photographs in each stage [px]. Wider photographs are reduced to it.
+    Larger widths give finer detail and take longer."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
-    """Share of the iterations in each stage.
-    A fit from a hull or a mesh skips two thirds of the first stage and adds 40 % of them to the second."""
+    """How the iterations are divided among the stages, from coarse to fine: one number above 0 for each stage.
+    Only the ratios count. A larger last number gives finer detail and takes longer.
+    A fit from a hull or a mesh skips two thirds of the first stage and adds 40 % of the skipped ones to the second."""
     subdivisions: int = 6
-    """Level of the mesh in the results. mi-ring export can write other levels later."""
+    """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. It does not change the fit.
+    mi-ring export can write other levels later."""
     batch: int = 8
-    """Photographs per iteration. More make an iteration slower and less noisy."""
+    """Photographs in each iteration. More photographs make an iteration slower and its gradient less noisy."""
     steps: int = 3
-    """Euler steps of the flow, the paper's T. Time and memory grow with it."""
+    """Number of steps in which the network moves the start surface to the object (Euler steps; the paper's T).
+    Time and memory grow with it. Raise it if the surface folds over: more steps make folds less likely."""
     spp: int = 1
-    """Samples per pixel of predicted photographs. More make an iteration slower and less noisy."""
+    """Samples per pixel of predicted photographs. More samples make an iteration slower and its gradient less noisy."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
-    """Weight of each term of the loss; 0 switches it off.
-    rgb: colours of the photographs.
-    mask: silhouettes.
-    velocity: smoothness of the flow, the paper's lambda.
-    calibration: keeps refined calibration near that of the scene file.
-    settling: variation of the material in the last stage, under an unknown environment.
-    normal_variation: total variation of normals; for objects with flat faces and sharp edges.
-    material_rank: low rank of the material; for objects that mix a few materials."""
+    """Weight of each term of the loss, 0 or more; 0 switches the term off.
+    rgb: the colours agree with the photographs.
+    mask: the silhouettes agree with the masks.
+    velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
+    calibration: refined calibration stays near that of the scene file.
+    settling: the material varies little in the last stage, under an unknown environment.
+    normal_variation: the surface has flat faces and sharp edges. Start with 0.01 for objects like this.
+    material_rank: the material is a mixture of few materials. Start with 0.01 for objects like this."""
     velocity_decay: float = 0.03
-    """Share of --weights.velocity that is left at the end of the fit.
+    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: the weight stays equal.
     A small share gives finer detail, but the surface may fold over if the fit is short."""
     laplacian_scale: float = 0.01
-    """Penalty of high frequencies of the flow in the term velocity, the paper's alpha."""
+    """How much the term velocity penalises high frequencies of the deformation, 0 or more (the paper's alpha).
+    A larger value gives a smoother surface with less detail."""
     learning_rate: float = 3e-3
-    """Learning rate of Adam at the start."""
+    """Learning rate of Adam at the start. Raise it for faster progress; lower it if the loss does not fall steadily."""
     muon_rate: float = 3e-2
-    """Learning rate at the start of Muon, which trains the hidden layers (see --optimizer)."""
+    """Learning rate of Muon at the start. Muon trains the hidden layers unless --optimizer is adam.
+    Raise it for faster progress; lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """Share of the learning rates that is left at the end. Learning rates of cameras fall to a half instead."""
+    """Share of the learning rates that is left at the end, above 0. 1: the rates stay equal.
+    A smaller share gives a steadier end. Learning rates of cameras fall to a half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
-    Set float32 to compare results of different machines."""
+    Set float32 to compare results of different machines; a fit may then take longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,28 +144,32 @@ class Ablation:
     """Parts of the method to replace or leave out, to measure their effect."""
 
     shadows: bool = True
-    """Trace shadows of the photographs' lights during the fit.
-    Without shadows the surface is wrong, unless each light is at its camera."""
+    """Trace the shadows that the photographs' own lights cast on the object.
+    Without shadows a fit is faster, but the surface is wrong, unless each light is at its camera."""
     indirect: bool = True
-    """Predict interreflection. Leave it out if the intensities of the lights are wrong."""
+    """Predict light that the object reflects onto itself (interreflection), which matters in concave parts.
+    Leave it out if the intensities of the lights are wrong."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
-    """Difference of predicted and observed colours.
+    """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
-    log: difference of logarithms, for dark surfaces. l1+log: the mean of both."""
+    log: difference of logarithms, for dark surfaces. l1+log: the mean of l1 and log."""
     optimizer: Literal["muon", "adam"] = "muon"
-    """Optimiser of the networks.
+    """The optimisers that train the networks. Set adam to compare with the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """The network that deforms the domain. ring: the paper's flow; all steps share one network.
+    """The network that deforms the start surface. The others are for comparison; their surfaces may fold over.
+    ring: the paper's flow; all steps share one network.
     resnet: each step has its own, narrower network, with about as many weights in total.
     wide-resnet: each step has its own network, as wide as that of ring, so there are more weights."""
     encoding: Literal["linear", "octaves", "none"] = "linear"
-    """Positional encoding of both networks.
-    linear: frequencies 1, 2, 3, … octaves: 1, 2, 4, 8, … none: no encoding."""
+    """Positional encoding of points in the networks of shape and material.
+    linear: frequencies 1, 2, 3, … octaves: frequencies 1, 2, 4, 8, … none: no encoding, which gives little detail."""
     frequencies: int = 16
-    """Number of frequencies of the encoding."""
+    """Number of frequencies of the positional encoding, 1 to 64 (1 to 16 for octaves).
+    More frequencies can represent finer detail, and also more noise."""
     resample: bool = True
-    """Sample other points of the domain in each iteration, so that the networks are trained everywhere."""
+    """Sample other points of the start surface in each iteration, so that the networks are trained everywhere.
+    Without it they are trained at the same points only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +224,7 @@ class Config(Ablation, Tuning, Common):
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Config":
-        """The settings of a preset, `fast`, `default`, `fine` or `paper`, with these changes.
+        """Make the settings of a preset, `fast`, `default`, `fine` or `paper`, with some `changes`.
 
         `weights` changes only the weights that it names. Raises InputError for a preset that does not exist.
         """
@@ -223,7 +237,7 @@ class Config(Ablation, Tuning, Common):
 
     @staticmethod
     def load(path: str | Path) -> "Config":
-        """The settings of an earlier fit, from its results folder or from the config.json in it.
+        """Read the settings of an earlier fit, from its results folder or from the config.json in it.
 
         Settings without an entry have their defaults. Raises InputError, which names file and field, for an unknown
         setting or a wrong value.
@@ -262,7 +276,7 @@ class Config(Ablation, Tuning, Common):
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """A value of JSON as a setting of this type. Raises ValueError if it cannot be one."""
+    """Convert a value of JSON to a setting of the type `kind`. Raises ValueError if that is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
@@ -283,7 +297,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """The value of a setting as on the command line, for messages."""
+    """Write the value of a setting as on the command line, for messages."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

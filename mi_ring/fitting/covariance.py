@@ -27,7 +27,7 @@ BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
 
 class Layout:
-    """The place of each unknown's numbers in one vector."""
+    """The order in which the numbers of all unknowns stand in one vector of `count` numbers."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.first, self.count = calibration, {}, 0
@@ -36,7 +36,7 @@ class Layout:
             self.count += getattr(calibration, name).numel()
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """The unknowns of photographs `index` (n,): name, component, and the place of each photograph's number (n,)."""
+        """List what photographs `index` (n,) depend on: name of unknown, component, positions (n,) in the vector."""
         result = []
         for name, unknown in self.calibration.unknowns.items():
             for row in unknown.rows(self.calibration.rig, index):
@@ -47,9 +47,9 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """Standard deviation of each unknown in its own unit and shape, except the room's light.
+    """The standard deviation of each unknown, except the room's light, by name, in its own unit and shape.
 
-    `level`: of the surface.
+    `level`: of the mesh for which photographs are predicted. Returns nothing if no unknown is refined.
     """
     calibration = model.calibration
     assert calibration is not None
@@ -73,15 +73,15 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 class Equations:
-    """Normal equations of all photographs, and the variance of their errors."""
+    """Normal equations of least squares, to which photographs are added, and the variance of their errors."""
 
     def __init__(self, count: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
 
     def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
-        """Add a photograph: its derivatives (K, H, W, C) by the numbers at `places` (K,), and its `error` (H, W, C).
+        """Add a photograph: its derivatives `slopes` (K, H, W, C) by the numbers at `places` (K,) in the vector.
 
-        `counted` (H, W) bool: pixels that count.
+        `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels that count.
         """
         slopes = slopes[:, counted].flatten(1).double()
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
@@ -93,13 +93,13 @@ class Equations:
         self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """The information matrix (N, N) of these photographs."""
+        """The information matrix (N, N): the inverse of the covariance by the photographs added so far."""
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 
 @dataclass(frozen=True)
 class CovarianceGroup:
-    """Photographs `index` of one size, `scale` times smaller, with what the model predicts for them."""
+    """Photographs `index` of one size, rendered `scale` times smaller by the current model."""
 
     problem: Problem
     calibration: Calibration
@@ -109,19 +109,19 @@ class CovarianceGroup:
     scale: int
 
     def photographs(self) -> Photographs:
-        """Cameras and lights with the current values of the unknowns, and the room's light if it is the only one."""
+        """The photographs for the renderer, with current calibration, and the room's light if it is the only one."""
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
-        """Radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
+        """Predict radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Radiance (n, H, W, 3) by interreflection and by the room's light."""
+        """Predict radiance (n, H, W, 3) by interreflection and by the room's light, to add to direct light `lit`."""
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
         room = calibration.room_harmonics()
@@ -136,7 +136,7 @@ class CovarianceGroup:
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
-    """Add photographs to the equations: errors, and derivatives by central differences."""
+    """Compare predicted photographs with the real ones, and add errors and derivatives to both equations."""
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)
     lit, coverage = at.direct()
@@ -147,7 +147,7 @@ def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes
         return perceived(calibration.recorded(light, index, at.scale), problem.exposure, "log")
 
     def beside(name: str, k: int, places: np.ndarray, step: float) -> tuple[Tensor, Tensor]:
-        """Picture and coverage with component `k` of an unknown changed by a step."""
+        """Predict picture and coverage after component `k` of the unknown `name`, at `places`, changes by a `step`."""
         factor, changes = float(np.exp(step * calibration.widths[name])), calibration.unknowns[name].changes
         colour = torch.ones(3)
         colour[k] = factor

@@ -19,12 +19,12 @@ ENOUGH = 30  #: least number of compared pixels
 
 
 class ExposureSolver(torch.optim.Optimizer):
-    """Steps of the photographs of the last iteration: `look` at it, then `step`."""
+    """Finds the power or gain of each photograph: `look` at an iteration, then `step`."""
 
     rate = Rate(0.5, 0.1, START)  #: share of the measured difference by which an estimate moves
 
     def __init__(self, calibration: Calibration, name: str) -> None:
-        """`name`: power or gain."""
+        """Solve for the unknown `name` of a calibration: "power" or "gain"."""
         self.tensor, self.width = getattr(calibration, name), calibration.widths[name]
         super().__init__([{"params": [self.tensor]}], {"lr": self.rate.initial})
         #: photographs, and log(observed / predicted brightness) (3,) of each; NaN: a colour without pixels

@@ -100,7 +100,7 @@ class Fit(Renamed):
         return self.ring
 
     def step(self) -> Iteration:
-        """One iteration. Raises InputError if the fit diverges, RuntimeError if no iteration is left."""
+        """Make one iteration. Raises InputError if the fit diverges, RuntimeError if no iteration is left."""
         if self.iteration >= self.iterations:
             raise RuntimeError(f"the fit is at its end: {self.iterations} iterations are done")
         started = time.perf_counter()
@@ -126,25 +126,25 @@ class Fit(Renamed):
         return it
 
     def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
-        """The loss of a batch for the present model, with its graph. Changes nothing: a step may repeat it."""
+        """Compute the loss of a batch for the present model, with its graph. Changes nothing: a step may repeat it."""
         it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
         return self.loss(it), it
 
     def context(self) -> Context:
-        """What terms and solvers may know at this iteration."""
+        """What terms of the loss and solvers may know at this iteration."""
         config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
         return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
     def refine_masks(self) -> None:
-        """Find masks anew."""
+        """Find the masks again, near the outline of the current surface."""
         parts = self.capture, self.problem.exposure, self.model, self.renderer, self.schedule.final_level
         self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
         self.capture = with_masks(self.problem.capture, self.course.masks)
 
     @property
     def ring(self) -> FittedObject:
-        """The fitted object."""
+        """The object as fitted so far."""
         return self.model.ring
 
     @property
@@ -162,14 +162,15 @@ class Fit(Renamed):
         return self.model.calibrated(self.capture)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
-        """The current prediction of photograph `k`: (H, W, 3) linear radiance, at most `width` pixels wide.
+        """Predict photograph `k` with the current model: (H, W, 3) linear radiance, at most `width` pixels wide.
 
-        `level`: of the surface. Do not call it within a term of the loss: its backward pass needs the renderer.
+        `level`: of the mesh; `spp`: samples per pixel. Do not call it within a term of the loss: the term's backward
+        pass needs the renderer.
         """
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """What the results are made of: `mi_ring.output` writes them."""
+        """Collect what the results are made of: `mi_ring.output` writes them."""
         return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                          list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
@@ -181,7 +182,7 @@ class Fit(Renamed):
         results.save(Path(folder), self.result())
 
     def state(self) -> dict[str, Any]:
-        """What another `Fit` of the same capture needs to continue, for `torch.save`."""
+        """Collect what another `Fit` of the same capture needs to continue, for `torch.save`."""
         return copy.deepcopy({  # the next iteration changes it
             "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
             "calibration": self.model.calibration and self.model.calibration.state_dict(),

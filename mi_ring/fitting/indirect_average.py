@@ -19,7 +19,7 @@ Averages: TypeAlias = dict[int, tuple[int, Tensor]]
 
 
 def averaged(earlier: Averages, new: GlobalIllumination, batch: Batch) -> tuple[GlobalIllumination, Averages]:
-    """`new` with averaged interreflection, and the new averages of the photographs of a batch.
+    """Average the interreflection of a batch with that of `earlier` iterations. Returns it and the new averages.
 
     A picture that is not finite changes no average.
     """

@@ -18,7 +18,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 
 @dataclass(frozen=True)
 class Context:
-    """What terms and solvers may know besides batch, observation and prediction."""
+    """What terms of the loss and solvers may know besides batch, observation and prediction."""
 
     config: Config
     capture: Capture
@@ -51,20 +51,20 @@ class Iteration(renamed.Renamed):
 
     @property
     def progress(self) -> float:
-        """Share of the shaping iterations before this one, in [0, 1]."""
+        """Share of the iterations that shape the surface, in [0, 1], that are done before this one."""
         return self.batch.progress
 
     @property
     def stage(self) -> Stage:
-        """The stage of the schedule."""
+        """The stage of the schedule that this iteration belongs to."""
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:
-        """(n, H, W) bool: pixels that show only the object, by prediction and mask (if there is one)."""
+        """Pixels that show only the object, (n, H, W) bool, by prediction and mask (if there is one)."""
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """(n, H, W) bool: pixels whose colours count; None: all. In a lit room the background does not count."""
+        """Pixels whose colours count, (n, H, W) bool; None: all. In a lit room the background does not count."""
         return self.object_pixels() if self.context.capture.lit_room else None
 
     def outline_blur(self) -> float:

@@ -39,7 +39,7 @@ RECORDING = {unknown.option for unknown in UNKNOWNS.values() if unknown.changes 
 
 
 def choose_lighting(capture: Capture, config: Config) -> Lighting:
-    """The lighting that `Config.light` asks for. Coarse fits find unknown lights; they take minutes.
+    """Find the lighting that `Config.light` asks for. For unknown lights coarse fits run, which take minutes.
 
     Raises InputError if nothing lights the object, and if capture and settings do not go together.
     """
@@ -81,7 +81,7 @@ class CoarseFits:
     """Coarse fits of a capture under different lights, each made once."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
-        """`config`: of the fit for which the light is chosen."""
+        """Prepare coarse fits of a capture. `config`: of the fit for which the light is chosen."""
         self.capture, self.config = capture, config
         self.center, _ = capture.sphere()
         self.errors: dict[Lighting, float] = {}  #: mean error of each
@@ -91,7 +91,7 @@ class CoarseFits:
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
-        """The mean error of a coarse fit; infinite if it fails."""
+        """The mean error of a coarse fit under this lighting, which runs if it has not yet; infinite if it fails."""
         if lighting in self.errors:
             return self.errors[lighting]
         refine = refined_under(lighting, self.config)
@@ -117,11 +117,11 @@ class CoarseFits:
         return self.errors[lighting]
 
     def best(self, *lightings: Lighting) -> Lighting:
-        """The lighting with the least error."""
+        """Choose the lighting with the least error."""
         return min(lightings, key=self.error)
 
     def lamps(self) -> Lighting:
-        """The fewest lamps that explain the photographs well enough, at the cameras' distance or infinitely far."""
+        """Find the fewest lamps that explain the photographs well enough, as near as the cameras or infinitely far."""
         several = [self.brightest(count) for count in range(1, MOST + 1)]
         enough = FEWER * min(self.error(some) for some in several if self.are_apart(some))
         lamps = next(some for some in several if self.are_apart(some) and self.error(some) <= enough)
@@ -140,7 +140,7 @@ class CoarseFits:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """`count` lamps in the brightest directions of the environment. Their strength fits an albedo of one half."""
+        """Place `count` lamps in the brightest directions of the environment; their strength fits an albedo of 0.5."""
         self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
@@ -152,7 +152,7 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """The lighting that was found, with one material at first if that explains the photographs about as well."""
+        """Change the lighting to start with one material, if that explains the photographs about as well."""
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
@@ -160,17 +160,17 @@ class CoarseFits:
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """The part of `Config.refine` that a coarse fit refines: the recording, and the photographs' own lights."""
+    """The options of `Config.refine` that a coarse fit refines: the recording, and the photographs' own lights."""
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)
 
 
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (count, 3) of lamps that light an object like an environment, and their colours (count, 3).
+    """Find lamps that light an object like an environment: directions (count, 3) and colours (count, 3).
 
-    Colours are relative to the first lamp, taken to be white: the object could have its colour. `harmonics`
-    (PER_FRAME, 3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant
-    light: each direction in turn moves to its best place, until none moves.
+    Colours are relative to the first lamp, taken to be white: the object could have its colour. `harmonics` (PER_FRAME,
+    3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant light: each
+    direction in turn moves to its best place, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics

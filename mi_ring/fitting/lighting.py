@@ -35,7 +35,7 @@ class Lighting(NamedTuple):
 
     @classmethod
     def of(cls, capture: Capture, config: Config) -> "Lighting":
-        """The lights of the scene.
+        """Take the lights of the scene.
 
         Raises InputError if it has none, or if the settings ask for unknown lights: coarse fits find those.
         """
@@ -46,7 +46,7 @@ class Lighting(NamedTuple):
         return cls("capture")
 
     def __str__(self) -> str:
-        """For people, for instance: environment, 1 lamp, 2 distant lamps."""
+        """A name for people, for instance: environment, 1 lamp, 2 distant lamps."""
         count = len(self.lamps)
         kind = f"{count} {'distant ' * self.distant}lamp{'s' * (count > 1)}" if count else self.kind
         return kind + " on one material" * (self.one_material_until > 0)
@@ -96,10 +96,7 @@ def is_unlit(capture: Capture) -> bool:
 
 
 def exposures(capture: Capture) -> np.ndarray:
-    """(P, 3) strengths of the photographs' own lights relative to their mean; 1 if the scene has none.
-
-    Under one common light these are the exposures of the photographs.
-    """
+    """Strengths (P, 3) of the photographs' own lights relative to their mean: under one light, the exposures."""
     strengths = capture.photographs.lights.rgb()
     kinds = capture.photographs.lights.is_finite()
     if kinds.any() != kinds.all() or not (strengths > 0).all():
@@ -108,10 +105,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """The lighting with the lamps that a fit has found. `capture`: as the fit has calibrated it.
+    """Replace the lamps of a lighting by those that a fit has found. `capture`: as the fit has calibrated it.
 
-    All lamps are scaled, so that the first brings as much light to the object at `center` (3,) as before: the albedo
-    is an assumption.
+    All lamps are scaled, so that the first brings as much light to the object at `center` (3,) as before: the albedo is
+    an assumption.
     """
     if not lighting.lamps:
         return lighting
@@ -124,10 +121,7 @@ def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -
 
 
 def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
-    """The capture under these lights. An environment starts grey and constant.
-
-    Lamps after the first become lamps of the scene.
-    """
+    """Put a capture under other lights: an environment starts grey; lamps after the first become lamps of the scene."""
     if lighting.kind == "capture":
         return capture
     scene, room, gains = capture.scene, None, exposures(capture)
@@ -163,6 +157,6 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """Axes in which unknown room light is fixed: "world", "camera"."""
+    """The axes in which unknown room light is fixed: "world", "camera"."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

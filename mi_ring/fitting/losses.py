@@ -23,10 +23,10 @@ def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
 def colour_error(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """How much brighter predicted photographs (n, H, W, 3) are than observed ones, both `perceived`.
+    """How much brighter predicted photographs (n, H, W, 3) are than observed ones, after `perceived` of each.
 
-    `clipped` (n, H, W, 3): the scene is at least as bright as observed, so a brighter prediction is no error.
-    `counted` (n, H, W): pixels where colours count; elsewhere the error is 0. None: all pixels.
+    `clipped` (n, H, W, 3): the scene is at least as bright as observed, so a brighter prediction is no error. `counted`
+    (n, H, W): pixels where colours count; elsewhere the error is 0. None: all pixels.
     """
     error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
     error = torch.where(clipped, error.clamp(max=0), error)

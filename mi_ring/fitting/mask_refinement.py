@@ -28,7 +28,7 @@ Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduce
 
 
 def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
-    """New masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
+    """Find new masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
 
     `exposure`: mean radiance of the object. `level`: of the surface.
     """
@@ -39,7 +39,7 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
         places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture (h, w, 3), coverage of the surface (h, w), and pixels (h, w) that are certainly background."""
+        """Photographs `index` from one place: picture (h, w, 3), coverage (h, w), and sure background (h, w)."""
         scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
@@ -64,7 +64,7 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
 
 
 def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
-    """The capture with these masks, as `find_masks` returns them, in place of its own."""
+    """Replace masks of a capture by those that `find_masks` returned."""
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape

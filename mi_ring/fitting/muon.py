@@ -26,7 +26,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step. That of a tall matrix is longer, by the root of height / width."""
+        """Make one step. That of a tall matrix is longer, by the root of height / width."""
         for group in self.param_groups:
             params = [p for p in group["params"] if p.grad is not None]
             updates = []
@@ -46,7 +46,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """About the nearest matrix with orthonormal rows or columns: its singular values are between 0.7 and 1.2."""
+    """Make the rows or columns of a matrix about orthonormal: its singular values are then between 0.7 and 1.2."""
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

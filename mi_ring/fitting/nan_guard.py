@@ -14,12 +14,12 @@ RETREATS = 5  #: number of retreats after which a fit fails
 
 
 class NanGuard:
-    """Watches a model and its optimisers, and keeps a copy of both."""
+    """Watches a model and its optimisers for NaN, and keeps a copy of their numbers."""
 
     def __init__(
         self, model: nn.Module, optimizers: Sequence[torch.optim.Optimizer], state: dict[str, Any] | None = None
     ) -> None:
-        """The parameters must be finite now. `state`: what `state()` of an interrupted fit returned."""
+        """Copy the parameters, which must be finite. `state`: what `state()` of an interrupted fit returned."""
         self.model, self.optimizers = model, optimizers
         self.factor: float = 1.0  #: of all learning rates
         self.retreats: int = 0  #: how often the copy was restored

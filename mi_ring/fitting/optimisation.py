@@ -26,7 +26,7 @@ CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one ma
 
 
 def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
-    """Muon for the hidden weight matrices and Adam for everything else, or Adam for all.
+    """Make the optimisers of networks: Muon for hidden weight matrices and Adam for the rest, or Adam for all.
 
     Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear layers.
     """
@@ -44,7 +44,7 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
 
 
 def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
-    """Adam for the unknowns that have no solver."""
+    """Make the optimisers, Adam, for the unknowns of calibration that have no solver."""
     groups = calibration.parameters_without_solver()
     if not groups:
         return []
@@ -67,7 +67,7 @@ class Optimisation:
     """The optimisers of a model with their learning rates, the solvers of calibration, and the guard against NaN."""
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
-        """`terms`: of the loss."""
+        """Make optimisers and solvers for a model. `terms`: of the loss, by name."""
         self.problem, self.model = problem, model
         self.steppers = network_steppers(model.ring, problem.config, problem.device)
         self.solvers: list[ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
@@ -141,7 +141,7 @@ class Optimisation:
         return self.optimizers[0].param_groups[0]["lr"]
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Collect what a checkpoint needs."""
         return {"optimizers": [o.state_dict() for o in self.optimizers], "guard": self.guard.state()}
 
     def restore(self, state: dict[str, Any]) -> None:

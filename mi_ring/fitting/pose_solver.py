@@ -66,10 +66,10 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
 
 
 class PoseSolver(torch.optim.Optimizer):
-    """Gauss-Newton steps of `turn` and `move` of a calibration: `look` at an iteration, then `step`."""
+    """Finds the poses of cameras, the unknowns `turn` and `move`: `look` at an iteration, then `step`."""
 
     def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
-        """`near`: the fit starts near the object. `terms`: of the loss.
+        """Solve for the poses of a calibration. `near`: the fit starts near the object. `terms`: of the loss.
 
         Raises InputError if `rgb` or `mask` is not the default term: the curvature is that of the default ones.
         """
@@ -89,7 +89,7 @@ class PoseSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """One step along the current gradients. Nothing moves before refinement begins."""
+        """Make one Gauss-Newton step along the current gradients. Nothing moves before refinement begins."""
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:

@@ -56,7 +56,7 @@ def number_of_bases(values: Tensor) -> Tensor:
 
 
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
-    """The material at V points as a matrix (V, C) of numbers near 1: in units of `scale`, or as shares of the range."""
+    """Arrange the material of V points as numbers near 1, (V, C): in units of `scale`, or as shares of the range."""
     columns = []
     for p in brdf_net.bsdf_parameters:
         unit = float(brdf_net.scale) if math.isinf(p.high) else p.high - p.low
@@ -65,7 +65,7 @@ def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
 
 
 def normal_variation(it: Iteration) -> Tensor:
-    """Total variation of the normals, relative to a sphere of the object's size."""
+    """The term `normal_variation`: total variation of the normals, relative to a sphere of the object's size."""
     radius = it.context.model.ring.radius
     return variation_of_normals(it.prediction.vertices, it.batch.faces) / (8 * math.pi * radius)
 
@@ -84,5 +84,5 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """Number of basis materials at all vertices."""
+    """The term `material_rank`: the number of basis materials at all vertices."""
     return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

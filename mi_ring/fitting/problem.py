@@ -34,7 +34,7 @@ class Problem:
 
     @classmethod
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
-        """Raises InputError if no photographs are left to fit, or if the object is black in them."""
+        """Prepare a fit. Raises InputError if no photographs are left to fit, or if the object is black in them."""
         given, capture = capture, reduced(capture, max(WIDTH, *config.widths))
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
@@ -45,7 +45,7 @@ class Problem:
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:
-    """Indices of one photograph in `every`, starting in the middle of the first `every`; none if that is 0.
+    """Choose one photograph in `every`, starting in the middle of the first `every`: indices; none if that is 0.
 
     Raises InputError if no photograph or all photographs would be held out.
     """

@@ -114,7 +114,7 @@ class Team(Processes):
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """See `Processes`. If several processes fail, the message of the first of them is used."""
+        """See `Processes.agreed`. If several processes fail, the message of the first of them is used."""
         result: Any = None
         error: InputError | None = None
         try:
@@ -195,11 +195,11 @@ class Share:
         self.part = slice(first, last) if last > first else slice(min(first, total - 1), min(first, total - 1) + 1)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The sum over all photographs, from the sum over those of this process. Without gradients."""
+        """Sum over all photographs, from the sum over those of this process. Without gradients."""
         return self.processes.sum(tensor if self.weight else torch.zeros_like(tensor))
 
     def gathered(self, tensor: Tensor) -> Tensor:
-        """(N, …) for all photographs, in order, from (n, …) for those of this process. Without gradients."""
+        """Join the rows (n, …) of all processes in order: (N, …) for all photographs. Without gradients."""
         if self.processes.count == 1:
             return tensor
         whole = tensor.new_zeros(self.total_count, *tensor.shape[1:])
@@ -208,7 +208,7 @@ class Share:
         return self.processes.sum(whole)
 
     def concatenated(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Tensors (N, …) for all points, from tensors (n, …) for those of this process. With gradients."""
+        """Join tensors (n, …) for the points of each process to tensors (N, …) for all points. With gradients."""
         if self.processes.count == 1:
             return list(tensors)
         columns = [tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors]

@@ -30,9 +30,10 @@ class Refinement(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, center: np.ndarray) -> "Refinement":
-        """`center`: (3,) of the object.
+        """Decide what to refine, from settings and capture; choose `power` if the albedo is impossible.
 
-        If `scale` is refined and the albedo is impossible, `power` makes it a usual one.
+        `center` (3,): of the object. Only if `scale` is refined, `power` differs from 1: it makes the albedo a usual
+        one.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance

@@ -25,7 +25,7 @@ class RegulariserStrength:
         self.unexplained: float = 1.0  #: running mean of `Iteration.unexplained`
 
     def note(self, it: Iteration) -> None:
-        """Update after an iteration.
+        """Update the strength after an iteration.
 
         Where photographs disagree with the model, a weak regulariser lets the surface fold. So it gets stronger while
         the surface intersects itself. Early intersections of growing limbs are normal, and the regulariser catches up
@@ -52,7 +52,7 @@ class RegulariserStrength:
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Collect what a checkpoint needs."""
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:

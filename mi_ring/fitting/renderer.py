@@ -35,7 +35,7 @@ class Prediction:
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
 
     def detached(self) -> "Prediction":
-        """The same without the graph, which uses memory."""
+        """A copy without the graph of gradients, which uses memory."""
         return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
                        material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
 
@@ -49,14 +49,14 @@ class Renderer:
         self.averages: Averages = {}  #: of interreflection
 
     def show(self, model: Model, level: int) -> Surface:
-        """The surface of a model at this level of the icosphere, under its lamps, to be drawn without gradients."""
+        """Write the surface of a model at this level, under its lamps, to be drawn without gradients."""
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
             model.calibration.relight(self.surface)
         return self.surface
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
-        """Prediction of photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the surface."""
+        """Predict photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the mesh."""
         photograph, surface = capture.photograph(k, -(-capture.shots[k].size[0] // width)), self.show(model, level)
         rgb, _ = prediction.draw(surface, photograph, spp, shadows=capture.shadows, indirect=model.ring.indirect)
         return rgb[0].numpy()
@@ -91,7 +91,7 @@ class Renderer:
         return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room)
 
     def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Vertices (V, 3) and material (V, …) at the batch's points. Several processes share the evaluation."""
+        """Compute vertices (V, 3) and material (V, …) at the batch's points. Several processes share the work."""
         points = problem.processes.share(len(batch.points))
         with self.autocast():
             vertices, material = ring(batch.points[points.part])
@@ -101,7 +101,7 @@ class Renderer:
     def other_light(
         self, model: Model, batch: Batch, photographs: Photographs, coverage: Tensor
     ) -> tuple[GlobalIllumination | None, Averages]:
-        """Interreflection and room light in the photographs, and new averages; None if there is neither light."""
+        """Render interreflection and room light of the photographs, and average it; None if there is neither light."""
         calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
         if calibration and calibration.solves_room(batch.progress):
             harmonics = calibration.room.which
@@ -116,7 +116,7 @@ class Renderer:
         self.averages |= prediction.averages
 
     def state(self) -> Averages:
-        """For a checkpoint."""
+        """Collect what a checkpoint needs."""
         return self.averages
 
     def restore(self, state: Averages) -> None:

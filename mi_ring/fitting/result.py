@@ -24,7 +24,7 @@ def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
     terms: Sequence[str], unexplained: float,
 ) -> FitResult:  # fmt: skip
-    """`capture`: with the masks that the fit ends with. `terms`: names of the loss's terms."""
+    """Collect the result of a fit. `capture`: with the masks that it ends with. `terms`: names of the loss's terms."""
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
 
     def summarised() -> dict[str, Any]:
@@ -57,7 +57,7 @@ def result_of(
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
-    """(BASIS, 3) room light without the environment that the scene file has."""
+    """Room light (BASIS, 3) without the environment that the scene file has."""
     room = refined.room
     if room is None or problem.environment is None:
         return room

@@ -54,7 +54,7 @@ class Sampler:
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
-        """The batch of an iteration, counted from 0."""
+        """Draw the batch of an iteration, which is counted from 0."""
         stage = schedule.stage(iteration)
         points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
         everyone, size = self.draw_photographs(problem.config.batch)
@@ -64,7 +64,7 @@ class Sampler:
                      everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
 
     def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
-        """Indices of the next `count` photographs, or of all of one size if there are fewer, and that size."""
+        """Draw `count` photographs of one size, or all of it if there are fewer: indices, and the size."""
         random = self.random["photographs"]
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
@@ -76,12 +76,12 @@ class Sampler:
         return np.array(waiting[:count]), size
 
     def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
-        """The photographs of a batch. Raises InputError in all processes if one cannot read its files."""
+        """Read the photographs of a batch. Raises InputError in all processes if one cannot read its files."""
         seen = problem.processes.agreed(lambda: capture.observe(batch.photographs, batch.scale))
         return seen.to(problem.device)
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Collect what a checkpoint needs."""
         return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixe
 
 
 class Stage(NamedTuple):
-    """One stage, coarse to fine."""
+    """A stage of a fit: level of the mesh, width of the photographs, iterations. Stages go from coarse to fine."""
 
     level: int  #: of the icosphere
     width: int  #: largest width of the photographs [px]
@@ -45,13 +45,13 @@ class Stepper(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """Stages, progress and what depends on progress."""
+    """The stages of a fit, and all that depends on its progress."""
 
     stages: tuple[Stage, ...]
 
     @classmethod
     def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
-        """The schedule of a fit with these settings. Stages without iterations are left out.
+        """Plan a fit with these settings. Stages without iterations are left out.
 
         `near`: the fit starts near the object. `settling`: a last stage with a fixed surface is added.
         """
@@ -86,7 +86,7 @@ class Schedule:
         return self.stages[-1].level
 
     def masks_due(self, iteration: int) -> bool:
-        """Are masks to be refined before an iteration, counted from 0?"""
+        """Should masks be refined before this iteration, counted from 0?"""
         return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
 
     def stage(self, iteration: int) -> Stage:

@@ -170,7 +170,7 @@ def resume_hint(folder: Path) -> Iterator[None]:
 
 
 def start_of(fit: Fit) -> str:
-    """A description of the surface that a fit starts from."""
+    """Describe the surface that a fit starts from."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
     if isinstance(domain, Sphere):
         missing = fit.problem.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")

@@ -39,7 +39,7 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
-    """The object before the first iteration. `networks`: (Shape-Net, BRDF-Net) in place of the default ones.
+    """Make the object before the first iteration. `networks`: (Shape-Net, BRDF-Net) in place of the default ones.
 
     Raises InputError if capture, settings and networks do not go together.
     """
@@ -79,7 +79,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
 
 
 def with_fresnel(bsdf: str) -> str:
-    """A `cooktorrance` as XML, with the Fresnel term unless the XML decides about it.
+    """Add the Fresnel term to a `cooktorrance` given as XML, unless the XML decides about it.
 
     Under a flash at the camera the term does not matter. Under light from the other side it does.
     """
@@ -90,7 +90,7 @@ def with_fresnel(bsdf: str) -> str:
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
-    """The domain of a fit, and centre and radius of the normalising sphere: by `--domain`, else by the scene."""
+    """Choose the domain of a fit, and centre and radius of the normalising sphere: by `--domain`, else by the scene."""
     shape = capture.shape
     if isinstance(choice, tuple):
         return closed_domain(load_closed_mesh(choice[1], "--domain"), shape.center, shape.radius)

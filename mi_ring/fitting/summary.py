@@ -13,11 +13,11 @@ from mi_ring.fitting.problem import Problem
 
 @torch.no_grad()
 def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Entries `refined` (options), `light` (its kind), `unknowns` and `photographs`.
+    """Collect the content of calibration.json: `refined` (options), `light` (its kind), `unknowns`, `photographs`.
 
     `unknowns`: of each its meaning (`what`), `before`, `after` and, except for the room's light, the standard deviation
     `std` with the surface fixed. `photographs`: of each fitted photograph how far its picture of the object has moved
-    [px], and its own unknowns. `refined`: the capture with all of it; `deviations`: from `covariance`.
+    [px], and its own unknowns. `refined`: the capture with all values found; `deviations`: from `covariance`.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None

@@ -19,7 +19,7 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss."""
+    """A term of the loss: its function, its weight, and a factor of the weight that may change during the fit."""
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -30,16 +30,16 @@ TermLike: TypeAlias = Term | Callable[[Iteration], Tensor | None]
 
 
 def rgb(it: Iteration) -> Tensor:
-    """Colours: predicted photographs against observed ones."""
+    """The term `rgb`: colours of predicted photographs against observed ones."""
     seen, context = it.observation, it.context
     return rgb_loss(it.prediction.rgb, seen.rgb, seen.clipped, context.exposure, context.config.loss, it.counted())
 
 
 def mask(it: Iteration) -> Tensor | None:
-    """Silhouettes, of the photographs that have a mask.
+    """The term `mask`: predicted silhouettes against the masks of photographs that have one.
 
-    Masks of a lit room are guesses. Once the shape has settled, the majority outweighs single wrong masks: for
-    instance one that takes a shadow for a part of the object.
+    Masks of a lit room are guesses. Once the shape has settled, the majority outweighs single wrong masks: for instance
+    one that takes a shadow for a part of the object.
     """
     seen, context = it.observation, it.context
     masked = float(it.batch.share.sum(seen.masked.sum()))
@@ -58,7 +58,7 @@ def mask(it: Iteration) -> Tensor | None:
 
 
 def velocity(it: Iteration) -> Tensor | None:
-    """L_reg at random points on the paths of the domain points, at a random time, while the surface moves."""
+    """The term `velocity`, L_reg: at random points on the paths of domain points, while the surface moves."""
     if it.stage.settles:
         return None
     net = it.context.model.ring.shape_net
@@ -73,13 +73,13 @@ def velocity(it: Iteration) -> Tensor | None:
 
 
 def calibration(it: Iteration) -> Tensor | None:
-    """The prior of the unknowns of calibration."""
+    """The term `calibration`: the prior of the unknowns of calibration."""
     calibration = it.context.model.calibration
     return calibration.prior() if calibration else None
 
 
 def settling(it: Iteration) -> Tensor | None:
-    """Variation of the material once the surface is fixed: what varies slowly is more likely light."""
+    """The term `settling`: variation of the material once the surface is fixed; slow variation is rather light."""
     return priors.albedo_variation(it) if it.stage.settles else None
 
 
@@ -102,7 +102,7 @@ class Loss:
     """The weighted sum of terms."""
 
     def __init__(self, terms: Mapping[str, TermLike] | None, weights: Mapping[str, float]) -> None:
-        """`terms`: default is `default_terms`. `weights`: by name.
+        """Make a loss of `terms`, by default `default_terms`, with `weights` by their names.
 
         Raises InputError for a reserved name, for a weight without a term, and if no term compares with photographs.
         """
@@ -128,7 +128,7 @@ class Loss:
                              "needs; give it one, or the term the weight 0")  # fmt: skip
 
     def __call__(self, it: Iteration) -> Tensor:
-        """This process's part of the loss, a scalar. The iteration gets the loss, terms and weights of all processes.
+        """Compute this process's part of the loss, a scalar. The iteration gets loss, terms and weights of all.
 
         A term is a mean over photographs, or is equal in all processes: parts add up by their weights.
         """

@@ -23,7 +23,7 @@ PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per
 
 
 def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
-    """Mean absolute error on the object in held-out photographs, as a share of its light; NaN if it is not seen.
+    """Compute the mean absolute error on the object in held-out photographs, as a share of its light; may be NaN.
 
     Each photograph is compared at its best exposure. `level`: of the surface.
     """

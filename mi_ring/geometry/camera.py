@@ -18,7 +18,7 @@ class NoParallax(InputError):
 
 
 def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """A camera-to-world pose (4, 4) after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,)."""
+    """Move a camera-to-world pose (4, 4) to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
     moved = np.eye(4)
     moved[:3, :3] = rotation @ pose[:3, :3]
     moved[:3, 3] = scale * rotation @ pose[:3, 3] + shift
@@ -71,22 +71,22 @@ class Camera(NamedTuple):
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) [scene units]"""
+        """The camera's centre of projection (3,) [scene units]."""
         return self.to_world[:3, 3]
 
     @property
     def forward(self) -> np.ndarray:
-        """(3,) viewing direction, unit length."""
+        """The viewing direction (3,), unit length."""
         return self.to_world[:3, 2]
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) unit length."""
+        """The up direction of the picture (3,), unit length."""
         return self.to_world[:3, 1]
 
     @property
     def projection(self) -> np.ndarray:
-        """(3, 4) maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth); without distortion."""
+        """The matrix (3, 4) that maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth); without distortion."""
         across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
         rows = np.column_stack([across, self.forward]).T
         return np.column_stack([rows, -rows @ self.position])
@@ -98,7 +98,7 @@ class Camera(NamedTuple):
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def undistorted(self, places: np.ndarray) -> np.ndarray:
-        """Vectors (..., 2) from the picture's centre [focal lengths] without lens distortion."""
+        """Remove lens distortion from vectors `places` (..., 2) from the picture's centre [focal lengths]."""
         if not self.distortion:
             return places
         return places * undistortion_factor(self.distortion, np.square(places).sum(-1, keepdims=True))
@@ -116,7 +116,7 @@ class Camera(NamedTuple):
             return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:
-        """(H, W) cosines of the angles between the pixels' rays and the optical axis."""
+        """Cosines (H, W) of the angles between the pixels' rays and the optical axis."""
         width, height = self.size
         y, x = np.mgrid[:height, :width]
         places = self.undistorted((np.stack([x, y], -1) + 0.5 - self.centre) / self.focal)
@@ -129,7 +129,7 @@ class Camera(NamedTuple):
 
     @property
     def key(self) -> tuple[bytes, ...]:
-        """Equal for equal cameras: a key for dictionaries."""
+        """A key for dictionaries: equal cameras have equal keys."""
         return tuple(np.asarray(part).tobytes() for part in self)
 
     def fault(self) -> str | None:

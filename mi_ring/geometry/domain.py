@@ -20,7 +20,7 @@ MAX_SAMPLES = 2**20  #: most points to take candidates from; from level 6 on, so
 def closed_domain(
     mesh: trimesh.Trimesh, center: ArrayLike | None = None, radius: float | None = None
 ) -> tuple["Domain", np.ndarray, float]:
-    """A closed mesh as a domain, and the centre (3,) and radius of the normalising sphere [units of the mesh].
+    """Make a closed mesh a domain, and find centre (3,) and radius of the normalising sphere [units of the mesh].
 
     Default: the centre of the bounding box, and the mean distance of the vertices from it.
     """
@@ -32,7 +32,7 @@ def closed_domain(
 
 
 def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Positions (N, 3) of `points` (N, 3) of a mesh after its `vertices` (V, 3) have moved to `others` (V, 3).
+    """Move `points` (N, 3) of a mesh along when its `vertices` (V, 3) move to `others` (V, 3).
 
     Points beside the mesh are first projected to it.
     """
@@ -42,7 +42,7 @@ def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
 
 
 def normalized(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (N, 3) scaled to length 1."""
+    """Scale vectors (N, 3) to length 1."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -59,7 +59,7 @@ class Domain:
         self.candidates: dict[int, Tensor] = {}
 
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
-        """Vertices (V, 3) and faces (F, 3): about 20 · 4^level faces, as in an icosphere of this level.
+        """Sample the surface: vertices (V, 3) and about 20 · 4^level faces (F, 3), as in an icosphere of this level.
 
         With `random`, each call moves the vertices to other points of the surface. The faces stay the same.
         """
@@ -78,7 +78,7 @@ class Domain:
         return inside
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """The points of the surface nearest to points (N, 3)."""
+        """Project points (N, 3) to the nearest points of the surface."""
         return transfer_points(points, self.points, self.faces, self.points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
@@ -104,14 +104,14 @@ class Domain:
         return points, faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Each vertex (V, 3) at a random one of its candidates."""
+        """Move each vertex (V, 3) to a random one of its candidates."""
         if level not in self.candidates:
             self.candidates[level] = self.find_candidates(level)
         chosen = torch.randint(CANDIDATES, (len(points),), generator=random)
         return self.candidates[level][torch.arange(len(points)), chosen]
 
     def find_candidates(self, level: int) -> Tensor:
-        """Random points (V, CANDIDATES, 3) of the surface near each vertex of a level's mesh."""
+        """Find random points (V, CANDIDATES, 3) of the surface near each vertex of a level's mesh."""
         points, faces = self.sample(level)
         coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
         fine = trimesh.Trimesh(self.points, self.faces, process=False)
@@ -151,6 +151,6 @@ class Sphere(Domain):
         return mesh.vertices, mesh.faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """All vertices (V, 3) after one random rotation of the sphere."""
+        """Rotate all vertices (V, 3) by one random rotation of the sphere."""
         rotation = Rotation.from_quat(torch.randn(4, generator=random).numpy()).as_matrix()
         return points @ torch.as_tensor(rotation, dtype=torch.float32).T

@@ -34,7 +34,7 @@ class Silhouette(NamedTuple):
 
     @property
     def whole(self) -> "Silhouette":
-        """The silhouette of the whole photograph. Nothing is outside of this part."""
+        """The silhouette of the whole photograph: outside of this part its mask is empty."""
         if self.frame is None:
             return self
         before = np.ceil(-self.frame[0]).astype(int)
@@ -47,7 +47,7 @@ class Silhouette(NamedTuple):
 
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """A mask (H, W) uint8 reduced by a whole factor to at most this `width` [px]; and the factor."""
+    """Reduce a mask (H, W) uint8 by a whole factor to at most this `width` [px]. Returns the mask and the factor."""
     scale = -(-mask.shape[1] // width)
     height, width = (n // scale for n in mask.shape)
     blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
@@ -55,7 +55,7 @@ def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
 
 def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouette:
-    """A silhouette reduced to at most this `width` [px]."""
+    """Reduce a silhouette to at most this `width` [px]."""
     mask, scale = shrink_mask(silhouette.mask, width)
     valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
     frame = None if silhouette.frame is None else silhouette.frame / scale
@@ -63,13 +63,13 @@ def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouet
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most `most` indices, evenly spaced in 0 … count − 1."""
+    """Choose at most `most` indices, evenly spaced in 0 … count − 1."""
     number = min(most, count)
     return [k * count // number for k in range(number)]
 
 
 def subsample(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
-    """At most `most` of the silhouettes, evenly spaced, each reduced to at most this `width` [px]."""
+    """Choose at most `most` silhouettes, evenly spaced, and reduce each to at most `width` [px]."""
     return [small_silhouette(silhouettes[k], width) for k in evenly_spaced(len(silhouettes), most)]
 
 
@@ -133,7 +133,7 @@ class Hull:
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """Distances (N, pixels) [px], 0 or more, of silhouettes from the projected hull. Default: its own silhouettes.
+        """How far silhouettes reach beyond the projected hull: (N, pixels) [px]. Default: the hull's own silhouettes.
 
         For `pixels` random pixels of each mask, or of its `outline`: the distance of the hull from the ray through the
         pixel, sampled at `samples` points.

@@ -11,7 +11,7 @@ from mi_ring.foreign import reading
 
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """A mesh from a file, with its seams closed. Raises InputError, which names the `field`, if it cannot be read."""
+    """Read a mesh from a file and close its seams. Raises InputError, which names the `field`, if that fails."""
     require_file(path, "the file of a mesh", field)
     with reading(f"{path}: {field}", "a mesh"):
         content = io.BytesIO(path.read_bytes())  # a damaged file cannot request more bytes than this has
@@ -22,7 +22,7 @@ def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
 
 
 def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """A closed mesh from a file. Raises InputError, which names the `field`, if the mesh is not closed."""
+    """Read a closed mesh from a file. Raises InputError, which names the `field`, if the mesh is not closed."""
     mesh = read_mesh(path, field)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise InputError(f"{path}: {field}: is not a closed surface")

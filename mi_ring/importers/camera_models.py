@@ -67,7 +67,7 @@ class Lens:
 
 
 def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
-    """The lens of a calibration matrix (3, 3).
+    """Make the lens of a calibration matrix `K` (3, 3) without distortion.
 
     `shift` [px] is added to the principal point: 0.5 if the tool puts the first pixel's centre at 0. Raises InputError,
     which begins with `what`, for a matrix with skew.
@@ -96,7 +96,7 @@ def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Calibration matrix (3, 3) and pose (4, 4) of a projection matrix (3, 4). Raises InputError if it is singular."""
+    """Split a projection matrix (3, 4) into calibration (3, 3) and pose (4, 4). Raises InputError if it is singular."""
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])

@@ -23,7 +23,7 @@ class DiligentMV(Source):
     """Numbers of the lights to take, from 1. Without it: all."""
     fill_holes: bool = False
     """Fill holes in the masks.
-    Use it for the bear, whose masks have wrong holes. Those of pot2 and cow are real."""
+    Use it for the object bear, whose masks have wrong holes. The holes in the masks of pot2 and cow are real."""
 
     def frames(self) -> Iterator[Frame]:
         file = self.src / "Calib_Results.mat"

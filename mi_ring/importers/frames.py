@@ -23,7 +23,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right,
 
 @dataclass
 class Frame:
-    """A photograph, its camera and its light."""
+    """A photograph with its camera, light and masks, as an importer found it."""
 
     image: Path
     lens: Lens
@@ -42,12 +42,12 @@ class Frame:
         return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """A point light of intensity `rgb`. `offset`: from the camera, in the camera's axes [scene units]."""
+        """Make a point light of intensity `rgb`. `offset`: from the camera, in the camera's axes [scene units]."""
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
 def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
-    """The file with this name, in any folder and with any suffix; None if there is none."""
+    """Find the file with this name, in any folder and with any suffix; None if there is none."""
     name = PureWindowsPath(name).name
     stem = PureWindowsPath(name).stem
     found = [file for file in files if file.name == name or file.stem in (name, stem)]
@@ -56,33 +56,34 @@ def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
 
 @dataclass(frozen=True)
 class Source:
-    """Base of all importers: the options of all formats."""
+    """The base class of all importers, with the options that all formats share."""
 
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
-    """Data of the other tool: a file or a folder."""
+    """The other tool's data: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
     copy: bool = False
-    """Copy the photographs beside the scene file. Without it the scene file refers to the originals."""
+    """Copy the photographs beside the scene file, to keep everything in one place.
+    Without it the scene file refers to the originals, which must stay where they are."""
     encoding: Encoding = "auto"
-    """How the photographs are encoded.
-    auto: as the format says, otherwise sRGB for 8-bit files and linear for others.
+    """How the pixels of the photographs encode radiance. Set it if auto is wrong.
+    auto: as the format says, otherwise srgb for 8-bit files and linear for others.
     Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""
 
     def frames(self) -> Iterator[Frame]:
-        """The photographs with a pose. Raises InputError for invalid data."""
+        """Read the photographs that have a pose. Raises InputError for invalid data."""
         raise NotImplementedError
 
     @cached_property
     def without_pose(self) -> set[str]:
-        """Names of the photographs without a pose. It is complete when all `frames` have been read."""
+        """The names of photographs without a pose. It is complete when all `frames` have been read."""
         return set()
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """All frames of a source. Any error of its reader becomes an InputError."""
+    """Read all frames of a source. Any error of its reader becomes an InputError."""
     try:
         return list(source.frames())
     except InputError:
@@ -93,7 +94,7 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """As `require_cameras`. Also raise InputError if there are no frames, or if sizes of file and camera differ."""
+    """Raise InputError like `require_cameras`, if there are no frames, or if sizes of file and camera differ."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)

@@ -53,12 +53,12 @@ class Metashape(Photogrammetry):
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:
-    """The chunk in a Metashape XML file; None if it is another kind of file."""
+    """Find the chunk in a Metashape XML file; None if it is another kind of file."""
     return root.find("chunk") if root.tag == "document" else None
 
 
 def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.Element | None:
-    """The child at `path` of the first parent that has one; None if no parent has."""
+    """Find the child at `path` of the first parent that has one; None if no parent has."""
     children = (parent.find(path) for parent in parents if parent is not None)
     return next((child for child in children if child is not None), None)
 
@@ -66,7 +66,7 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """The numbers (`shape`) in the text of a child. Raises InputError if invalid, or missing without `default`."""
+    """Read the numbers in the text of a child. Raises InputError if invalid, or missing without `default`."""
     text = parent.findtext(name)
     if text is None and default is not None:
         return default
@@ -75,7 +75,7 @@ def numbers(
 
 
 def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.ndarray:
-    """A pose (4, 4), moved from the chunk's frame to the world by `transform`, whose parts may be missing."""
+    """Move a pose (4, 4) from the chunk's frame to the world by `transform`, whose parts may be missing."""
     rotation = numbers(transform, "rotation", (3, 3), what, np.eye(3))
     shift = numbers(transform, "translation", (3,), what, np.zeros(3))
     scale = numbers(transform, "scale", (1,), what, np.ones(1))[0]
@@ -85,7 +85,7 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """The lens of a sensor. The formulas are in appendix D of Metashape's manual."""
+    """Read the lens of a sensor. The formulas are in appendix D of Metashape's manual."""
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
         calibration = sensor.find("calibration")

@@ -21,24 +21,25 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(Source):
-    """Base of the photogrammetry formats. Each format implements `posed`."""
+    """The base class of formats of photogrammetry, with their options. Each format implements `posed`."""
 
     images: Path | None = None
     """Folder of the photographs. Without it: the nearest folder `images` beside or above SRC, or the folder of SRC."""
     masks: Path | None = None
-    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png. Without it: no masks."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the light relative to the camera: right, down and forward [scene units]."""
+    """Position of the light relative to the camera: right, down and forward [scene units]. Default: at the lens."""
     exif: bool = True
-    """Take different exposures into account, by exposure time, ISO and aperture in EXIF data."""
+    """Correct for different exposures by exposure time, ISO and aperture in EXIF data.
+    Leave it out if EXIF data are wrong or the photographs have been brightened later."""
 
     def posed(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs with a pose, each after the name by which its mask is found."""
+        """Read the photographs that have a pose, each after the name by which its mask is found."""
         raise NotImplementedError
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs, unless the format has a rule of its own."""
+        """The folder of the photographs. Formats with another rule replace this property."""
         own = self.src if self.src.is_dir() else self.src.parent
         candidates = (own / "images", own.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), own)
@@ -49,7 +50,7 @@ class Photogrammetry(Source):
         return list_images(self.folder)
 
     def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, with any suffix. None if it is not in `photographs`.
+        """Find the photograph of this name, with any suffix; None if it is not in `photographs`.
 
         Without `photographs`, raises InputError if it is not in `folder`.
         """
@@ -81,7 +82,7 @@ class Photogrammetry(Source):
 
 
 def exif_exposure(path: Path) -> float | None:
-    """`exposure_of` an image file. Raises InputError if it is not positive."""
+    """Compute `exposure_of` an image file. Raises InputError if it is not positive."""
     if path.suffix.lower() == ".exr":
         return None
     with reading(path, "image"), open_image(existing(path, "image")) as image:
@@ -95,7 +96,7 @@ def exif_exposure(path: Path) -> float | None:
 
 
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """Exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
+    """Compute exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
     values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
     if not all(values):
         return None

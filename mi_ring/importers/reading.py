@@ -18,18 +18,18 @@ Content = TypeVar("Content")
 
 
 def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
-    """The result of `read(path)`. Raises InputError if the file is missing or cannot be read as `what`."""
+    """Call `read(path)` and return its result. Raises InputError if the file is missing or cannot be read as `what`."""
     with reading(path, what):
         return read(existing(path, what))
 
 
 def pixels_of(path: Path) -> np.ndarray:
-    """Pixels (H, W, C) of an image file."""
+    """Read the pixels (H, W, C) of an image file."""
     return read_as(path, "image", images.read_image)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) [px] of an image file."""
+    """Read the width and height [px] of an image file."""
     return read_as(path, "image", images.image_size)
 
 
@@ -42,21 +42,21 @@ def has_alpha(path: Path) -> bool:
 
 
 def existing(path: Path, field: str) -> Path:
-    """The path. Raises InputError, which names the `field`, if there is no such file."""
+    """Return the path. Raises InputError, which names the `field`, if there is no such file."""
     if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
 
 
 def first_file(candidates: list[Path], field: str) -> Path:
-    """The first of these files that exists. Raises InputError, which names the `field`, if none exists."""
+    """Find the first of these files that exists. Raises InputError, which names the `field`, if none exists."""
     if file := next(filter(is_file, candidates), None):
         return file
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def with_suffix(path: Path, field: str) -> Path:
-    """The image file at `path`, or at `path` with one of `SUFFIXES` appended. Raises InputError if none exists."""
+    """Find the image file at `path`, or with one of `SUFFIXES` appended. Raises InputError if none exists."""
     candidates = [path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)]
     if file := next(filter(is_file, candidates), None):
         return file
@@ -64,18 +64,18 @@ def with_suffix(path: Path, field: str) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files in a folder, sorted by name."""
+    """List the image files in a folder, sorted by name."""
     return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """The image files in a folder by number: their name, or their index if any name is no number."""
+    """List the image files in a folder by number: their name, or their index if any name is no number."""
     files = list_images(folder)
     return {int(f.stem): f for f in files} if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:
-    """The wanted numbers, sorted; all available ones if none is given. Raises InputError if one is not available."""
+    """Sort the wanted numbers; if none is given, take all available ones. Raises InputError if one is not available."""
     for number in wanted:
         if number not in available:
             raise InputError(f"{option}: {number}: is not in {where}, which has {min(available)} to {max(available)}")
@@ -83,7 +83,7 @@ def chosen(wanted: Collection[int], available: Collection[int], option: str, whe
 
 
 def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Finite numbers of this shape, as floats. Raises InputError, which begins with `what`, for anything else."""
+    """Convert values to finite floats of this shape. Raises InputError, which begins with `what`, if impossible."""
     try:
         array = np.array(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -103,30 +103,30 @@ def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: 
 
 
 def load_mat(path: Path) -> dict:
-    """The variables in a MATLAB file. A child process reads it first, because damaged files crash scipy's reader."""
+    """Read the variables in a MATLAB file. A child process tries first, because damaged files crash scipy's reader."""
     size = existing(path, "MATLAB file").stat().st_size
     require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
     return read_as(path, "MATLAB file", scipy.io.loadmat)
 
 
 def load_json(path: Path) -> Any:
-    """The value in a JSON file."""
+    """Read the value in a JSON file."""
     return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
 
 
 def load_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file."""
+    """Read the root of an XML file."""
     return read_as(path, "XML", lambda file: ElementTree.fromstring(file.read_bytes()))
 
 
 def load_lines(path: Path) -> list[str]:
-    """The lines of a text file without empty ones."""
+    """Read the lines of a text file, without empty ones."""
     text = read_as(path, "text", lambda file: file.read_bytes().decode("utf-8-sig"))
     return [line for line in text.splitlines() if line.strip()]
 
 
 def load_table(path: Path, columns: int) -> np.ndarray:
-    """The numbers (n, columns) in a text file."""
+    """Read the numbers (n, columns) in a text file."""
     text = read_as(path, "table of numbers", lambda file: file.read_text("utf-8"))
     if not text.strip():
         raise InputError(f"{path}: is empty; must have {columns} numbers a line")

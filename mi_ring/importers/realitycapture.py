@@ -35,7 +35,7 @@ class RealityCapture(Photogrammetry):
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
     def from_sidecars(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs x.jpg that have a sidecar x.xmp with a pose."""
+        """Read the photographs x.jpg that have a sidecar x.xmp with a pose."""
         if not any(self.src.glob("*.xmp")):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
@@ -49,7 +49,7 @@ class RealityCapture(Photogrammetry):
                 self.without_pose.add(image.name)
 
     def from_csv(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs in the rows of a CSV file."""
+        """Read the photographs in the rows of a CSV file."""
         columns, rows = read_csv(self.src)
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
@@ -75,7 +75,7 @@ class RealityCapture(Photogrammetry):
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
-    """A photograph with the camera in the fields of its sidecar."""
+    """Make a photograph with the camera in the `fields` of its sidecar."""
 
     def numbers(name: str, count: int, default: str | None = None) -> np.ndarray:
         text = fields.get(name, default)
@@ -119,7 +119,7 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def film_lens(image: Path, focal: float, centre: list[float], terms: list[float], what: str) -> Lens:
-    """The lens of a photograph.
+    """Make the lens of a photograph from numbers relative to the film.
 
     `focal`: focal length for film 36 mm wide; `centre`: principal point relative to the middle of the photograph [its
     longer side]; `terms`: the coefficients `TERMS`.

@@ -35,7 +35,7 @@ class SfmData(Photogrammetry):
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """The photographs of a scene of Meshroom."""
+        """Read the photographs of a scene of Meshroom."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
@@ -60,7 +60,7 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""
+        """Read the photographs of a scene of OpenMVG. Its library cereal names polymorphic types only at first use."""
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
         for own in intrinsics.values():
@@ -86,14 +86,14 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """The entries of the list `name` in the file, by their field `key`; empty if there is no such list."""
+        """Arrange the entries of the list `name` in the file by their field `key`; empty if there is no such list."""
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[tuple[str, Frame]]:
-        """The frame of a photograph, which may have been moved; nothing if it is not in `photographs`."""
+        """Make the frame of a photograph, which may have been moved; nothing if it is not in `photographs`."""
         path = self.src.parent / file
         own = path if is_file(path) and not self.images and self.photographs is None else self.photograph(file, what)
         if own:
@@ -101,7 +101,7 @@ class SfmData(Photogrammetry):
 
 
 def require_object(value: Any, what: str) -> dict:
-    """The value. Raises InputError, which begins with `what`, if it is no JSON object."""
+    """Return the value. Raises InputError, which begins with `what`, if it is no JSON object."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
@@ -115,7 +115,7 @@ def file_name(view: dict, field: str, what: str) -> str:
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """The object in a smart pointer of cereal, with the fields of its base class."""
+    """Read the object in a smart pointer of cereal, with the fields of its base class."""
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
@@ -163,9 +163,9 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """A lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
+    """Make a lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
 
-    `given`: its coefficients; 0 if they are missing.
+    `given`: the model's coefficients; 0 if they are missing.
     """
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")

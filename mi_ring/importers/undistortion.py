@@ -13,7 +13,7 @@ AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
 
 
 class Window(NamedTuple):
-    """A part of the undistorted photograph, at full size or reduced."""
+    """A part of the undistorted photograph: its place, and its scale."""
 
     left: int  #: first column [px of the photograph]
     top: int  #: first row [px of the photograph]
@@ -30,7 +30,7 @@ class Window(NamedTuple):
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Rows and columns (2, H, W) [px] in the photograph of the window's pixels; the first pixel's centre is 0."""
+    """Find where in the photograph the window's pixels are: rows and columns (2, H, W) [px]; first pixel's centre 0."""
     (fx, fy), (cx, cy) = lens.focal, lens.centre
     left, top, width, height, scale = window
     x = (left + (np.arange(width) + 0.5) * scale - cx) / fx
@@ -61,7 +61,7 @@ def undistort(
 def undistort_part(
     pixels: np.ndarray, lens: Lens, srgb: bool, saturation: float, window: Window
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`undistort` of a window that is small enough for arrays of floats."""
+    """Undistort a window that is small enough for arrays of floats; see `undistort`."""
     positions = source_positions(lens, window)
     size = np.array(pixels.shape[:2])
     valid = np.all((positions >= -0.5) & (positions <= size[:, None, None] - 0.5), 0)

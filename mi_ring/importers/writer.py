@@ -49,13 +49,13 @@ class Writer:
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """The path relative to the scene file."""
+        """Make a path relative to the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
         """Move all files to their places, then write the scene file.
 
-        Raises InputError if another file is in such a place, because it may be a source. An equal file is from an
+        Raises InputError if another file is in the place of one, because it may be a source. An equal file is from an
         interrupted run.
         """
         for file in self.files:

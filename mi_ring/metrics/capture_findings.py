@@ -20,24 +20,21 @@ FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Names and shifts of photographs that a fit moved much farther than the others.
-
-    `photographs`: the entry of this name in calibration.json.
-    """
+    """Name photographs that a fit moved much farther than others; may be empty. Argument: see calibration.json."""
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """Names and powers of photographs whose light is much stronger or weaker than the others', as in `moved_far`."""
+    """List photographs whose light is much stronger or weaker than that of the others. See `moved_far`."""
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
     return ", ".join(f"{name} ({power:.2g} times)" for name, power in odd.items())
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """`moved_far` and `odd_powers` of these photographs, from calibration.json beside the scene; empty without it."""
+    """Read calibration.json beside a scene file: `moved_far` and `odd_powers` of photographs; empty without it."""
     record = read_json(scene.parent / "calibration.json")
     try:
         known = {name: entry for name, entry in record["photographs"].items() if name in names}
@@ -48,7 +45,7 @@ def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
 
 @dataclass
 class PhotographQuality:
-    """A row of the table of `mi-ring check`. Distances are in radii of the normalising sphere."""
+    """The quality of one photograph: a row of the table of `mi-ring check`. Lengths are in radii of the object."""
 
     name: str
     distance: float  #: from the camera to the object
@@ -77,7 +74,7 @@ agreement: share of the mask that the other masks agree with"""
 def measure(
     capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
 ) -> list[PhotographQuality]:
-    """A row for each photograph. `agreement`: from `mask_agreement.agreements`."""
+    """Measure the quality of each photograph. `agreement`: share of each mask that the others confirm, by file."""
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
     of_each = zip(capture.shots, capture.names, lights.toward(center), lights.distances(center),
@@ -105,13 +102,13 @@ def measure(
 
 
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
-    """The irradiance (N,) at the object in each photograph; 1 everywhere if the lights are unknown."""
+    """Irradiance (N,) at the object, `center` (3,), in each photograph; 1 everywhere if the lights are unknown."""
     received = capture.photographs.irradiance(center).mean(1)
     return received if np.median(received) > 0 else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:
-    """A finding if the lights are in other units than the cameras."""
+    """A sentence for the user if the lights seem to be in other units than the cameras; None otherwise."""
     lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
     cameras = np.stack([shot.camera.position for shot in capture.shots])
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
@@ -128,7 +125,7 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def facing(capture: Capture, center: np.ndarray) -> str | None:
-    """A finding if cameras look away from the object."""
+    """A sentence for the user if cameras look away from the object; None otherwise."""
     cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
@@ -152,7 +149,7 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
 
 
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
-    """The findings, one line each."""
+    """The findings about a capture: one sentence for each problem. `rows`: from `measure`."""
     found: list[str] = []
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # masks of bright parts only need not agree
@@ -193,7 +190,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
 
 
 def quality_table(rows: list[PhotographQuality]) -> str:
-    """The rows as text, with a legend. Brightness is relative to the median."""
+    """Format the rows as text, with a legend. Brightness is relative to the median."""
     typical = float(np.median([row.brightness for row in rows]))
     lines = [["photograph", *FORMATS]]
     for row in rows:
@@ -208,7 +205,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 
 def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
-    """The capture without its empty masks, and the names of the photographs that had them."""
+    """Remove empty masks from a capture. Returns the capture, and the names of the photographs that had them."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
     empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     masks = capture.masks.replaced(dict.fromkeys(empty))

@@ -33,12 +33,13 @@ def evaluate(
     run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
     align: str | None = None,
 ) -> dict:  # fmt: skip
-    """Errors of the fit in the results folder `run`. Lists of errors by photograph: `views` and `novel_views`.
+    """Compare a fit, in the results folder `run`, with the truth. Returns errors by name.
 
     `mesh`: true surface. `novel`: scene file of novel views. `spp`: samples per pixel of predicted photographs. `seen`:
-    measure distances between surfaces only where a photograph shows them. `align`: "rigid" or "similarity" first
-    aligns the truth and `novel` with the fit; `aligned_*` is this motion. Numbers end in `_input` for fitted
-    photographs and in `_held_out` for held-out ones. Undefined numbers are missing, such as the genus of an open mesh.
+    measure distances between surfaces only where a photograph shows them. `align`: "rigid" or "similarity" first aligns
+    the truth and `novel` with the fit; `aligned_*` is this motion. Numbers end in `_input` for fitted photographs and
+    in `_held_out` for held-out ones; `views` and `novel_views` list them by photograph. Undefined numbers are missing,
+    such as the genus of an open mesh.
     """
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
@@ -81,7 +82,7 @@ def evaluate(
 
 
 def evaluation_table(numbers: dict[str, float]) -> str:
-    """A table of numbers as text, with a line for each of the `LINES`."""
+    """Format `numbers` of `evaluate` as text, with a line for each of the `LINES`."""
     lines = []
     for start, words in LINES.items():
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
@@ -93,5 +94,5 @@ def evaluation_table(numbers: dict[str, float]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """A JSON value with all floats in it rounded to four decimals; more are not significant."""
+    """Round all floats in a JSON value to four decimals; more are not significant."""
     return json.loads(json.dumps(value), parse_float=lambda digits: round(float(digits), 4))

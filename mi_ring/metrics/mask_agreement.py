@@ -14,7 +14,7 @@ CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """The share of each mask that the other masks agree with, by file; and findings about all masks."""
+    """Test whether masks agree: the share of each mask that all others contain, by file; and findings as sentences."""
     if not capture.hull:
         return {}, []
     silhouettes = capture.silhouettes()
@@ -39,7 +39,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """A silhouette whose camera has the `changed` fields."""
+    """A copy of a silhouette whose camera has the `changed` fields."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
@@ -70,7 +70,7 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Share of mask pixels that all masks agree with; 0 if the visual hull is empty."""
+    """The share of all masks' pixels that every mask agrees with; 0 if the visual hull is empty."""
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -78,7 +78,7 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """The known mistake that explains why the masks disagree, and its correction, as text; None if there is none."""
+    """Find the known mistake in the cameras that explains why masks disagree, and its correction, as text; or None."""
     some = subsample(silhouettes, 32, 96)
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
@@ -94,7 +94,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """A finding if all principal points are wrong by half a pixel: the outlines of masks and hull then differ."""
+    """Test whether all principal points are wrong by half a pixel, so that masks differ from the hull: text or None."""
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

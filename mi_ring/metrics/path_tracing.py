@@ -23,7 +23,7 @@ LANES = 1 << 21  #: most rays in one launch
 
 @dataclass
 class Pictures:
-    """Independent renderings (16, H, W, 3) of one photograph: linear radiance."""
+    """Renderings of one photograph by `photometric` and `path`: 16 independent ones each (16, H, W, 3), linear."""
 
     photometric: np.ndarray
     unshadowed: np.ndarray  #: photometric without shadows, same samples
@@ -32,7 +32,7 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """A scene that stock integrators can light, without tables, and its photographs. Raises InputError."""
+    """Load a scene that stock integrators can light, without tables, and its photographs. Raises InputError."""
     scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
@@ -46,7 +46,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """The scene with exactly one `flash`, by which stock integrators see the photographs' light, and without a `room`.
+    """Change a scene so that stock integrators see the photographs' light: with exactly one `flash`, without a `room`.
 
     A `shapenet` has a `flash` already. Raises SceneError if there are several.
     """
@@ -64,9 +64,10 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
 def render_both(
     scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
 ) -> Pictures:
-    """16 independent renderings of photograph `k` of `sensor`, reduced by `scale`, with `spp` samples per pixel each.
+    """Render photograph `k`, whose sensor is `sensor`, by `photometric` and by Mitsuba's `path`, 16 times each.
 
-    Uses the seeds `seed` to `seed` + 31; `photometric` and `path` have different ones. Neither uses the film's filter.
+    Pictures are `scale` times smaller, with `spp` samples per pixel and paths of at most `depth`. Seeds are `seed` to
+    `seed` + 31, different for both renderers. Neither uses the film's filter.
     """
     size = sensor.camera.size
     width, height = (s // scale for s in size)
@@ -92,7 +93,7 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """`render_photographs` with `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
+    """Render photographs by Mitsuba's `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

@@ -17,7 +17,7 @@ IMPLAUSIBLE = 0.75  #: share of interreflection above which the intensities are 
 
 @dataclass
 class Comparison:
-    """Numbers of one photograph or of all. Numbers without a unit here are shares of the mean radiance of `path`."""
+    """Differences of `photometric` and `path` in one photograph or all. Shares are of the mean radiance of `path`."""
 
     name: str
     radiance: float  #: mean of `path` over all pixels and channels
@@ -34,13 +34,13 @@ class Comparison:
 
 
 def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
-    """p-value of the difference of independent pictures a, b (16, H, W, 3) float64 under equal distributions.
+    """The p-value of the difference of independent pictures a, b (16, H, W, 3) float64, if both renderers agree.
 
     It is the smaller of two p-values, with Šidák's correction. The first tests the mean of all pixels, by Student's t.
     The second tests blocks of 8 × 8 pixels. Under equal distributions, each of the 16 differences d of a block has
-    either sign with equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance
-    2 − 2 Σ d⁴ / (Σ d²)². Blocks are independent, so their sum has about a gamma distribution of known mean and
-    variance. Channels share samples, so each block uses only one channel: red, green, blue in turn.
+    either sign with equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance 2 −
+    2 Σ d⁴ / (Σ d²)². Blocks are independent, so their sum has about a gamma distribution of known mean and variance.
+    Channels share samples, so each block uses only one channel: red, green, blue in turn.
     """
     whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
     error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
@@ -59,7 +59,7 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sums (16, h, w) of (16, H, W, 3) over blocks of pixels, each in one channel. Border blocks are smaller."""
+    """Sum pictures (16, H, W, 3) over blocks of pixels, each in one channel: (16, h, w). Border blocks are smaller."""
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
     x = x.reshape(len(x), x.shape[1] // BLOCK, BLOCK, -1, BLOCK, 3).sum((2, 4))
@@ -73,7 +73,7 @@ def sidak(p: Sequence[float] | np.ndarray) -> float:
 
 
 def compare_renderers(name: str, pictures: Pictures) -> Comparison:
-    """The numbers of one photograph. Raises InputError if pixels are NaN or infinite."""
+    """Compare both renderers in one photograph. Raises InputError if pixels are NaN or infinite."""
     for which, picture in vars(pictures).items():
         if bad := int((~np.isfinite(picture)).any((0, 3)).sum()):
             raise InputError(f"{name}: {which}: {bad} pixels are NaN or infinite; check BSDF and mesh")
@@ -96,7 +96,7 @@ def compare_renderers(name: str, pictures: Pictures) -> Comparison:
 
 
 def all_as_one(rows: list[Comparison]) -> Comparison:
-    """The comparison of all photographs together: shares of all light; p-values corrected for their number."""
+    """Combine the comparisons of photographs: shares of the light in all, p-values corrected for their number."""
     column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
     weight = column["radiance"] / (column["radiance"].sum() or 1.0)
     shares = {name: float((weight * values).sum()) for name, values in column.items()}
@@ -110,17 +110,17 @@ def all_as_one(rows: list[Comparison]) -> Comparison:
 
 
 def percent(x: float) -> str:
-    """A share as text."""
+    """Format a share as per cent."""
     return f"{100 * x:.2f} %"
 
 
 def probability(p: float) -> str:
-    """A p-value as text with its significant digits."""
+    """Format a p-value with its significant digits."""
     return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
 
 
 def comparison_table(rows: list[Comparison]) -> str:
-    """The numbers as text, one line each. Shares are of the mean radiance of `path`."""
+    """Format comparisons as text, one line each. Shares are of the mean radiance of `path`."""
     cells: list[tuple[str, ...]] = [(
         "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
         "unexplained %", "p direct", "p path",
@@ -136,7 +136,7 @@ def comparison_table(rows: list[Comparison]) -> str:
 
 
 def verdict(rows: list[Comparison], everything: Comparison, significance: float) -> list[str]:
-    """The result in words."""
+    """Say in three sentences whether the renderers agree, and how strong shadows and interreflection are."""
     p = probability(everything.p_direct)
     if everything.p_direct >= significance:
         direct = f"direct light agrees with path ({p})"

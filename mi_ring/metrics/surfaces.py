@@ -25,7 +25,7 @@ THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
-    """A mesh file, and a scene of this mesh only, with smooth normals. Raises InputError if it cannot be read."""
+    """Load a mesh file: the mesh, and a scene of this mesh only, with smooth normals. Raises InputError."""
     mesh = read_mesh(path, "mesh")
     if not len(mesh.faces):
         raise InputError(f"{path}: mesh: has no triangles; give a surface")
@@ -33,7 +33,7 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """The rigid motion or `similarity` (4, 4) that aligns a mesh with a mesh `onto` nearby.
+    """Find the rigid motion, or the `similarity`, that aligns a mesh with a mesh `onto` nearby: (4, 4).
 
     Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """
@@ -59,7 +59,7 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """At the pixel centres of a photograph: hit (P,) bool, distance (P,), normal (P, 3), back of a face (P,) bool."""
+    """Trace the pixel centres of a photograph with P pixels: is it a hit, distance, normal (P, 3), back of a face?"""
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
     camera = photograph.camera(mi.UInt32(0))
@@ -75,10 +75,11 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Errors of all views together, and by view: shading normals [deg], depths [% of `diagonal`], silhouettes.
+    """Compare two surfaces in all photographs: errors of all views together, and a list by view.
 
-    Normals and depths count at pixels that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of
-    `guess` that see the back of a face.
+    Errors are of shading normals [deg], depths [% of `diagonal`] and silhouettes. Normals and depths count at pixels
+    that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of `guess` that see the back of a
+    face.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
     for k, name in enumerate(capture.names):
@@ -98,7 +99,7 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Means and medians of errors (P,); empty if there are none."""
+    """Means and medians of errors (P,) of normals [deg] and depths, by name; empty if there are none."""
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -109,12 +110,12 @@ def compare_shapes(
     guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[MaskedCamera] | None = None,
     diagonal: float | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Chamfer distance [% of `diagonal`, by default that of the true bounding box] and F-scores of two surfaces.
+    """Compare two surfaces in space: Chamfer distance [% of `diagonal`, default: the true bounding box's] and F-scores.
 
     They use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean of the
-    two mean distances. `f_score_t`: harmonic mean of precision (share of the fit's points with a distance of at most
-    t % of the diagonal) and recall (the same for the truth); Knapitsch et al., Tanks and Temples, ACM TOG 2017.
-    With `views`, only points that a view shows count; `unseen` and `unseen_true` are the shares of the others.
+    two mean distances. `f_score_t`: harmonic mean of precision (share of the fit's points with a distance of at most t
+    % of the diagonal) and recall (the same for the truth); Knapitsch et al., Tanks and Temples, ACM TOG 2017. With
+    `views`, only points that a view shows count; `unseen` and `unseen_true` are the shares of the others.
     """
     diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))

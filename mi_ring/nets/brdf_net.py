@@ -56,11 +56,11 @@ class MaterialNet(nn.Module):
         return sum(p.channels for p in self.bsdf_parameters)
 
     def evaluate(self, s: Tensor) -> Tensor:
-        """Unbounded values (..., outputs) at domain points (..., 3); initially about 0."""
+        """Compute unbounded values (..., outputs) at domain points (..., 3); initially about 0."""
         raise NotImplementedError
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        """The parameters by name at domain points (..., 3): (..., 3) for colours, otherwise (...).
+        """Compute the parameters by name at domain points (..., 3): (..., 3) for colours, otherwise (...).
 
         A sigmoid maps outputs to the range of a parameter. Without an upper limit, softplus times `scale` does, so that
         outputs are about 1 in any unit of light.

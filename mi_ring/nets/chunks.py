@@ -18,7 +18,7 @@ _lock = threading.Lock()
 
 
 def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Tensor:
-    """The values of a network at points (n, 3), computed in chunks of equal size, one per thread.
+    """Compute the values of a network at points (n, 3) in chunks of equal size, one per thread.
 
     `forward(chunk, keep)` returns the values of a chunk and, with `keep`, the data for the backward pass. For more than
     `MAX_STORED` points the backward pass computes this data again, to save memory. A GPU uses a single chunk.
@@ -37,7 +37,7 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Ten
 
 
 def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """The gradients of the points (n, 3) and of the parameters of `ctx.layers`.
+    """Compute the gradients of the points (n, 3) and of the parameters of `ctx.layers`.
 
     `backward(gradient, stored, sums)` returns the gradient of the points of a chunk and adds the gradients of the
     parameters to `sums`. Raises RuntimeError for a second call, and if parameters changed after the forward pass.
@@ -60,7 +60,7 @@ def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[
 
 
 def in_parallel(function: Callable, *arguments: Sequence) -> list:
-    """`map` over worker threads, each of which uses one thread of torch."""
+    """Call `function` like `map`, in worker threads, each of which uses one thread of torch."""
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads == 1:
         return list(map(function, *arguments))

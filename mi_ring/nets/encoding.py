@@ -24,12 +24,12 @@ class PosEnc(nn.Module):
         return {"encoding": self.spacing, "frequencies": self.frequencies}
 
     def omega(self, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """ω (frequencies,)."""
+        """The frequencies ω, (frequencies,), as a tensor."""
         k = torch.arange(self.frequencies, dtype=dtype, device=device)
         return 2**k if self.spacing == "octaves" else k + 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """The features of points (..., 3)."""
+        """Compute the features of points (..., 3)."""
         if self.spacing == "none":
             return x
         phase = (x[..., None, :] * self.omega(x.dtype, x.device)[:, None]).flatten(-2)

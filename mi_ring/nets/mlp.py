@@ -56,7 +56,7 @@ class MLP(nn.Module):
         return values.reshape(*x.shape[:-1], self.output.out_features)
 
     def operands(self, x: Tensor) -> list:
-        """The last arguments of `_Evaluate` and of `_EulerSteps`.
+        """Collect the last arguments of `_Evaluate` and of `_EulerSteps`.
 
         They are: encoding, type of the matrix products, whether gradients are needed, weights and biases by layer.
         """
@@ -73,7 +73,7 @@ class Layers:
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
     def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
-        """Activations and output at points (n, 3).
+        """Compute activations and output at points (n, 3).
 
         Activations are those of the encoding and all hidden layers; without `keep`, of the last hidden layer alone.
         """

@@ -12,7 +12,7 @@ from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 
 @register_network("resnet")
 class ResNet(Flow):
-    """T = `steps` blocks `x ← x + Vₖ(x) / T`, each with its own weights. It is not the flow of one velocity field.
+    """A plain ResNet: T = `steps` blocks `x ← x + Vₖ(x) / T` with own weights, not the flow of one velocity field.
 
     By default all blocks together have as many parameters as Shape-Net: for T = 20 they are about 42 neurons wide.
     `width`: neurons per layer of each block; with Shape-Net's 256 there are T times as many parameters.
@@ -32,7 +32,7 @@ class ResNet(Flow):
         return {"steps": self.steps, "width": self.width, **self.encoding.arguments()}
 
     def velocity_of(self, step: int) -> Velocity:
-        """Vₖ of block k = `step`."""
+        """The velocity field Vₖ of block k = `step`."""
         block: Any = self.blocks[step]
         return block.velocity
 

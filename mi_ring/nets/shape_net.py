@@ -28,7 +28,7 @@ class Flow(nn.Module):
     steps: int = 20  #: T: steps from the domain to the object
 
     def velocity(self, x: Tensor) -> Tensor:
-        """V(x) at points (..., 3), of the same shape and type."""
+        """Compute V(x) at points (..., 3); of the same shape and type as x."""
         raise NotImplementedError
 
     def velocity_of(self, step: int) -> Velocity:
@@ -49,7 +49,7 @@ class Flow(nn.Module):
 
 
 class VelocityField(MLP):
-    """V, an MLP of 771 neurons in the paper.
+    """The velocity field V: an MLP, of 771 neurons in the paper.
 
     It is bounded by `SPEED`, by tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH
     2022. It is initially almost 0, so that the start surface is the domain.
@@ -62,7 +62,7 @@ class VelocityField(MLP):
             self.output.bias.zero_()
 
     def velocity(self, x: Tensor) -> Tensor:
-        """V(x) at points (..., 3), of the same shape and type."""
+        """Compute V(x) at points (..., 3); of the same shape and type as x."""
         return SPEED * torch.tanh(self.evaluate(x).to(x.dtype))
 
 
@@ -79,7 +79,7 @@ class ShapeNet(VelocityField, Flow):
         return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """`Flow.flow`, with matrix products in bfloat16 under `torch.autocast`.
+        """Compute `Flow.flow`, with matrix products in bfloat16 under `torch.autocast`.
 
         It allows one backward pass and first derivatives; within `plain_autograd`, any number of both.
         """

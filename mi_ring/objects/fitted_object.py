@@ -54,22 +54,22 @@ class FittedObject(nn.Module):
         self.metres = None if metres is None else float(metres)
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
-        """Surface points (V, 3) [scene units] of domain points (V, 3), at a `time` of the flow."""
+        """Compute the surface points (V, 3) [scene units] of domain points (V, 3), at a `time` of the flow."""
         return self.to_scene(self.shape_net(s, time))
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
-        """The parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
+        """Compute the parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
         return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """`surface` and `material`."""
+        """Compute `surface` and `material` at domain points (V, 3)."""
         return self.surface(s, time), self.material(s)
 
     def render(
         self, camera: Camera, light: Light | None = None, spp: int = 16, level: int | None = None, shadows: bool = True,
         seed: int = 0,
     ) -> Tensor:  # fmt: skip
-        """A picture (H, W, 3) of the camera's size: linear radiance by direct light.
+        """Render a picture (H, W, 3) of the camera's size: linear radiance by direct light.
 
         `light`: default: a point light of intensity 1 at the camera. `level`: of the mesh; default: `subdivisions`.
         `spp`: samples per pixel. The picture allows one backward pass to the parameters of both networks. Gradients
@@ -84,7 +84,7 @@ class FittedObject(nn.Module):
         return prediction.render(surface, shot, vertices, material, spp, seed, shadows)[0][0]
 
     def to_scene(self, points: Tensor) -> Tensor:
-        """Points (V, 3) of the normalised frame in scene units. Points below the ground are moved up to it."""
+        """Convert points (V, 3) of the normalised frame to scene units. Points below the ground are moved up to it."""
         points = self.center + self.radius * points
         if self.ground is None:
             return points

@@ -20,17 +20,17 @@ SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """Changes of the material."""
+    """Options that change the material of an object."""
 
     material: Path | None = None
-    """Results folder of another fit. The object gets the material of that fit.
+    """Results folder of another fit whose material the object gets. Without it: its own material.
     Both fits must start from the same domain or from surfaces without handles."""
     specular_scale: float = 1.0
-    """Factor for the specular reflectance."""
+    """Factor for the specular reflectance: above 1 for stronger highlights, 0 for none."""
     roughness_add: float = 0.0
-    """Number to add to the roughness, which stays within its range."""
+    """Number to add to the roughness, which stays in its range. Above 0: wider highlights. Below 0: sharper ones."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors for red, green and blue."""
+    """Factors for red, green and blue of the object's colour, 0 or more. 1 1 1: no change."""
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:

@@ -23,7 +23,7 @@ ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
-    """The content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
+    """Make the content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
     domain = None
     if not isinstance(ring.domain, Sphere):  # as tensors: torch loads no numpy arrays with `weights_only`
         domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
@@ -36,7 +36,7 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
 
 
 def ring_of(state: dict) -> FittedObject:
-    """The inverse of `ring_state`.
+    """Make the object of a state: the inverse of `ring_state`.
 
     Raises InputError for networks that are not registered and for removed settings of older versions. If the state is
     damaged, raises KeyError, RuntimeError, TypeError or ValueError.
@@ -129,7 +129,7 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
 
 
 def load_fit(path: str | Path) -> FittedObject:
-    """The object of a fit, from its results folder or its `ring.pt`.
+    """Load the object of a fit, from its results folder or its `ring.pt`.
 
     Raises InputError if there is no such file, if its version cannot be read, or if its networks are not registered.
     """

@@ -49,7 +49,7 @@ def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: 
 
 
 def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """Surface points (V, 3), in the normalised frame, of domain points (V, 3)."""
+    """Move domain points (V, 3) to the surface at a `time` of the flow: (V, 3) in the normalised frame."""
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
@@ -68,7 +68,7 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """An atlas with vertices, normals and tangents."""
+    """Make an atlas with vertices, normals and tangents."""
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
     (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
@@ -90,7 +90,7 @@ def assemble(
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surface at points `s` (V, 3) of the domain with triangles `faces`, at `time` of the flow.
+    """Compute the surface at points `s` (V, 3) of the domain with triangles `faces`, at `time` of the flow.
 
     Returns points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, and `Atlas.uncut`.
     """
@@ -111,7 +111,7 @@ class Texels:
 
 
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
-    """The texels of an atlas. Normals are those of the surface at the level of the fit, if that is finer."""
+    """Fill the texels of an atlas. Normals are those of the surface at the level of the fit, if that is finer."""
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
     for _ in range(ring.subdivisions - atlas.subdivisions):
@@ -145,7 +145,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """The parameters of the material by name, (N, 3) or (N,), at domain points (N, 3)."""
+    """Compute the material at domain points (N, 3): its parameters by name, (N, 3) or (N,)."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
         parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]

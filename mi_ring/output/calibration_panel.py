@@ -18,7 +18,7 @@ LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
 class Panel(NamedTuple):
-    """The section of the report about calibration."""
+    """The section of the report about calibration: a table, a chart and a warning."""
 
     rows: list[tuple[str, str, str, str]]  #: quantity, before, after, standard deviation
     chart: str  #: a data URI

@@ -42,45 +42,48 @@ class RenderConfig(MaterialOptions):
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Mitsuba XML file with the photographs to render. Their image files need not exist."""
+    """Mitsuba XML file with the cameras and lights to render. The image files that it names need not exist."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder for the pictures, or a file FILE.mp4 for a film.
-    A picture is linear if the scene names an EXR file, and 8-bit sRGB if it names PNG or JPEG."""
+    A picture is linear if the scene names an EXR file, and 8-bit sRGB if the scene names PNG or JPEG."""
     turntable: int = 0
-    """Number of pictures with a camera that moves once around the object, together with its light."""
+    """Render this number of pictures while camera and light move once around the object. 0: none."""
     light_orbit: int = 0
-    """Number of pictures with a light that moves once around the line from the object to the camera.
+    """Render this number of pictures while the light moves once around the line from the object to the camera. 0: none.
     Seen from the object, the angle between light and camera is 45 degrees."""
     flow: int = 0
-    """Number of pictures of the flow, from the start surface of the fit to the object."""
+    """Render this number of pictures of the deformation, from the start surface of the fit to the object. 0: none."""
     view: str | None = None
     """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
     Without it: the first photograph."""
     width: int | None = None
     """Width of the pictures of --turntable, --light-orbit and --flow [px].
-    Without it: the width of that photograph."""
+    Without it: the width of the photograph that --view names."""
     up: tuple[float, float, float] | None = None
     """Axis of the turntable, and the up direction of --envmap (x y z).
     Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
     """Environment map that lights the object in place of the scene's lights: EXR or HDR, latitude and longitude."""
     integrator: str | None = None
-    """Mitsuba's name of the integrator. Without it: photometric, or path with --envmap.
-    path computes all interreflection, but does not show a `table`."""
+    """Name of the Mitsuba integrator that computes the light. Without it: photometric, or path with --envmap.
+    photometric is fast and predicts photographs as the fit does. It cannot be used with --envmap.
+    path traces all reflections, also in scenes with other objects. It has more noise and does not show a `table`."""
     format: Literal["png", "exr"] | None = None
-    """Format of the pictures. Without it: that of the scene's file names; png for numbered pictures."""
+    """Format of the pictures. png: 8-bit sRGB. exr: linear radiance.
+    Without it: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
     fps: float = 24.0
-    """Pictures per second of a film."""
+    """Pictures per second of a film, 240 at most."""
     time: float = 1.0
-    """Time of the flow: 0 is the surface where the fit started, 1 the object."""
+    """Which surface to render, as a time of the deformation: 0 is where the fit started, 1 is the finished object."""
     subdivisions: int | None = None
-    """Level of the mesh, with about 10 · 4^level vertices. Without it: that of the fit."""
+    """Level of the mesh, with about 10 · 4^level vertices. Without it: the level of the fit.
+    Higher levels show finer detail and take more memory."""
     spp: int = SPP
-    """Samples per pixel. More give less noise."""
+    """Samples per pixel. More samples give less noise and take longer."""
 
     @property
     def count(self) -> int:
-        """The number of pictures of the turntable, the light orbit or the flow; 0 without these."""
+        """The number of pictures of --turntable, --light-orbit or --flow; 0 if none of them is given."""
         return self.turntable or self.light_orbit or self.flow
 
     @property
@@ -91,7 +94,7 @@ class RenderConfig(MaterialOptions):
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A view to render."""
+    """A picture to render: its camera and light, file name and time of the flow."""
 
     shot: Shot
     name: str  #: of the picture's file
@@ -100,7 +103,7 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Mitsuba's integrator to render with; None for `photometric`. Raises InputError if there is none of this name."""
+    """Make Mitsuba's integrator; None for `photometric`. Raises InputError if there is none of this name."""
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
         return None
@@ -114,7 +117,7 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 
 
 def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
-    """The views to render: the photographs of the scene, or the frames of a film."""
+    """List the views to render: the photographs of the scene, or the frames of a film."""
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
@@ -161,7 +164,7 @@ def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """A camera at the same position that is centred on the object and shows it and the start surface of the fit.
+    """Turn and zoom a camera, at its position, so that it shows object and start surface of the fit, centred.
 
     Also returns the centre (3,) of the object [scene units].
     """
@@ -183,7 +186,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """The object in the light of its scene. With --envmap: in that environment and fixed lamps, without a table."""
+    """Light the object by its scene, or with --envmap by that environment and fixed lamps, without a table."""
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -204,7 +207,7 @@ def render_views(
     surface: Surface, ring: FittedObject, views: list[RenderedView], integrator: mi.Integrator | None,
     capture: Capture, config: RenderConfig,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """The pictures, (H, W, 3) linear radiance each."""
+    """Render the views one by one: pictures (H, W, 3) of linear radiance."""
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
@@ -221,7 +224,7 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """A picture (H, W, 3) by an integrator of Mitsuba. It is the mean of passes, so memory does not grow with `spp`.
+    """Render a picture (H, W, 3) by an integrator of Mitsuba, as the mean of passes: memory does not grow with `spp`.
 
     A pass has at most `LANES` rays, but at least one ray per pixel.
     """

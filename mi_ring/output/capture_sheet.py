@@ -25,7 +25,7 @@ LEGEND = (
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
-    """Cameras, viewing directions, lights and the normalising sphere, projected along the three axes."""
+    """Draw cameras, viewing directions, lights and the normalising sphere, projected along the three axes."""
     cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())
@@ -48,7 +48,7 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
 
 
 def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
-    """The contact sheet: the plan; then photographs with the visual hull, the masks' outlines and invalid pixels."""
+    """Draw the contact sheet: the plan; then photographs with the visual hull, the masks' outlines, invalid pixels."""
     top = plan(capture, center, radius)
     try:
         mesh = capture.hull.surface() if capture.hull else None

@@ -64,7 +64,7 @@ def export(
 def require_exportable(
     file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
 ) -> str:  # fmt: skip
-    """The suffix of a file, one of `KINDS`. Raises InputError for other suffixes and for values out of range."""
+    """Check the values and return the suffix of `file`, one of `KINDS`. Raises InputError if one is out of range."""
     kind = file.suffix.lower()
     if kind not in KINDS:
         raise InputError(f"{file}: must end in {', '.join(KINDS)}")

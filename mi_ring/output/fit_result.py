@@ -41,10 +41,10 @@ class FitResult:
 
     @functools.cached_property
     def calibration(self) -> dict[str, Any] | None:
-        """Content of calibration.json; None if nothing was refined. Slow: it renders, so write other files first."""
+        """Make the content of calibration.json; None if nothing was refined. It renders, so write other files first."""
         return self.summary and self.summary()
 
     def drawn(self, level: int) -> Surface:
-        """The surface at this level of the mesh, ready for rendering."""
+        """Make the surface at this level of the mesh, ready for rendering."""
         self.surface.show(self.ring, *self.ring.domain.sample(level))
         return self.surface

@@ -86,7 +86,7 @@ def require_expressible(ring: FittedObject) -> None:
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """The textures of a material, (H, W, 3 or 4) uint8, by their names in glTF."""
+    """Draw the textures of a material, (H, W, 3 or 4) uint8, by their names in glTF."""
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": linear_to_srgb(material.base_color),
@@ -101,7 +101,7 @@ def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
     views: Sequence[MaskedCamera] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """The object as a GLB file with textures of `resolution` texels a side.
+    """Make a GLB file of an object, with textures of `resolution` texels a side.
 
     Positions are in scene units and in the scene's frame. A node scales them to metres if `metres`, the length of a
     scene unit, is given, and turns `up` (3,) to the y axis. The BSDF's own parameters are vertex attributes (_DIFFUSE,
@@ -123,7 +123,7 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """The GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
+    """Make a GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
     blob = bytearray()
     buffer_views: list[pygltflib.BufferView] = []
     accessors: list[pygltflib.Accessor] = []

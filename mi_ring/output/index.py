@@ -56,7 +56,7 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
 
 
 def row_of(entry: Entry, out: Path) -> dict:
-    """The content of the page's row for a fit."""
+    """Collect the content of the page's row for a fit."""
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
@@ -69,13 +69,13 @@ def row_of(entry: Entry, out: Path) -> dict:
 
 
 def link_to(file: Path, out: Path) -> str | None:
-    """The link to a file from a page in `out`; None if there is no such file."""
+    """Make the link to a file from a page in `out`; None if there is no such file."""
     return quote(relative_to(out.resolve(), file.resolve())) if file.is_file() else None
 
 
 @functools.lru_cache(maxsize=4096)
 def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
-    """The numbers of a report, and the prediction of its first photograph as a data URI of a thumbnail.
+    """Read the numbers of a report, and the prediction of its first photograph as a data URI of a thumbnail.
 
     `modified`: modification time of the file. The result is cached, because the page is often written again.
     """

@@ -38,7 +38,7 @@ def inspect(capture: Capture) -> Inspection:
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
-    """As `inspect`; `advance` is called after each of its four steps."""
+    """Inspect a capture like `inspect`, and call `advance` after each of the four steps."""
     capture, empty = without_empty_masks(capture)
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:

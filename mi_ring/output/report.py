@@ -58,7 +58,7 @@ class PhotographPanel:
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
-    """The page of a fit. `glb`: the object, for the viewer. `unseen`: share of its area that no photograph shows."""
+    """Make the page of a fit. `glb`: the object, for the viewer. `unseen`: share of area that no photograph shows."""
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
@@ -115,7 +115,7 @@ def fit_findings(
     rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
-    """Sentences about problems of a fit, each with advice.
+    """List problems of a fit as sentences, each with advice.
 
     `refined`: content of calibration.json. `unexplained`: share of the object's light that the fit does not predict.
     """
@@ -167,13 +167,13 @@ def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """One line with names and numbers of the lowest (rank, name, number); empty if there are none."""
+    """List names and numbers of the lowest (rank, name, number) in one line; empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """Words for a shift [px]."""
+    """Describe a shift [px] in words: how far right or left, up or down."""
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
@@ -191,7 +191,7 @@ def scale_of(result: FitResult, size: tuple[int, int]) -> int:
 
 
 def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[PredictedPhotograph]:
-    """Predictions of photographs `index`, all of one size."""
+    """Predict photographs `index`, all of one size."""
     capture, ring = result.capture, result.ring
     size = capture.shots[index[0]].size
     scale = scale_of(result, size)
@@ -209,12 +209,12 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
 def panels_of(
     result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
-    """`panel_of` of several photographs."""
+    """Make the panels of several photographs, each by `panel_of`."""
     return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
 def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
-    """The panel of photograph `k`, and its mean squared error in sRGB over the `comparable` pixels."""
+    """Make the panel of photograph `k`; also returns its mean squared error in sRGB over the `comparable` pixels."""
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
@@ -255,7 +255,7 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
 
 
 def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
-    """The shift (right, down) of `photo` (H, W, 3) relative to `guess` within `inside` (H, W) [px]; None if black."""
+    """Find the shift (right, down) [px] of `photo` (H, W, 3) from `guess` within `inside` (H, W); None if black."""
     if not (photo.any() and guess.any() and inside.any()):
         return None
     rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]
@@ -267,7 +267,7 @@ def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[flo
 
 
 def data_uri(picture: np.ndarray) -> str:
-    """A picture (H, W) or (H, W, 3) in [0, 1] as the data URI of a small WebP."""
+    """Encode a picture (H, W) or (H, W, 3) in [0, 1] as the data URI of a small WebP."""
     image = Image.fromarray(to_bytes(picture))
     image.thumbnail((PICTURE, PICTURE))
     content = encoded_picture(image, "WEBP", quality=85, method=1)  # method 1: faster, hardly larger
@@ -275,7 +275,7 @@ def data_uri(picture: np.ndarray) -> str:
 
 
 def loss_curve(result: FitResult) -> str:
-    """The loss and its weighted terms over the iterations as an SVG data URI."""
+    """Draw the loss and its weighted terms over the iterations as an SVG data URI."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()
     for term in ("loss", *result.terms):

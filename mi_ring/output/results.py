@@ -54,7 +54,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """As `prepare_folder`, but the scene file may be in the folder."""
+    """Make the results folder like `prepare_folder`, but the scene file may be in it."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -92,7 +92,7 @@ def save(folder: Path, result: FitResult) -> None:
 
 
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
-    """scene.xml of a fit of these photographs. Raises InputError for a scene that cannot be rewritten."""
+    """Make scene.xml of a fit of these photographs. Raises InputError for a scene that cannot be rewritten."""
     return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
 
 
@@ -109,7 +109,7 @@ def add_to_log(folder: Path, entry: dict) -> None:
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The entries of log.jsonl, without a last line that a kill or a full disk cut off."""
+    """Read the entries of log.jsonl, without a last line that a kill or a full disk cut off."""
     entries = []
     for line in (folder / "log.jsonl").read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):
@@ -118,7 +118,7 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
-    """inputs.png: photographs with the start surface in green. It shows wrong masks and poses."""
+    """Write inputs.png: photographs with the start surface in green. It shows wrong masks and poses."""
     some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
@@ -138,7 +138,7 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
 
 
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
-    """ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
+    """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
 
     `scene`: its `fitted_scene`, with cameras and lights as before the fit.
     """
@@ -168,9 +168,9 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of these photographs, each named like its photograph with .png added.
+    """Write the masks of photographs `index` as PNG, each named like its photograph with .png added.
 
-    Returns their names, by index, as a scene beside `folder` has them.
+    Returns the masks' names, by index, as a scene beside `folder` has them.
     """
     names = {}
     for k in index:
@@ -185,7 +185,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
 
 
 def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
-    """The object as GLB for the viewer in the report. If that fails, prints why and returns None."""
+    """Make the GLB for the viewer in the report. If that fails, prints why and returns None."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)

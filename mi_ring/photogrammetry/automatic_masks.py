@@ -32,7 +32,7 @@ MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
 class RefinementSettings(NamedTuple):
-    """Settings of `refine_masks`."""
+    """How `refine_masks` works: agreement that the vote needs, width of GrabCut's band, number of rounds."""
 
     agreement: float  #: share of the masks that must contain a voxel
     band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
@@ -47,7 +47,7 @@ OUTLINES = RefinementSettings(0.96, 0.04, 2)
 
 @dataclass
 class VoxelObject:
-    """The voxels of the object."""
+    """The object as a set of voxels in a grid."""
 
     corner: np.ndarray  #: (3,) centre of the first voxel
     spacing: float
@@ -55,11 +55,11 @@ class VoxelObject:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(N, 3) centres of the object's voxels."""
+        """Centres (N, 3) of the object's voxels."""
         return self.corner + self.spacing * np.argwhere(self.voxels)
 
     def silhouette(self, view: ReducedView) -> np.ndarray:
-        """(H, W) uint8: 1 where a view shows the object."""
+        """Project the voxels to a view: (H, W) uint8, 1 where the view shows the object."""
         row, column, inside = view.project(self.points)
         mask = np.zeros(view.valid.shape, np.uint8)
         mask[row[inside], column[inside]] = 1
@@ -88,7 +88,7 @@ class VoxelGrid:
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """A grid around the point that the cameras look at. It fills the median photograph."""
+        """Make a grid around the point that the cameras look at. It fills the median photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -97,12 +97,12 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
-        """A grid around an object, a little larger than the object."""
+        """Make a grid around an object, a little larger than the object."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """The largest connected piece of the voxels that most masks contain; None if it is too small.
+        """Find the largest connected piece of the voxels that most masks contain; None if it is too small.
 
         `agreement`: share of the masks that must contain a voxel. `voters`: which masks vote; None: all.
         """
@@ -124,18 +124,18 @@ class VoxelGrid:
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
-    """A mask (H, W) uint8 of zeros for each view."""
+    """Make a mask (H, W) uint8 of zeros for each view."""
     return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
 
 def bright_mask(view: ReducedView) -> np.ndarray:
-    """(H, W) uint8: 1 where log radiance is above Otsu's threshold: what is near the flash."""
+    """Mask what is near the flash: (H, W) uint8, 1 where log radiance is above Otsu's threshold."""
     log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Whether each mask is complete: it misses about as little of the common silhouette (H, W) as the other masks."""
+    """Test whether each mask is complete: it misses about as little of its common silhouette as the other masks."""
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
         for view, mask, silhouette in zip(views, masks, silhouettes)
@@ -144,7 +144,7 @@ def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
 
 
 class Segmentation(NamedTuple):
-    """The object and its masks in all views."""
+    """The result of `refine_masks`: the object, and its mask in each view."""
 
     masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
     object: VoxelObject
@@ -154,7 +154,10 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Refine guessed masks by the vote and GrabCut in turn; None if the guesses disagree. `backgrounds` stay out."""
+    """Refine guessed masks by the vote and GrabCut in turn; None if the guesses disagree.
+
+    `guesses`, `backgrounds` (H, W): of each view, above 0 on the guessed object, and where the object surely is not.
+    """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
         return grabcut(view.rgb, silhouette, ~view.valid | (background > 0), settings.band)
@@ -176,18 +179,18 @@ def refine_masks(
 
 
 def resize_mask(mask: np.ndarray, view: ReducedView) -> np.ndarray:
-    """A mask (h, w) resized to the view: (H, W) bool."""
+    """Resize a mask (h, w) to the view: (H, W) bool."""
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) -> np.ndarray:
-    """(H, W) uint8: 1 where a mask differs from the common silhouette by more than `tolerance` [px]; often a shadow."""
+    """Mark where a mask differs from the silhouette by over `tolerance` [px]: (H, W) uint8; often a shadow."""
     wide, narrow = cv2.dilate(silhouette, disk(tolerance)), cv2.erode(silhouette, disk(tolerance))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 on pieces of the guess beside the mask that touch it, such as a rod that holds the object."""
+    """Mark pieces of the guess that touch the mask from outside, such as a rod that holds the object: (H, W) uint8."""
     labels, _ = pieces((guess > 0) & (mask == 0))
     touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])
     return np.isin(labels, touching[touching > 0]).astype(np.uint8)

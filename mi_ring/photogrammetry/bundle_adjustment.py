@@ -22,7 +22,7 @@ ITERATIONS = 10  #: of the solver per call; a call of pycolmap cannot be interru
 
 
 def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
-    """The model after bundle adjustment. The sheet's corners are used unless they contradict the features."""
+    """Adjust cameras and points of a model. The sheet's corners are used unless they contradict the features."""
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
@@ -66,7 +66,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
-    """Options and configuration of a bundle adjustment of all images of a model, with a robust loss."""
+    """Make options and configuration of a bundle adjustment of all images of a model, with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -88,7 +88,7 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """The model with refined principal points. A lens whose principal point is not well determined keeps its own."""
+    """Refine the principal points of a model. A lens whose principal point is not well determined keeps its own."""
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -117,7 +117,7 @@ def is_determined(camera: Any, covariance: Any) -> bool:
 
 
 def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
-    """The images with a pose, each with its photograph and the factor by which the photograph is larger."""
+    """List the images with a pose: each with its photograph, and the factor by which the photograph is larger."""
     by_file = {grey_file(picture): picture for picture in pictures}
     for image in [model.images[k] for k in model.reg_image_ids()]:
         camera, picture = model.cameras[image.camera_id], by_file[image.name]
@@ -125,7 +125,7 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """Lens and camera-to-world pose (4, 4) of each photograph with a pose, by its name."""
+    """The lens and the camera-to-world pose (4, 4) of each photograph with a pose, by the photograph's name."""
     cameras = {}
     for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params

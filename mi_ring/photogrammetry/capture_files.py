@@ -30,7 +30,7 @@ OBJECT, UNKNOWN = 255, 128  #: values of masks; the background is 0
 
 @dataclass(frozen=True)
 class PosedPicture:
-    """A photograph with its calibration."""
+    """A photograph with its camera, light and masks."""
 
     picture: Picture
     lens: Lens
@@ -43,7 +43,7 @@ class PosedPicture:
 
 
 def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
-    """The window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
+    """Choose the window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
 
     Photographs of one size get windows of one size, so that they are rendered together. Without any mask the window is
     the whole photograph.
@@ -115,7 +115,7 @@ def write_table(
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
-    """(2, 2) lowest and highest column and row of the object [px of the photograph]; None if the mask is empty."""
+    """The lowest and highest column and row of the object, (2, 2) [px of the photograph]; None if the mask is empty."""
     rows, columns = np.nonzero(mask == OBJECT)
     if not len(rows):
         return None
@@ -128,7 +128,7 @@ def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """A window of a mask, enlarged to the photograph's `size` (width, height): (H, W) of `OBJECT`, `UNKNOWN` and 0."""
+    """Crop a mask, enlarged to the photograph's `size` (width, height), to a window: `OBJECT`, `UNKNOWN` or 0."""
     scale, (left, top, width, height) = reduction(mask, size), window[:4]
     to_mask = np.array([[1, 0, left + (1 - scale) / 2], [0, 1, top + (1 - scale) / 2]]) / scale
     is_object, is_unknown = (

@@ -59,7 +59,7 @@ class FlashCalibration(NamedTuple):
 
     @property
     def ambient(self) -> np.ndarray:
-        """(3,) radiance of the room at the median exposure, if it is uniform."""
+        """Radiance (3,) of the room at the median exposure, if it is uniform."""
         return self.room / np.pi * self.power
 
 
@@ -85,7 +85,7 @@ class Observations(NamedTuple):
 
 
 class FlashParameters(NamedTuple):
-    """The unknowns that all photographs share; see `FlashCalibration`."""
+    """The unknowns of a flash calibration that all photographs share; see `FlashCalibration`."""
 
     offset: np.ndarray
     falloff: float
@@ -95,7 +95,7 @@ class FlashParameters(NamedTuple):
     power: np.ndarray  #: logarithms
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
-        """(n, 3) log intensities of the flash, each from one sample."""
+        """Log intensities (n, 3) of the flash, one computed from each sample of `seen`."""
         to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
         light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
         if sphere:
@@ -148,10 +148,9 @@ def fit_parameters(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], offset: np.ndarray,
     sphere: ObjectSphere | None, curved: bool,
 ) -> FlashParameters:  # fmt: skip
-    """Fit the unknowns that all photographs share to at most `MAX_PHOTOGRAPHS` photographs.
+    """Fit the shared unknowns to at most `MAX_PHOTOGRAPHS` photographs. Arguments: see `calibrate_flash`.
 
-    `prior`: log exposures (count,) of the photographs, and their standard deviations (count,). For the others see
-    `calibrate_flash`.
+    `prior`: log exposures (count,) of the photographs, and their standard deviations (count,).
     """
     some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
@@ -174,7 +173,7 @@ def fit_parameters(
         return np.concatenate([error.ravel(), own, x[: len(units)]])
 
     def loss(z: np.ndarray) -> np.ndarray:
-        """Loss of squared residuals, and its first two derivatives: `soft_l1` for brightness, squares for priors."""
+        """Loss of squared residuals `z`, and two derivatives: `soft_l1` for brightness, squares for priors."""
         brightness = np.arange(len(z)) < seen.colours.size
         root = np.sqrt(1 + z)
         return np.where(brightness, [2 * (root - 1), 1 / root, -0.5 / root**3], [z, 1 + 0 * z, 0 * z])
@@ -191,7 +190,7 @@ def fit_intensities(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], parameters: FlashParameters,
     sphere: ObjectSphere | None,
 ) -> np.ndarray:  # fmt: skip
-    """(count, 3) robust log intensities of the flash in each photograph. `prior`: see `fit_parameters`."""
+    """Fit robust log intensities (count, 3) of the flash in each photograph. `prior`: see `fit_parameters`."""
     result = []
     for seen, exposure, deviation in zip(observations, *prior):
         single, expected = parameters.intensities(seen, sphere), exposure + parameters.power

@@ -44,11 +44,11 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """(H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read."""
+        """Upright pixels (H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read."""
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
-        """`pixels` before they are turned."""
+        """The pixels as the file stores them, before they are turned upright."""
 
         def develop(raw: Any) -> np.ndarray:
             require_plausible_size(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
@@ -63,7 +63,7 @@ class Picture:
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """`read(file)` of the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
+        """Call `read` on the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
         raw = self.suffix in RAW
         with (
             reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
@@ -83,17 +83,17 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """The EXIF orientation by which stored pixels are turned: 1 for HEIF, whose reader has turned them."""
+        """The EXIF orientation by which `stored` is turned: 1 for HEIF, whose reader has turned the pixels already."""
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property
     def axes(self) -> np.ndarray:
-        """(3, 3) from the sensor's axes (x right, y down, z forward) to those of `pixels`."""
+        """Rotation (3, 3) from the sensor's axes (x right, y down, z forward) to those of `pixels`."""
         return orientation_axes(self.camera_orientation if self.upright or self.suffix in HEIF else 1)
 
     @cached_property
     def exif(self) -> Image.Exif:
-        """EXIF data; empty if there is none or it cannot be read."""
+        """The EXIF data; empty if there is none or it cannot be read."""
         try:
             with open_image(self.path) as image:
                 exif = image.getexif()
@@ -108,18 +108,18 @@ class Picture:
 
     @cached_property
     def exposure(self) -> float:
-        """Exposure time · ISO / aperture² by EXIF; NaN if unknown."""
+        """The exposure by EXIF: time · ISO / aperture²; NaN if unknown."""
         exposure = exposure_of(self.exif.get_ifd(ExifTags.IFD.Exif)) or 0.0
         return exposure if exposure > 0 else np.nan
 
     @property
     def encoding(self) -> Encoding:
-        """`linear` or `srgb`: the encoding of `pixels`."""
+        """The encoding of `pixels`: `linear` or `srgb`."""
         return "linear" if self.suffix in RAW else "srgb"
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """(width, height) of `pixels` [px]."""
+        """Width and height of `pixels` [px]."""
         if self.suffix in RAW:
             size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight))
         else:
@@ -127,14 +127,14 @@ class Picture:
         return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
-        """(h, w) uint8: reduced by block means to at most `longest` pixels along the longer side, for features."""
+        """Grey pixels (h, w) uint8 for features: block means, at most `longest` pixels along the longer side."""
         rgb = self.srgb()
         scale = -(-max(rgb.shape[:2]) // longest)
         height, width = (n // scale * scale for n in rgb.shape[:2])
         return np.array(Image.fromarray(rgb[:height, :width]).convert("L").reduce(scale))
 
     def srgb(self) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB."""
+        """The photograph as sRGB, (H, W, 3) uint8."""
         rgb = self.pixels[:, :, :3]
         if rgb.dtype == np.uint8:
             return rgb
@@ -148,7 +148,7 @@ class Picture:
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def linear(self) -> np.ndarray:
-        """(H, W, 3) float32 linear radiance, 1.0 = full scale."""
+        """The photograph as linear radiance, (H, W, 3) float32, 1.0 = full scale."""
         rgb = self.pixels[:, :, :3]
         value = np.arange(np.iinfo(rgb.dtype).max + 1, dtype=np.float32) / np.iinfo(rgb.dtype).max
         return (value if self.encoding == "linear" else srgb_to_linear(value))[rgb]
@@ -192,19 +192,19 @@ def rembg() -> Callable[[Image.Image], Image.Image]:
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """(3, 3) from the axes (x right, y down, z forward) of stored pixels to those after a turn by an orientation."""
+    """Rotation (3, 3) from the axes (x right, y down, z forward) of stored pixels to those of pixels turned upright."""
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels (H, W, …) turned by an EXIF orientation."""
+    """Turn pixels (H, W, …) by an EXIF orientation."""
     column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
     return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """A vector that is fixed to the camera, in the axes of each photograph's pixels; by the photograph's name.
+    """Give a vector that is fixed to the camera in the axes of each photograph's pixels, by the photograph's name.
 
     `vector`: (3,), or (3, n) for n vectors, in the axes of upright photographs with the most frequent orientation.
     """
@@ -251,31 +251,31 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """The first focal length for film 36 mm wide in EXIF data [mm]; None if no photograph has one."""
+    """The first focal length [mm] in EXIF data, for film 36 mm wide; None if no photograph has one."""
     values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
     return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """File names of the photographs without an exposure in EXIF data; empty if no photograph has one."""
+    """Name the files of photographs without an exposure in EXIF data; empty if no photograph has one."""
     missing = [picture.path.name for picture in pictures if np.isnan(picture.exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """(N,) exposures by EXIF, relative to their median; the value `unknown` where EXIF has none."""
+    """Exposures (N,) by EXIF, relative to their median; the value `unknown` where EXIF has none."""
     exposures = np.array([picture.exposure for picture in pictures])
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 
 
 def without_flash(pictures: Sequence[Picture]) -> list[str]:
-    """File names of the photographs whose flash did not fire, by EXIF; empty unless it fired in most photographs."""
+    """Name the files of photographs whose flash did not fire, by EXIF; empty unless it fired in most photographs."""
     fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
 def camera_names(pictures: Sequence[Picture]) -> dict[str, int]:
-    """The number of photographs by each camera model in EXIF data."""
+    """Count the photographs of each camera model in EXIF data."""
     return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

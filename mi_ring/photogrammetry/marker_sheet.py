@@ -40,7 +40,7 @@ Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
 
 
 class SheetDetection(NamedTuple):
-    """The sheet's corners in a photograph. Frame: origin in the sheet's middle, x right, y up, z out of the paper."""
+    """The sheet's corners in one photograph. Sheet frame: origin in its middle, x right, y up, z out of the paper."""
 
     ids: np.ndarray  #: (n,) int, row by row from the top left
     points: np.ndarray  #: (n, 3) [mm], z = 0
@@ -52,7 +52,7 @@ Cameras = Mapping[str, tuple[Lens, Pose]]  #: by the photograph's name
 
 
 class Similarity(NamedTuple):
-    """x ↦ scale · rotation x + shift, from the cameras' frame to the sheet's [mm], and its quality."""
+    """The map x ↦ scale · rotation x + shift from the cameras' frame to the sheet's [mm], and its quality."""
 
     scale: float
     rotation: np.ndarray  #: (3, 3)
@@ -68,7 +68,7 @@ def charuco() -> cv2.aruco.CharucoBoard:
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """The sheet to print, in black and white, with `DOTS` per mm and a line that says what to measure."""
+    """Draw the sheet to print, in black and white, with `DOTS` per mm and a line that says what to measure."""
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
     left, top = ((np.array(sheet.size) - size) // 2).tolist()
@@ -91,7 +91,7 @@ class MarkerSheet:
         self.detector = cv2.aruco.CharucoDetector(charuco(), params)
 
     def detect(self, picture: np.ndarray) -> SheetDetection | None:
-        """The sheet's corners in a photograph (H, W, 3) or (H, W) uint8; None if it shows too few."""
+        """Find the sheet's corners in a photograph (H, W, 3) or (H, W) uint8; None if it shows too few."""
         grey = picture if picture.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
         scale = -(-max(grey.shape) // LONGEST)
         height, width = (side // scale for side in grey.shape)
@@ -116,7 +116,7 @@ class MarkerSheet:
         return SheetDetection(ids, points, pixels)
 
     def pitch(self, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """(n,) shorter sides [px] of the squares at n corners, by their `points` (n, 3) and `pixels` (n, 2)."""
+        """Shorter sides (n,) [px] of the squares at n corners, by their `points` (n, 3) and `pixels` (n, 2)."""
         plane, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 0.05 * np.ptp(pixels, 0).max())
         if plane is None:
             return np.zeros(len(points))
@@ -164,7 +164,7 @@ def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict
 
 
 def align(detections: Detections, cameras: Cameras) -> Similarity:
-    """The similarity from the cameras' frame to the sheet's. Raises InputError if too few corners fit the sheet."""
+    """Find the similarity from the cameras' frame to the sheet's. Raises InputError if too few corners fit."""
     seen = np.array([pair for _, *pair in triangulate(detections, cameras)]).reshape(-1, 2, 3)
     found, true = seen[:, 0], seen[:, 1]
     if len(found) < MIN_CORNERS or are_collinear(true):
@@ -185,7 +185,7 @@ def align(detections: Detections, cameras: Cameras) -> Similarity:
 
 
 def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Triangulate the corners: id, point (3,) in the cameras' frame, and point (3,) on the sheet [mm] of each."""
+    """Triangulate the corners: of each its id, point (3,) in the cameras' frame, and point (3,) on the sheet [mm]."""
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0
     seen: dict[int, list[tuple]] = {}
@@ -212,7 +212,7 @@ class PaperSamples(NamedTuple):
 
 
 def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
-    """Median colours of white squares and of the margin in a photograph (H, W, 3), without those above `CLIPPED`."""
+    """Sample white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`."""
     pixels = dict(zip(detection.ids.tolist(), detection.pixels))
     points = dict(zip(detection.ids.tolist(), detection.points))
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
@@ -241,9 +241,9 @@ def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
 
 
 def sample_colours(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Colours (n, 3) of a photograph (H, W, 3) at points (n, 2), mapped to pixels by the homography `plane` (3, 3).
+    """Sample a photograph (H, W, 3) at points (n, 2) of a plane: colours (n, 3), NaN outside the photograph.
 
-    NaN outside the photograph.
+    `plane` (3, 3): homography that maps points to pixels.
     """
     at = (cv2.perspectiveTransform(points[None], plane) - 0.5).astype(np.float32)
     x, y = np.ascontiguousarray(np.moveaxis(at, -1, 0))  # (1, n): versions of OpenCV differ on one-dimensional maps

@@ -28,7 +28,7 @@ STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey images, and their features to the database. Existing ones are kept."""
+    """Write reduced grey images to `folder`, and their features to the database. Existing files are kept."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -67,7 +67,7 @@ def camera_ids(database: Path) -> dict[str, int]:
 
 
 def pairs_to_match(count: int) -> list[tuple[int, int]]:
-    """The pairs of `count` photographs, sorted by name, that are matched."""
+    """Choose the pairs of `count` photographs, sorted by name, that are matched."""
     pairs = itertools.combinations(range(count), 2)
     if count <= ALL_PAIRS:
         return list(pairs)
@@ -107,7 +107,7 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Both images of each matched pair in COLMAP's database, and the verified matches (n, 2) [px] in each image."""
+    """Read COLMAP's database: the two images of each matched pair, and verified matches (n, 2) [px] in each of them."""
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}

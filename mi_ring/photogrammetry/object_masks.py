@@ -36,7 +36,7 @@ WIDE = 2.0  #: half size of the table's texture from whole photographs [half siz
 
 
 class SegmentedObject(NamedTuple):
-    """The object's masks and place."""
+    """The object as found: its masks, its place, and the table."""
 
     masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
@@ -53,14 +53,14 @@ class SegmentationInput(NamedTuple):
     sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """The source of the masks; for a folder of masks a hash of its files' names, sizes and times."""
+        """Text that changes with the source of masks: for a folder a hash of file names, sizes and times."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """(N,) bool: are points (N, 3) in the box, and higher than `flatness` · `camera_distance` above the table?"""
+        """Which points (N, 3) may be the object: in the box, and `flatness` · `camera_distance` above the table."""
         allowed = np.ones(len(points), bool)
         if self.plane:
             allowed &= self.plane.height(points) > flatness * camera_distance
@@ -75,7 +75,7 @@ def find_object(
 ) -> SegmentedObject:
     """Find the object and its masks. Existing masks in `folder` are used: the user may have edited or removed some.
 
-    Raises InputError if these were found with other cameras or another `known`, or if no object is found.
+    Raises InputError if the existing masks were found with other cameras or another `known`, or if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
@@ -112,7 +112,7 @@ def find_object(
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """`SegmentedObject.masks` from the files in a folder. Raises InputError if there are none or a size is wrong."""
+    """Read `SegmentedObject.masks` from a folder. Raises InputError if there are none or a size is wrong."""
     found = {}
     for picture in pictures:
         file = folder / f"{picture.name}.png"
@@ -132,7 +132,7 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """The object by the user's masks, and the masks. Raises InputError if they are too few or show no common object."""
+    """Read the user's masks and find the object by them. Raises InputError if masks are too few or disagree."""
     masks = {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(known.masks)
@@ -163,7 +163,7 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
 
 
 def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """(H, W) uint8: 1 where a photograph shows the box of `SegmentationInput`; 1 everywhere if it reaches behind it."""
+    """Mask the box of `SegmentationInput` in a photograph: (H, W) uint8; all 1 if it reaches behind the camera."""
     pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
     if depth.min() <= 0:  # a corner is behind the camera
         return np.ones(camera.size[::-1], np.uint8)
@@ -208,7 +208,7 @@ def refine_object(
     views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
     progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
-    """Refine the object `found` so far in views around it. `whole`: the grid with the views of whole photographs."""
+    """Refine the object `found` in new views around it. `whole`: the grid with the views of whole photographs."""
     grid = VoxelGrid.around(views, found)
     grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
     silhouettes, backgrounds = [found.silhouette(view) for view in views], automatic_masks.empty_masks(views)

@@ -27,11 +27,11 @@ class ReducedView(NamedTuple):
 
     @property
     def linear(self) -> np.ndarray:
-        """(H, W, 3) float32 linear radiance."""
+        """The pixels as linear radiance, (H, W, 3) float32."""
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows (N,), columns (N,) of the pixels of points (N, 3), and whether the view shows each point (N,)."""
+        """Project points (N, 3): rows (N,) and columns (N,) of pixels, and whether the view shows each (N,)."""
         projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
         x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -55,7 +55,7 @@ def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation:
 
 
 def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> ReducedView:
-    """A window of a photograph with its camera. `pose` (4, 4): camera-to-world, OpenCV's axes."""
+    """Reduce and undistort a window of a photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
@@ -67,7 +67,7 @@ def read_windows(
     pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], cameras: Mapping[str, tuple[Lens, np.ndarray]],
     progress: Progress,
 ) -> list[list[ReducedView]]:  # fmt: skip
-    """The views of each photograph's windows. `cameras`: lens and pose by the photograph's name."""
+    """Read each photograph and make the views of its windows. `cameras`: lens and pose by the photograph's name."""
 
     def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
         views = [reduce_photograph(picture, *cameras[picture.name], window) for window in wanted]
@@ -83,7 +83,7 @@ def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
-    """The window around a mask (h, w) of the whole photograph. In the window the mask is about `pixels` long."""
+    """Choose the window around a mask (h, w) of the whole photograph, so that the mask is about `pixels` long in it."""
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)
     unit = np.round(size / mask.shape[::-1])

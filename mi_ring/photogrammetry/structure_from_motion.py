@@ -36,7 +36,7 @@ BLURRED = 0.25  #: a photograph with less detail is blurred [detail of those wit
 
 @dataclass
 class SparseModel:
-    """Cameras of the photographs by name, and sparse points [any unit]."""
+    """Cameras of the photographs by name, and sparse points of the scene [any unit]."""
 
     cameras: dict[str, tuple[Lens, np.ndarray]]  #: lens and camera-to-world pose (4, 4), OpenCV's axes
     points: np.ndarray  #: (N, 3)
@@ -45,17 +45,17 @@ class SparseModel:
     source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """A hash of the cameras."""
+        """A hash of the cameras, by which a change is noticed."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
 
     def distance(self, point: np.ndarray) -> float:
-        """Median distance from the cameras to a point (3,)."""
+        """The median distance from the cameras to a point (3,)."""
         return float(np.median([np.linalg.norm(pose[:3, 3] - point) for _, pose in self.cameras.values()]))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
-        """The model after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """Move cameras and points to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
         cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
@@ -63,7 +63,7 @@ class SparseModel:
 def structure_from_motion(
     pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """The cameras of photographs, one lens per size. Raises InputError if fewer than half of them get a camera."""
+    """Find cameras by features of photographs, one lens per size. Raises InputError if fewer than half get one."""
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
     if sparse.is_dir():
@@ -88,11 +88,12 @@ def structure_from_motion(
 
 
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
-    """The better of two models: the one whose cameras explain more matches; None if there is none.
+    """Reconstruct the cameras of `count` photographs in two ways. Returns the better model, or None if there is none.
 
-    Global mapping ("Global Structure-from-Motion Revisited", Pan et al. 2024) uses all matches from the start.
-    Incremental mapping tolerates more wrong matches (repeated patterns, moving shadows), but may mirror a camera that
-    sees few points in one plane. Disconnected parts of both are removed.
+    The better model is the one whose cameras explain more matches. Global mapping ("Global Structure-from-Motion
+    Revisited", Pan et al. 2024) uses all matches from the start. Incremental mapping tolerates more wrong matches
+    (repeated patterns, moving shadows), but may mirror a camera that sees few points in one plane. Disconnected parts
+    of both models are removed.
     """
     paths = database, _, output = folder / "database.db", folder / "grey", folder / "models"
     output.mkdir(exist_ok=True)
@@ -118,7 +119,7 @@ def deregister(model: Any, images: Iterable[int]) -> None:
 
 
 def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
-    """Models by global mapping, by their numbers. `paths`: database, images, output."""
+    """Make models by global mapping, by number. `paths`: database, images, output."""
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
@@ -128,7 +129,7 @@ def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
 
 
 def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
-    """Models of `count` photographs by incremental mapping, by their numbers. `paths`: database, images, output."""
+    """Make models of `count` photographs by incremental mapping, by number. `paths`: database, images, output."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
@@ -141,7 +142,7 @@ def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> 
 
 
 class ImagePair(NamedTuple):
-    """Two images of a model, their number of matches, and how many of these their poses explain."""
+    """Two images of a model, the number of their matches, and how many matches their poses explain."""
 
     first: int
     second: int
@@ -150,7 +151,7 @@ class ImagePair(NamedTuple):
 
 
 def check_pairs(model: Any, database: Path) -> list[ImagePair]:
-    """All matched pairs of images that have a pose in the model."""
+    """Count matches and explained matches of all pairs of images that have a pose in the model."""
     images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
     pairs = []
     for one, other, first, second in read_matches(database):
@@ -162,10 +163,10 @@ def check_pairs(model: Any, database: Path) -> list[ImagePair]:
 
 
 def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> list[int]:
-    """The images outside the largest connected part. A pair that explains most of its matches connects two images.
+    """Find the images outside the largest connected part. A pair that explains most of its matches connects two images.
 
     The poses of such parts are random relative to the largest. Parts of one or two images are kept: the vote on masks
-    tolerates them.
+    tolerates wrong poses of so few.
     """
     index = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= PAIR_MATCHES and p.explained > PAIR_EXPLAINED * p.matches]
@@ -185,7 +186,7 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
-    """The model with cameras and errors [px] of the photographs at full size."""
+    """Convert a model: cameras and errors [px] are then those of the photographs at full size."""
     cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
     return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
@@ -197,7 +198,7 @@ def model_points(model: Any) -> np.ndarray:
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """The reasons why photographs that are not `placed` have no camera, by name."""
+    """Say why photographs that are not `placed` have no camera, by their names."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
     detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
@@ -213,13 +214,13 @@ def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: 
 
 
 def sharpness(file: Path) -> float:
-    """Sharpness of an image: the variance of its Laplacian, after a blur against noise."""
+    """Measure the sharpness of an image: the variance of its Laplacian, after a blur against noise."""
     grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
-    """The reason why only `count` photographs have a camera, and what to do."""
+    """Say why only `count` photographs have a camera, and what to do."""
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])

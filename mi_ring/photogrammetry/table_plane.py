@@ -37,7 +37,7 @@ NEAR, INSIDE, CONFUSED, SPECK = 0.3, 0.1, 0.03, 0.015
 
 
 class Plane(NamedTuple):
-    """The points x with normal · x = offset. The normal, of length 1, points to the cameras' side."""
+    """The table's plane: points x with normal · x = offset. The normal, of length 1, points to the cameras' side."""
 
     normal: np.ndarray  #: (3,)
     offset: float
@@ -47,15 +47,12 @@ class Plane(NamedTuple):
         return points @ self.normal - self.offset
 
     def axes(self) -> np.ndarray:
-        """(3, 3) rows: two directions in the plane, and the normal."""
+        """Rows (3, 3): two directions in the plane, and the normal."""
         return align_vectors(self.normal, [0, 0, 1])[:3, :3]
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """The plane with most points (N, 3) around `center` (3,), by RANSAC; None if there is none.
-
-    Other points and the cameras (K, 3) must be above it.
-    """
+    """Find the plane with most points (N, 3) around `center`, by RANSAC, below all cameras (K, 3); None without one."""
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
         return None
@@ -98,14 +95,14 @@ class TexelGrid:
 
     @property
     def to_world(self) -> np.ndarray:
-        """(4, 4) from Mitsuba's rectangle (x and y from -1 to 1, normal z) to the world. The first row is at y = -1."""
+        """The matrix (4, 4) from Mitsuba's rectangle (x, y from -1 to 1, normal z) to the world. First row: y = -1."""
         middle = self.from_texel @ np.array([(self.texels - 1) / 2, (self.texels - 1) / 2, 1])
         across = self.from_texel[:, :2] * self.texels / 2
         normal = np.cross(across[:3, 0], across[:3, 1]) / np.linalg.norm(across[:, 0])
         return np.column_stack([across, [*normal, 0], middle])
 
     def render(self, view: ReducedView, texels: np.ndarray) -> np.ndarray:
-        """Values (texels², …) of the texels in a view: (H, W, …). Outside: NaN for float32, 0 for uint8."""
+        """Render values (texels², …) of the texels in a view: (H, W, …). Outside: NaN for float32, 0 for uint8."""
         width, height = view.camera.size
         pixel_centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         from_pixel = np.linalg.inv(view.camera.projection @ self.from_texel) @ pixel_centre
@@ -122,7 +119,7 @@ class TexelGrid:
 def estimate_albedo(
     views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
 ) -> np.ndarray | None:
-    """Diffuse albedo (texels, texels, 3) of the table, the median over views; None if no view shows the table.
+    """Estimate the table's diffuse albedo (texels, texels, 3), the median over views; None if no view shows the table.
 
     `lights`: one per view. `flash`: cone, room's light and response. `hidden` (H, W): above 0 where the table may be
     hidden. Texels that no view shows get the median of the others. Interreflection is ignored.
@@ -147,7 +144,7 @@ def estimate_albedo(
 class TableAppearance:
     """The table's appearance: one texture, multiplied by a smooth illumination in each view.
 
-    `hidden` (H, W): above 0 where something may hide the table; None: nowhere.
+    `hidden` (H, W) of each view: above 0 where something may hide the table; None: nowhere.
     """
 
     def __init__(self, views: Views, grid: TexelGrid, progress: Progress, hidden: Masks | None = None) -> None:
@@ -169,7 +166,7 @@ class TableAppearance:
         self.texture = np.concatenate([nan_median(self.observe_all(part)) for part in progress(parts, "table")])
 
     def observe(self, number: int, texels: np.ndarray) -> np.ndarray:
-        """Log radiance (N, 3) of texels (N,) in a view, without its illumination; NaN where not shown."""
+        """Log radiance (N, 3) of texels (N,) in view `number`, without its illumination; NaN where not shown."""
         row, column, inside = self.views[number].project(self.grid.points[texels])
         if self.hidden:
             inside &= self.hidden[number][row, column] == 0
@@ -177,11 +174,11 @@ class TableAppearance:
         return np.where(inside[:, None], own, np.float32(np.nan))
 
     def observe_all(self, texels: np.ndarray) -> np.ndarray:
-        """`observe` in all views: (views, N, 3)."""
+        """Log radiance (views, N, 3) of texels (N,) in all views, as `observe` gives it."""
         return np.stack(list(in_threads(partial(self.observe, texels=texels), range(len(self.views)))))
 
     def foreign_masks(self) -> list[np.ndarray]:
-        """(H, W) uint8 of each view: 1 where it differs from the table, because something stands there."""
+        """Mask where each view differs from the table, because something stands there: (H, W) uint8 each."""
         result, everywhere = [], np.arange(len(self.texture))
         for number, view in enumerate(self.progress(self.views, "beside the table")):
             rest = np.abs(self.observe(number, everywhere) - self.texture).max(1)
@@ -192,7 +189,7 @@ class TableAppearance:
         return result
 
     def pattern_masks(self) -> list[np.ndarray]:
-        """(H, W) uint8 of each view: 1 where it certainly shows the table, by the table's pattern."""
+        """Mask where each view certainly shows the table, by the table's pattern: (H, W) uint8 each."""
         known = self.texture.mean(1)
         return [
             match_pattern(LOG_RADIANCE[view.rgb].mean(-1), self.grid.render(view, known))
@@ -200,7 +197,7 @@ class TableAppearance:
         ]
 
     def expected(self, view: ReducedView) -> np.ndarray:
-        """Log radiance (H, W, 3) of a view, or of a window of it, without the object; NaN if unknown."""
+        """Predict log radiance (H, W, 3) of a view, or of a window of it, without the object; NaN if unknown."""
         number = [other.name for other in self.views].index(view.name)
         return self.grid.render(view, self.texture + (self.basis @ self.lighting[number])[:, None])
 
@@ -208,10 +205,10 @@ class TableAppearance:
 def bare_table(
     views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
 ) -> list[np.ndarray] | None:
-    """(H, W) uint8 of each view: 1 where it shows the bare table. None if the object looks like the table.
+    """Mask where each view shows the table alone, (H, W) uint8 each; None if the object looks like the table.
 
-    Darker pixels count as shadows on the table, unless the object then looks like the table. Each pixel is compared
-    with the first of the `tables` that shows it. `silhouettes` (H, W): rough ones of the object.
+    `tables`: appearances; each pixel is compared with the first that shows it. `silhouettes` (H, W): rough outlines of
+    the object in each view. Darker pixels count as shadows on the table, unless the object then looks like the table.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -240,7 +237,8 @@ def bare_table(
 def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Differences (H, W, 3) of log radiances (H, W, 3): in the mean, in red/green and in blue/green; NaN if unknown.
 
-    The pixel is compared with the nearest value of 3 × 3 expected ones, because the texture may be shifted by a pixel.
+    A pixel of `seen` is compared with the nearest value of 3 × 3 `expected` ones: the texture may be shifted by a
+    pixel.
     """
 
     def split(log: np.ndarray) -> np.ndarray:
@@ -260,7 +258,7 @@ def nan_median(stack: np.ndarray) -> np.ndarray:
 
 
 def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Robust least-squares coefficients (6,) of a `basis` (N, 6) for the mean channel of a `difference` (N, 3)."""
+    """Fit robust least-squares coefficients (6,) of a `basis` (N, 6) to the mean channel of a `difference` (N, 3)."""
     mean = difference.mean(1)
     known = np.isfinite(mean)
     if not known.any():
@@ -273,7 +271,7 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: 1 where log radiance `seen` (H, W) correlates with that of the `table` (H, W), NaN if unknown."""
+    """Mark where log radiance `seen` (H, W) correlates with the `table`'s (H, W; NaN if unknown): (H, W) uint8."""
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

@@ -77,10 +77,7 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """Find the sheet, with squares of this side [mm], or None if few photographs show it.
-
-    Raises InputError if a photograph cannot be read.
-    """
+    """Find the sheet, whose squares are `square` mm wide; None if few photographs show it. Raises InputError."""
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
 
@@ -112,9 +109,9 @@ def find_sheet(
 
 
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
-    """The cameras of another tool beside the photographs; None without them.
+    """Read cameras of another tool beside the photographs; None if there are none.
 
-    Raises InputError if they are invalid, or if most photographs have none.
+    Raises InputError if the cameras are invalid, or if most photographs have none.
     """
     source = detect(pictures[0].path.parent)
     if source is None:
@@ -154,7 +151,7 @@ def require_parallax(sparse: SparseModel, folder: Path) -> None:
 def find_cameras(
     pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
 ) -> SparseModel:
-    """The cameras of another tool, otherwise by structure from motion, otherwise by the sheet.
+    """Find the cameras: those of another tool, otherwise by structure from motion, otherwise by the sheet.
 
     With a turntable only by the sheet: structure from motion would track the room. Raises InputError if too few
     photographs get a camera.
@@ -176,7 +173,7 @@ def find_cameras(
 
 
 def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
-    """Cameras by the sheet alone, in its frame [mm]. Raises InputError if fewer than half of all get one."""
+    """Find cameras by the sheet alone, in its frame [mm]. Raises InputError if fewer than half of all get one."""
     cameras: dict[str, tuple[Lens, np.ndarray]] = {}
     errors: list[float] = []
     for size in dict.fromkeys(picture.size for picture in pictures):
@@ -219,7 +216,7 @@ def posed_pictures(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     flash: FlashCalibration | None,
 ) -> list[PosedPicture]:  # fmt: skip
-    """The photographs that have a camera, with their calibration.
+    """Join the photographs that have a camera with their calibration.
 
     Without a calibrated `flash`, `offset` (3,) is its position relative to the lens [scene units], and its intensity is
     that of `ASSUMED_ALBEDO`.

@@ -97,7 +97,7 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """(ρᵈ, ρᵞ, r) at surface interactions."""
+        """The parameters (ρᵈ, ρᵞ, r) at surface interactions."""
         diffuse = self.textures["diffuse"].eval(si, active)
         specular = self.textures["specular"].eval_1(si, active)
         return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)

@@ -10,7 +10,7 @@ from mi_ring.rendering.photograph_lights import DISTANT, flash_falloff
 def flash_light(it, sample=(0, 0), active=True):
     """The light of the current photograph at interactions `it`: (DirectionSample3f, radiance · d⁻²).
 
-    Black for the rays of another kind of sensor.
+    It is black while another kind of sensor is rendered.
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
@@ -25,7 +25,7 @@ def flash_light(it, sample=(0, 0), active=True):
 
 
 class InvisibleEmitter(mi.Emitter):
-    """An emitter that lights surfaces, and that rays do not see."""
+    """Base class of emitters that light surfaces, but that rays do not see."""
 
     def __init__(self, props):
         super().__init__(props)

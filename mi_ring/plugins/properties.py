@@ -8,7 +8,7 @@ import numpy as np
 
 
 def beside_scene(name: str) -> Path:
-    """The path of a file that a scene names relative to its own folder; without a scene file, to the working folder."""
+    """The path of a file that a scene names: relative to the scene's folder, or without one to the working folder."""
     return Path(str(mi.file_resolver()[0])) / name
 
 
@@ -16,9 +16,9 @@ LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """A property of a plugin that is a number. Its square is finite, and if it must be positive its inverse, too.
+    """Read a number from a plugin's properties. Its square must be finite, and if `positive` its inverse, too.
 
-    Raises ValueError if it is anything else.
+    Raises ValueError if the property is anything else. `default`: the value if it is missing.
     """
     value = props.get(name, default)
     least = 1 / LARGEST if positive else -LARGEST
@@ -29,10 +29,7 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
 
 
 def vector(props, name: str, kind: str) -> np.ndarray | None:
-    """A property of a plugin that is a <point> or <vector> (`kind`), (3,); None if it is missing.
-
-    Raises ValueError if it is anything else.
-    """
+    """Read a <point> or <vector> (`kind`) from a plugin's properties: (3,), or None. Otherwise raises ValueError."""
     if name not in props:
         return None
     found = np.array(props[name]).ravel()
@@ -42,10 +39,7 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
 
 
 def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
-    """A property of a plugin that is a text of numbers, as many as one of `counts`.
-
-    Raises ValueError if it is anything else.
-    """
+    """Read a text of numbers, as many as one of `counts`, from a plugin's properties. Otherwise raises ValueError."""
     text = str(props.get(name, ""))
     try:
         values = [float(word) for word in text.replace(",", " ").split()]

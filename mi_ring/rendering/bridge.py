@@ -11,23 +11,23 @@ from torch.autograd.function import once_differentiable
 
 
 def to_drjit(tensor: Tensor) -> mi.Float:
-    """A tensor, flattened, as a Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
+    """Convert a tensor to a flat Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
     return mi.Float(tensor.detach().contiguous().ravel())
 
 
 def to_torch(array: mi.Float) -> Tensor:
-    """A Dr.Jit Float as a tensor (n,) of the same memory (DLPack). Neither side may write to it."""
+    """Convert a Dr.Jit Float to a tensor (n,) of the same memory (DLPack). Neither side may write to it."""
     return dr.detach(array).torch()
 
 
 def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
-    """Dr.Jit Floats as tensors like `to_torch`, computed together by one kernel."""
+    """Compute Dr.Jit Floats together, by one kernel, and convert each to a tensor as `to_torch` does."""
     dr.eval(arrays)
     return [to_torch(array) for array in arrays]
 
 
 def differentiable(program: Callable, tensors: Sequence[Tensor], target) -> tuple[Tensor, ...]:
-    """The output of a Dr.Jit program as tensors (n,), differentiable with respect to `tensors`.
+    """Run a Dr.Jit program and return its output as tensors (n,), differentiable with respect to `tensors`.
 
     `program` takes a list of flat Floats, those attached whose tensors require a gradient, and returns a list of
     Floats. It writes its input to `target`, which counts this in `written`.

@@ -10,7 +10,7 @@ MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones a
 
 
 def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
-    """Radiance that leaves surface interactions `si` toward the viewer, attached.
+    """Compute the radiance that leaves surface interactions `si` toward the viewer, attached.
 
     `light(si)`, or None: (DirectionSample3f, radiance · d⁻²) of the photograph's own light. Other emitters take one
     sample each, by `next_2d`. `shadows`: does the own light cast shadows? Other emitters always do.
@@ -40,7 +40,7 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
 
 
 def light_visible(scene, si, ds, active=True):
-    """Is there nothing between the surface at `si` and the light at `ds`?"""
+    """Is there nothing between the surface at `si` and the light at the direction sample `ds`?"""
     n, d = dr.detach(si.n), dr.detach(ds.d)
     origin = dr.detach(si.p) + n * dr.mulsign(ray_offset(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
     to_light = dr.detach(ds.p) - origin
@@ -51,7 +51,10 @@ def light_visible(scene, si, ds, active=True):
 
 
 def next_2d(seed, lanes, stream=None):
-    """A function that returns 2-D samples: each lane has the random stream of its number, or of `stream` (UInt32)."""
+    """Make a function that returns random points in [0, 1)². Each lane has its own random numbers.
+
+    `stream` (UInt32): the number of each lane's random stream; by default the number of the lane.
+    """
     # Hashed as in Mitsuba's samplers: without this, neighbouring streams are correlated.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
     # Of size 1: a larger generator would add the lane's number to the stream.
@@ -60,7 +63,7 @@ def next_2d(seed, lanes, stream=None):
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """[R, G, B, coverage] along rays, each lane lit by the light of its own photograph; 0 where not `active`.
+    """Trace rays: [R, G, B, coverage], each lane lit by the light of its photograph `view`; 0 where not `active`.
 
     The light of the photographs' room is included without occlusion. `render_indirect` has the occlusion.
     """

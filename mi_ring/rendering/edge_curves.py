@@ -13,7 +13,7 @@ OUTLINE_OFFSET, SHADOW_OFFSET = 1e-4, 1e-2
 
 
 def ray_offset(point, distance):
-    """Distance from `point` at which a ray must start in order not to hit the surface that it leaves [scene units].
+    """How far from `point` a ray must start in order not to hit the surface that it leaves [scene units].
 
     It is proportional to the rounding error of the point, which a ray of length `distance` has found.
     """
@@ -22,7 +22,7 @@ def ray_offset(point, distance):
 
 @dataclass
 class EdgeSamples:
-    """Samples of curves in space, any number per photograph."""
+    """Samples of curves in space: outlines, creases and borders of shapes. Photographs may have different numbers."""
 
     view: mi.UInt32  #: the photograph
     lane: mi.UInt32  #: the number of the sample, the same whichever photographs are rendered together
@@ -37,13 +37,13 @@ class EdgeSamples:
 # Curves of such shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in [0, 1) and
 # of the eye e, which is a point for w = 1 and a direction for w = 0.
 def circle(u, v, t):
-    """A unit circle in the plane of `u` and `v`."""
+    """The unit circle in the plane of the unit vectors `u` and `v`: (point, its derivative by `t`), `t` in [0, 1)."""
     s, c = dr.sincos(2 * dr.pi * t)
     return u * c + v * s, 2 * dr.pi * (v * c - u * s)
 
 
 def square_border(e, w, t):
-    """Border of [-1, 1]²."""
+    """The border of the square [-1, 1]² as a curve; arguments and result as for all `CURVES`."""
     side, along = dr.floor(4 * t), 8 * (t - 0.25 * dr.floor(4 * t)) - 1
     x = dr.select(side == 0, along, dr.select(side == 1, 1, dr.select(side == 2, -along, -1)))
     y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
@@ -53,19 +53,19 @@ def square_border(e, w, t):
 
 
 def disk_border(e, w, t):
-    """Border of the unit disk."""
+    """The border of the unit disk as a curve; arguments and result as for all `CURVES`."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p), dp, mi.Point3f(0)
 
 
 def cylinder_border(e, w, t, z):
-    """Border of the cylinder at its end `z`."""
+    """The circle at the end `z` of the unit cylinder as a curve; other arguments and result as for all `CURVES`."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
 
 
 def sphere_outline(e, w, t):
-    """Points of the unit sphere with p · e = w, where its normal is perpendicular to the view."""
+    """The outline of the unit sphere as a curve: points p · e = w, where the normal is perpendicular to the view."""
     e2 = dr.squared_norm(e)
     frame = mi.Frame3f(e * dr.rsqrt(e2))
     p, dp = circle(frame.s, frame.t, t)
@@ -74,7 +74,7 @@ def sphere_outline(e, w, t):
 
 
 def cylinder_outline(e, w, t, side=1.0):
-    """A line on the cylinder x² + y² = 1, 0 < z < 1, where its normal is perpendicular to the view."""
+    """One of two lines of the outline of the cylinder x² + y² = 1, 0 < z < 1, as a curve; `side`, 1 or -1: which."""
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
     p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)
@@ -95,9 +95,9 @@ CURVES = {
 
 
 def outline_of(shape, eye, views, seed, before=0) -> list[EdgeSamples]:
-    """Samples of the outline and border of a shape that is not a mesh, for the eyes of `views` photographs.
+    """Sample the outline and border of a shape that is not a mesh, as the eyes of `views` photographs see it.
 
-    `eye`: see `Edges`; `before`: see `Photographs`.
+    `eye`: see `Edges`; `before`: number of photographs before these, see `Photographs`.
     """
     to_world = mi.traverse(shape)["to_world"]
     curves = []

@@ -33,7 +33,7 @@ def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
 
 
 def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window):
-    """`boundary_terms` of one curve; None if nothing moves it."""
+    """Compute `boundary_terms` for one curve; None if nothing moves the curve."""
     camera = photographs.camera(curve.view)
     where, depth = camera.project(curve.point)
     if not dr.grad_enabled(where):
@@ -69,7 +69,7 @@ def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window)
 
 
 def cast_shadow(scene, curve: EdgeSamples, light, camera) -> EdgeSamples:
-    """The shadow of a curve: where rays from the light that graze the curve hit the scene.
+    """Project a curve away from the light: where rays from the light that graze the curve hit the scene.
 
     Attached to the light, to the curve and to the surface that the shadow falls on. `light` and `camera` are eyes.
     """

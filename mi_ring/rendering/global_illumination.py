@@ -41,9 +41,9 @@ class GlobalIllumination:
     ) -> "GlobalIllumination":  # fmt: skip
         """Render interreflection and `transfer` of some harmonics for the surface as last written, without gradients.
 
-        `photographs`: as they were rendered; `coverage` (N, H, W): of these pictures. The small pictures are at most
-        `width` pixels wide, and have `paths` paths per pixel: this light varies slowly, and a few good pixels are
-        better than many noisy ones. Both are larger by default where there is a table.
+        `photographs`: as they were rendered. `coverage` (N, H, W): of the large pictures. `width`: largest width of the
+        small pictures [px]; `paths`: paths per pixel. This light varies slowly, and a few good pixels are better than
+        many noisy ones. By default `width` and `paths` are larger where there is a table.
 
         Without `indirect`, `transfer` has only room light that the surface reflects once, and `interreflection` must
         not be used.
@@ -62,24 +62,23 @@ class GlobalIllumination:
 
     @property
     def interreflection(self) -> Tensor:
-        """(N, H, W, 3) linear radiance that interreflection adds to the large pictures."""
+        """Linear radiance (N, H, W, 3) that interreflection adds to the large pictures."""
         return self.upsampled(self.radiance)
 
     def room_light(self, room: Tensor) -> Tensor:
-        """(N, H, W, 3) linear radiance that a room, harmonics (BASIS, 3), adds to pictures without one."""
+        """Linear radiance (N, H, W, 3) that a room, harmonics (BASIS, 3), adds to large pictures without room light."""
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """(N, H, W, 3) what to add to pictures with an unoccluded room (BASIS, 3): shadow, which is negative, and
-        interreflection of its light."""
+        """What to add (N, H, W, 3) to pictures with unhidden room light (BASIS, 3): its shadow and interreflection."""
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
 
     def upsampled(self, rgb: Tensor) -> Tensor:
-        """Small pictures (N, h, w, 3) as large ones (N, H, W, 3), with the outlines of the large ones.
+        """Scale small pictures (N, h, w, 3) up to (N, H, W, 3), with the outlines of the large pictures.
 
         Gradients flow through `coverage` alone: the outline feels this light, shape and material do not. The fit
-        corrects them for it as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
+        corrects shape and material for it as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
         """
         images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
         images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)

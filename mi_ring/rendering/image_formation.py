@@ -9,11 +9,11 @@ from mi_ring.rendering.photographs import center_rays, pixel_rays
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
-    """All selected photographs in one launch: [R, G, B, coverage], each a Float of N·H·W pixels, attached.
+    """Render all selected photographs in one launch: [R, G, B, coverage], Floats of N·H·W pixels, attached.
 
-    Box-filtered linear radiance. With `edges`, gradients have the boundary terms of moving edges; without them only
-    those of shading. `pixels`: a range (first, last + 1) of pixels to render, numbered through all photographs; not
-    together with `edges`.
+    Box-filtered linear radiance. `spp`: samples per pixel. `shadows`: do the photographs' own lights cast shadows? With
+    `edges`, gradients have the boundary terms of moving edges; without, only those of shading. `pixels`: a range
+    (first, last + 1) of pixels to render, numbered through all photographs; not together with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
     lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.first_lane(spp, pixels[0] if pixels else 0)
@@ -33,7 +33,7 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
 
 
 def render_maps(scene, photographs, attributes, pixels=None):
-    """Normals and mesh attributes at the centres of pixels, 0 where there is no surface or no such attribute.
+    """Render normals and mesh attributes at the centres of pixels, 0 where there is no surface or no such attribute.
 
     `attributes`: numbers of channels by name. `pixels`: as in `render_photographs`. Returns Floats of N·H·W pixels,
     [nx, ny, nz, first attribute, …]; normals are in world space.

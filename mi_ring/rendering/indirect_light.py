@@ -11,7 +11,7 @@ BOUNCES = 3  #: points of a path after the first surface
 
 
 def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=(), table=None):
-    """Interreflection: [R, G, B, coverage], box-filtered linear radiance, Floats of N·H·W pixels without gradients.
+    """Render interreflection: [R, G, B, coverage], linear radiance, Floats of N·H·W pixels without gradients.
 
     Paths start at the camera and sample BSDFs. At each of the `bounces` points after the first one the direct light is
     added; the own light of each photograph casts shadows there. This is unbiased but for longer paths. `table`: a scene
@@ -20,7 +20,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
     For n `harmonics` of `mi_ring.rendering.spherical_harmonics`, 6 n more Floats follow. The first 3 n are R, G, B of
     the radiance transfer of each harmonic: the radiance in a room whose radiance is the harmonic, with occlusion and
     with paths of at most `bounces` points. The last 3 n are the same without occlusion and interreflection, by
-    `reflected_harmonics`. Both have the same noise-free part; only occlusion and interreflection have noise.
+    `reflected_harmonics`. Both groups have the same noise-free part; only occlusion and interreflection have noise.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
@@ -52,16 +52,15 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
 
 
 def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=()):
-    """Light that arrives at surface interactions `si` from other surfaces, by one path per lane.
+    """Trace one path per lane for the light that arrives at surface interactions `si` from other surfaces.
 
     Returns (radiance, escaped, blocked). Radiance leaves `si` toward the viewer. `escaped` and `blocked` are each a
     throughput and a direction: of paths that leave the scene, and of paths that hit another surface next to `si`. Both
     throughputs are 0 for other paths.
 
-    `known`: BSDFs whose unoccluded room light the caller has from `reflected_harmonics`. Of paths from these,
-    `escaped` leaves out those that leave the scene at once. Those that hit something at once are in `blocked`, for the
-    caller to subtract.
-    `random`: a source of 2-D samples.
+    `random`: a source of 2-D samples. `known`: BSDFs whose unoccluded room light the caller has from
+    `reflected_harmonics`. Of paths from these BSDFs, `escaped` leaves out those that leave the scene at once. Paths
+    that hit something at once are in `blocked`, for the caller to subtract.
     """
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
@@ -94,6 +93,6 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
 
 
 def separate_kernels(values) -> None:
-    """Compute values before what follows, on a GPU: OptiX cannot trace rays through two scenes in one kernel."""
+    """Compute values now, on a GPU: OptiX cannot trace rays through two scenes in one kernel."""
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
         dr.eval(values)

@@ -41,7 +41,7 @@ class MerlTable:
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
 
     def value(self, theta, d):
-        """The BRDF f (3) [1/sr] for half vectors at an angle `theta` from the normal and difference vectors `d`."""
+        """The BRDF f (3) [1/sr] for half vectors at `theta` [rad] from the normal and difference vectors `d`."""
         half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
         difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
         turn = dr.atan2(d.y, d.x) / dr.pi
@@ -72,7 +72,7 @@ class MerlNetwork:
         self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
-        """Like `MerlTable.value`."""
+        """The BRDF, with arguments and result of `MerlTable.value`."""
         theta = dr.minimum(theta, float(FITTED_ANGLES[0]))
         sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
         narrowed = dr.minimum(sin, float(np.sin(FITTED_ANGLES[1])))
@@ -85,7 +85,7 @@ class MerlNetwork:
 
 
 def dense_layer(x: list, weights: list, biases: list) -> list:
-    """x (n) times weights (n, m) plus biases (m). Dr.Jit's own layers need half precision on a GPU."""
+    """Multiply x (n) by weights (n, m) and add biases (m). Dr.Jit's own layers need half precision on a GPU."""
     sums = [mi.Float(bias) for bias in biases]
     for value, row in zip(x, weights):
         sums = [dr.fma(value, weight, sum_) for weight, sum_ in zip(row, sums)]

@@ -25,7 +25,7 @@ class Lights:
 
     @classmethod
     def of(cls, shots: Sequence[Shot]) -> "Lights":
-        """The photographs' own lights. Raises SceneError if one is not finite, or if some are black but not all."""
+        """Collect the photographs' own lights. Raises SceneError if one is not finite, or if only some are black."""
         lights = [shot.own_light for shot in shots]
         finite = np.array([light.kind == "point" for light in lights])
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
@@ -45,16 +45,16 @@ class Lights:
 
     @classmethod
     def attached(cls, emitter) -> "Lights":
-        """One point light or distant light, attached to the parameters of its emitter."""
+        """Make one point light or distant light, attached to the parameters of its emitter."""
         place, finite = position_of(emitter)
         return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Light `k`, one per lane, as an eye of `Edges`."""
+        """Light `k`, one number per lane, as an eye: a point, or a direction toward a distant light; see `Edges`."""
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
-        """(DirectionSample3f, radiance · d⁻²) of light `k`, one per lane, at surface interactions `si`."""
+        """The light `k`, one per lane, at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
         where, finite = self.eye(k)
         strength = dr.gather(mi.Color3f, self.strengths, k)
         ds = dr.zeros(mi.DirectionSample3f)
@@ -73,36 +73,37 @@ class Lights:
         return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
 
     def is_finite(self) -> np.ndarray:
-        """(N,) bool: which are point lights?"""
+        """Which lights are point lights, (N,) bool; the others are distant."""
         return np.array(self.finite)
 
     def positions(self) -> np.ndarray:
-        """(N, 3) positions [scene units], or unit directions toward distant lights."""
+        """Positions (N, 3) [scene units], or unit directions toward distant lights."""
         return np.array(self.places).reshape(-1, 3).astype(float)
 
     def rgb(self) -> np.ndarray:
-        """(N, 3) intensities [W/sr], or irradiances of distant lights [W/m²]."""
+        """Intensities (N, 3) [W/sr], or irradiances of distant lights [W/m²]."""
         return np.array(self.strengths).reshape(-1, 3).astype(float)
 
     def toward(self, point: np.ndarray) -> np.ndarray:
-        """(N, 3) vectors from a point (3,) to the lights [scene units], or unit directions toward distant lights."""
+        """Vectors (N, 3) from a point (3,) to the lights [scene units], or unit directions toward distant lights."""
         places = self.positions()
         return np.where(self.is_finite()[:, None], places - point, places)
 
     def distances(self, point: np.ndarray) -> np.ndarray:
-        """(N,) distances from a point (3,) [scene units], infinite for distant lights."""
+        """Distances (N,) of the lights from a point (3,) [scene units]; infinite for distant lights."""
         return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """(N, 3) irradiance of a surface at a point (3,) that faces the light: intensity / d² of equation 2."""
+        """Irradiance (N, 3) by each light of a surface at a point (3,) that faces it: intensity / d² of equation 2."""
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
 
 
 def flash_falloff(direction, to_world, falloff):
-    """The share of its intensity that a flash has in a direction: a power, `falloff`, of the cosine from its axis.
+    """The share of its intensity that a flash sends in a direction: the cosine from its axis to the power `falloff`.
 
-    `direction` is the unit vector to the flash. The axis is the optical axis of the camera with pose `to_world`.
+    `direction`: unit vector from the surface to the flash. The axis is the optical axis of the camera with pose
+    `to_world`.
     """
     cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
     return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)

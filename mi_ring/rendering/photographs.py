@@ -21,7 +21,7 @@ LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
 class Photographs:
     """Cameras and lights of all photographs of a scene as Dr.Jit buffers, and which photographs to render.
 
-    A `view` is a number among the selected photographs, one per lane.
+    In methods, a `view` is a number among the selected photographs, one per lane.
     """
 
     views: Views  #: buffers of all photographs
@@ -36,9 +36,10 @@ class Photographs:
 
     @classmethod
     def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
-        """All these photographs; `size` is the first one's, `select` chooses those of equal size.
+        """Collect cameras and lights of photographs, which are all selected. `room` (BASIS, 3): light of their room.
 
-        Raises SceneError for lights that cannot be rendered.
+        `size` is that of the first photograph; `select` chooses photographs of equal size. Raises SceneError for lights
+        that cannot be rendered.
         """
         lights = Lights.of(shots)
         views = Views.of(shots, lights.positions(), lights.rgb())
@@ -52,7 +53,7 @@ class Photographs:
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """One photograph, its camera and its light attached to the parameters of its sensor."""
+        """Make one photograph whose camera and light are attached to the parameters of its sensor."""
         m = sensor.to_world.matrix
         light = Lights.attached(sensor.light)
         views = Views(
@@ -63,7 +64,7 @@ class Photographs:
         return replace(cls.of([sensor.shot]), views=views)
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
-        """Photographs `index`, all of `size` (width, height), rendered `scale` times smaller."""
+        """Select photographs `index`, all of `size` (width, height) [px], to be rendered `scale` times smaller."""
         width, height = size
         views = self.views._replace(intrinsics=self.views.intrinsics / dr.opaque(mi.Float, scale))
         return replace(
@@ -71,7 +72,7 @@ class Photographs:
         )
 
     def with_views(self, views: Views) -> "Photographs":
-        """The photographs with other buffers of cameras and lights. No light counts as colocated with its camera."""
+        """Replace the buffers of cameras and lights. No light then counts as colocated with its camera."""
         return replace(self, views=views, colocated=False)
 
     @property
@@ -80,7 +81,7 @@ class Photographs:
         return Lights(self.views.places, self.finite, self.views.strengths)
 
     def in_units(self, unit: float) -> "Photographs":
-        """The same pictures in a world whose unit of length is `unit` scene units."""
+        """Convert to a world whose unit of length is `unit` scene units. The pictures stay the same."""
         if unit == 1:
             return self
         views = self.views
@@ -94,7 +95,7 @@ class Photographs:
         return dr.width(self.index)
 
     def camera(self, view) -> Pinhole:
-        """The camera of photograph `view`."""
+        """The camera of each photograph `view`."""
         k = dr.gather(mi.UInt32, self.index, view)
         rows = [dr.gather(mi.Vector4f, self.views.cameras, 3 * k + row) for row in range(3)]
         f = dr.gather(mi.Vector4f, self.views.intrinsics, k)
@@ -103,15 +104,15 @@ class Photographs:
         return Pinhole(to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion)
 
     def eye(self, view):
-        """The camera of photograph `view` as an eye of `Edges`."""
+        """The camera position of each photograph `view` as an eye; see `Edges`."""
         return mi.Vector3f(self.camera(view).position), mi.Bool(True)
 
     def source(self, view):
-        """The light of photograph `view` as an eye of `Edges`."""
+        """The light of each photograph `view` as an eye; see `Edges`."""
         return self.lights.eye(dr.gather(mi.UInt32, self.index, view))
 
     def light(self, view, si):
-        """(DirectionSample3f, radiance · d⁻²) of the light of photograph `view` at surface interactions `si`."""
+        """The light of each photograph `view` at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
         if self.views.falloff is not None:
@@ -127,17 +128,17 @@ class Photographs:
 
     @property
     def harmonics(self) -> list[int]:
-        """The harmonics of the room that are not 0."""
+        """The numbers of the room's harmonics that are not 0."""
         return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
 
     def lighting(self, view):
-        """`light` of photograph `view` as a function of surface interactions; None if `dark`."""
+        """Make a function of surface interactions that is `light` of photograph `view`; None if `dark`."""
         return None if self.dark else lambda si: self.light(view, si)
 
     def room_radiance(self, scene, view):
-        """Radiance that surface interactions reflect of the room's light without occlusion, attached to the surface.
+        """Make a function of surface interactions: the room's light that they reflect as if nothing hid it, attached.
 
-        As a function of surface interactions; None if there is no room.
+        Returns None if there is no room. `view`: the photograph of each lane, because a room may turn with the camera.
         """
         which = self.harmonics
         if not which:
@@ -151,7 +152,7 @@ class Photographs:
         return radiance
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """(N, 3) irradiance by each light of a surface at a point (3,) that faces it; by the mean room if `dark`."""
+        """Irradiance (N, 3) of a surface at a point (3,) that faces each light; if `dark`, by the mean of the room."""
         own = self.lights.irradiance(point)
         if self.dark and self.room is not None:
             own = own + math.pi * self.room[0] / math.sqrt(4 * math.pi)
@@ -159,7 +160,7 @@ class Photographs:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of the selected photographs: their number, height and width [px]."""
+        """Number, height [px] and width [px] of the selected photographs."""
         return len(self), self.size[1], self.size[0]
 
     @property
@@ -168,26 +169,26 @@ class Photographs:
         return math.prod(self.shape)
 
     def first_lane(self, spp: int, first: int = 0):
-        """The number of the first lane of these photographs, or of their pixel `first`, with `spp` lanes per pixel."""
+        """The number of the first lane of selected photographs, or of their pixel `first`, with `spp` lanes each."""
         return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
 
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
-        """Ranges (first, last + 1) of pixels with at most `LANES` rays, `spp` rays per pixel."""
+        """Split all pixels into ranges (first, last + 1) with at most `LANES` rays, if each pixel has `spp` rays."""
         step = max(1, LANES // spp)
         return ((first, min(first + step, self.pixels)) for first in range(0, self.pixels, step))
 
 
 def pixel_position(photographs: Photographs, pixel):
-    """(photograph, column, row) of a pixel that is numbered through all selected photographs."""
+    """The photograph, column and row of a `pixel` that is numbered through all selected photographs."""
     width, height = photographs.size
     view, pixel = pixel // (width * height), pixel % (width * height)
     return view, mi.Float(pixel % width), mi.Float(pixel // width)
 
 
 def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int, int] | None = None):
-    """`spp` stratified primary rays per pixel: (rays, photograph per lane). A pixel's samples are consecutive lanes.
+    """Make `spp` stratified camera rays per pixel: (rays, photograph per lane). A pixel's rays are consecutive lanes.
 
-    `pixels`: only this range of pixels. A pixel has the same rays in any range.
+    `pixels`: range (first, last + 1) of pixels; by default all. A pixel has the same rays in any range.
     """
     first, last = pixels or (0, photographs.pixels)
     local = dr.arange(mi.UInt32, (last - first) * spp)
@@ -206,7 +207,7 @@ def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int,
 
 
 def center_rays(photographs: Photographs, pixels: tuple[int, int] | None = None):
-    """One ray through the centre of every pixel, or of this range of pixels: (rays, photograph per lane)."""
+    """Make one ray through the centre of each pixel: (rays, photograph per lane). `pixels`: as in `pixel_rays`."""
     first, last = pixels or (0, photographs.pixels)
     pixel = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
     view, column, row = pixel_position(photographs, pixel)

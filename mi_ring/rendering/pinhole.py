@@ -20,11 +20,11 @@ class Pinhole(NamedTuple):
 
     @property
     def position(self):
-        """Point3f [scene units]"""
+        """The centre of projection, Point3f [scene units]."""
         return mi.Point3f(self.to_world[0, 3], self.to_world[1, 3], self.to_world[2, 3])
 
     def ray(self, pixel):
-        """The ray through continuous pixel coordinates, Point2f [px], x right, y down: (origin, unit direction)."""
+        """The ray (origin, unit direction) through continuous pixel coordinates, Point2f [px], x right, y down."""
         x, y = (pixel.x - self.centre.x) / self.focal.x, (pixel.y - self.centre.y) / self.focal.y
         if self.distortion is not None:
             factor = undistortion_factor(self.distortion, x * x + y * y)
@@ -38,12 +38,12 @@ class Pinhole(NamedTuple):
         return self.position, dr.normalize(direction)
 
     def local(self, vector):
-        """A direction of the world in the axes of the camera, by the inverse of the upper left 3 × 3 of `to_world`."""
+        """Convert a direction of the world to the axes of the camera, by the inverse of 3 × 3 numbers of `to_world`."""
         # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
         return dr.rcp(mi.Matrix3f([[self.to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
     def project(self, point):
-        """The inverse of `ray`: (pixel coordinates [px], depth along the optical axis [scene units]) of a point."""
+        """Project a point to (pixel coordinates [px], depth along the optical axis [scene units]); inverse of `ray`."""
         x, y, z = self.local(point - self.position)
         x, y = x / z, y / z
         if self.distortion is not None:
@@ -54,7 +54,7 @@ class Pinhole(NamedTuple):
         return mi.Point2f(self.centre.x - self.focal.x * x, self.centre.y - self.focal.y * y), z
 
     def project_tangent(self, point, tangent):
-        """How far a point moves in the picture [px] for a step `tangent` in the world: the derivative of `project`."""
+        """How far a point moves in the picture [px] if it moves by `tangent` in the world: derivative of `project`."""
         x, y, z = self.local(point - self.position)
         dx, dy, dz = self.local(tangent)
         moved = mi.Vector2f(dx * z - x * dz, dy * z - y * dz) / (z * z)

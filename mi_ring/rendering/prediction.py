@@ -24,12 +24,13 @@ def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
     seed: int = 0, shadows: bool = True, views: Views | None = None, lamps: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Predicted photographs of the surface, each under its own light, differentiable.
+    """Render photographs of the surface as tensors, each under its own light, differentiable.
 
     `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
     `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
-    samples. `views`: other cameras and lights of all P photographs, as tensors. `lamps`: other places and strengths
-    (L, 3) of the scene's L lamps, as `Surface.relight` takes them.
+    samples. `shadows`: do the photographs' own lights cast shadows? `views`: other cameras and lights of all P
+    photographs, as tensors. `lamps`: other places and strengths (L, 3) of the scene's L lamps, as `Surface.relight`
+    takes them.
 
     Returns linear radiance (N, H, W, 3) and coverage (N, H, W) in [0, 1]. Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage. There can be one backward
@@ -58,7 +59,7 @@ def render(
 
 
 def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Tensor:
-    """The gradient (V, 3) of vertices (V, 3), 0 where it is not finite because a triangle (F, 3) has no area.
+    """Set the gradient (V, 3) of vertices (V, 3) to 0 where it is not finite because a triangle (F, 3) has no area.
 
     Mitsuba's vertex normals have gradients there that are not finite. Other entries that are not finite stay.
     """
@@ -75,7 +76,7 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
 
 
 def with_views(photographs: Photographs, views: Views) -> Photographs:
-    """Photographs with other cameras and lights, as tensors, without gradients."""
+    """Give photographs other cameras and lights, which are tensors, without gradients."""
     return photographs.with_views(Views(*map(to_drjit, views)))
 
 
@@ -83,10 +84,11 @@ def draw(
     surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
     indirect: bool = False, paths: int = 32, occlusion: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Like `render`, of the surface as last written, without gradients, in the processor's memory.
+    """Render photographs of the surface as last written, without gradients, in the processor's memory.
 
-    `indirect` adds interreflection by `paths` per pixel of a picture that is at most 128 pixels wide. The light of the
-    photographs' room is always part of the pictures; without `occlusion` as if nothing hid it from the surface.
+    Arguments and result are those of `render`. `indirect` adds interreflection by `paths` per pixel of a picture that
+    is at most 128 pixels wide. The light of the photographs' room is always part of the pictures; without `occlusion`
+    as if nothing hid it from the surface.
 
     This takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and the memory of the pictures
     themselves, however many pixels and samples there are. `indirect` or a room add about 100 MB for each photograph.
@@ -109,9 +111,9 @@ def draw(
 def maps(
     surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
 ) -> dict[str, np.ndarray]:
-    """Normals and BSDF parameters of the surface as last written at the centres of pixels, 0 where there is none.
+    """Render normals and BSDF parameters at the centres of pixels; 0 where there is no surface. See `draw`.
 
-    Returns `normal` (N, H, W, 3) in world space and each of the parameters by its name, (N, H, W, 3) or (N, H, W).
+    Returns `normal` (N, H, W, 3) in world space and each of the `parameters` by its name, (N, H, W, 3) or (N, H, W).
     """
     own, parts = photographs.in_units(surface.unit), []
     attributes = {f"vertex_{p.name}": p.channels for p in parameters}

@@ -22,7 +22,7 @@ FRAMES = {"world": [*range(PER_FRAME)], "camera": [0, *range(PER_FRAME, BASIS)]}
 
 
 def harmonics_up_to(order: int, frames: Iterable[str]) -> list[int]:
-    """The harmonics in these axes up to an order."""
+    """The numbers of the harmonics up to an `order`, in the axes `frames` ("world", "camera")."""
     return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
 
 
@@ -32,7 +32,7 @@ def degree(k: int) -> int:
 
 
 def room_of(scene) -> np.ndarray | None:
-    """The room of a scene, (BASIS, 3): the sum of its `room` emitters; None if there are none."""
+    """Sum the `room` emitters of a scene to a room (BASIS, 3); None if there are none."""
     rooms = [emitter for emitter in scene.emitters() if is_room(emitter)]
     total = np.zeros((BASIS, 3))
     for room in rooms:
@@ -42,7 +42,7 @@ def room_of(scene) -> np.ndarray | None:
 
 
 def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
-    """A scene without its `envmap` and `constant` emitters, and a room (BASIS, 3) of their light.
+    """Take the `envmap` and `constant` emitters out of a scene. Returns the scene and a room (BASIS, 3) of their light.
 
     The same scene and None if there are none.
     """
@@ -54,7 +54,7 @@ def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
 
 
 def harmonics_of(environment) -> np.ndarray:
-    """An emitter that is infinitely far away as a room (BASIS, 3)."""
+    """Convert an emitter that is infinitely far away to a room (BASIS, 3)."""
     directions, angles = envmap_directions(FINE_ROWS)
     toward, si = mi.Vector3f(*directions.T), dr.zeros(mi.SurfaceInteraction3f, len(angles))
     si.wi = -toward
@@ -65,15 +65,16 @@ def harmonics_of(environment) -> np.ndarray:
 
 
 def world_harmonics(directions: np.ndarray, order: int = MAX_ORDER) -> np.ndarray:
-    """The world's harmonics up to an order in unit directions (n, 3), ((order + 1)², n)."""
+    """Evaluate the world's harmonics up to an `order` in unit directions (n, 3): ((order + 1)², n)."""
     values = dr.sh_eval(mi.Vector3f(*directions.T.astype(np.float32)), order)
     return np.stack([np.asarray(value + dr.zeros(mi.Float, len(directions))) for value in values])
 
 
 def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (2 rows², 3) and solid angles (2 rows²,) of the pixels of an environment map of 2 rows columns.
+    """Unit directions and solid angles of the pixels of an environment map with `rows` rows and 2 rows columns.
 
-    In latitude and longitude like Mitsuba's `envmap`: y is up, and -z is in the middle of the left and right borders.
+    Returns (2 rows², 3) and (2 rows²,). In latitude and longitude like Mitsuba's `envmap`: y is up, and -z is in the
+    middle of the left and right borders.
     """
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
     theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
@@ -82,12 +83,12 @@ def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frames_of(scene) -> set[str]:
-    """The axes of the `room` emitters of a scene, "world" or "camera"; the world's if there are none."""
+    """The axes of a scene's `room` emitters, "world" or "camera"; "world" if there are none."""
     return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
 def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
-    """Harmonics `which` in a direction of the world, for a camera with pose `to_world`."""
+    """Evaluate the harmonics `which` in a direction of the world, for a camera with pose `to_world`."""
     order = max(map(degree, which))
     world = dr.sh_eval(direction, order) if min(which) < PER_FRAME else []
     camera = dr.sh_eval(to_camera_axes(direction, to_world), order) if max(which) >= PER_FRAME else []
@@ -95,12 +96,12 @@ def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
 
 
 def to_camera_axes(direction, to_world):
-    """A direction of the world in the axes of a camera with pose `to_world`."""
+    """Convert a direction of the world to the axes of a camera with pose `to_world`."""
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
 
 
 def bsdfs_with_lobes(scene) -> list:
-    """The BSDFs of a scene that have a method `lobes`, each once."""
+    """The BSDFs of a scene that have a method `lobes`; each BSDF once."""
     found = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if hasattr(bsdf, "lobes")}
     return list(found.values())
 
@@ -122,9 +123,10 @@ def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], a
 
 
 def room_envmap(room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS) -> np.ndarray:
-    """A room (BASIS, 3) as an environment map (rows, 2 rows, 3) like Mitsuba's `envmap`, for a camera with this pose.
+    """Convert a room (BASIS, 3) to an environment map (rows, 2 rows, 3) like Mitsuba's `envmap`.
 
-    Radiance may be negative: a sum of few harmonics can be.
+    `to_world`: pose of the camera, with which a part of the room may turn. Radiance may be negative: a sum of few
+    harmonics can be.
     """
     directions, _ = envmap_directions(rows)
     which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))

@@ -50,14 +50,14 @@ class Surface:
         self.written = 0  #: number of times that vertices were written
 
     def set_faces(self, faces: np.ndarray) -> None:
-        """Change the triangles (F, 3); vertices and attributes must be written before the next picture."""
+        """Replace the triangles (F, 3). Vertices and attributes must be written before the next picture."""
         if faces is not self.faces:
             self.faces, self.faces_changed = faces, True
 
     def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
-        """(V, 3) vertices [scene units] and (V, 3) or (V,) attributes by the names of the mesh's parameters.
+        """Name tensors as the mesh's parameters: vertices (V, 3) [scene units] and attributes (V, 3) or (V,).
 
-        The vertices, which come first, are in units of `unit`.
+        The vertices come first in the result, in units of `unit`.
 
         Raises ValueError if the number of vertices is not that of the triangles, or an attribute has another size.
         """
@@ -73,14 +73,14 @@ class Surface:
         return {POSITIONS: vertices / self.unit} | {f"vertex_{name}": value for name, value in attributes.items()}
 
     def write(self, vertices: Tensor, attributes: dict[str, Tensor]) -> None:
-        """Write (V, 3) vertices [scene units] and (V, 3) or (V,) attributes, without gradients.
+        """Write vertices (V, 3) [scene units] and attributes (V, 3) or (V,) to the shape, without gradients.
 
         Raises ValueError like `parameters`.
         """
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
-        """Write `parameters` of the mesh as Dr.Jit Floats, which may be attached.
+        """Write the mesh's `parameters` as Dr.Jit Floats, which may be attached.
 
         Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
         """
@@ -93,10 +93,10 @@ class Surface:
         self.written += 1
 
     def relight(self, places: mi.Float, strengths: mi.Float) -> None:
-        """Change the scene's L lamps: three numbers for each, which may be attached. The given scene stays as it was.
+        """Change the scene's L lamps by Floats with three numbers per lamp. The given scene stays as it was.
 
         `places`: positions [scene units], or unit directions toward distant lamps. `strengths`: intensities [W/sr], or
-        irradiances [W/m²] of distant lamps.
+        irradiances [W/m²] of distant lamps. Both may be attached.
         """
         if not self.owns_lamps:
             self.scene, self.owns_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
@@ -104,13 +104,13 @@ class Surface:
         move_lamps(self.scene, places, strengths)
 
     def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Write a `FittedObject` at domain points (V, 3) with triangles (F, 3), at a `time` of the flow in [0, 1]."""
+        """Write the surface of `ring` at domain points `s` (V, 3) with triangles (F, 3), at a `time` in [0, 1]."""
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))
 
 
 def unit_for(radius: float) -> float:
-    """The unit of length [scene units] that an object of this radius is rendered in: 1, or a power of 2."""
+    """Choose the unit of length [scene units] in which an object of this radius is rendered: 1, or a power of 2."""
     least, largest = RADII_IN_SCENE_UNITS
     return 1.0 if least <= radius <= largest else 2.0 ** round(math.log2(radius))

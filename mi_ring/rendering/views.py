@@ -11,7 +11,7 @@ from mi_ring.scene.shot import Shot
 
 
 class Views(NamedTuple):
-    """Cameras and lights of P photographs: arrays of numpy or torch, or buffers: the same, flat, in Dr.Jit."""
+    """Cameras and lights of P photographs, as arrays of numpy or torch, or as Dr.Jit buffers, which are flat."""
 
     cameras: Any  #: (P, 3, 4) camera-to-world
     intrinsics: Any  #: (P, 4) fx, fy, cx, cy [px]
@@ -22,7 +22,7 @@ class Views(NamedTuple):
 
     @classmethod
     def of(cls, shots: Sequence[Shot], places: np.ndarray, strengths: np.ndarray) -> "Views":
-        """The cameras of these photographs with these lights, as numpy arrays."""
+        """Collect the cameras of photographs, with lights `places` (P, 3) and `strengths` (P, 3), as numpy arrays."""
         cameras = [shot.camera for shot in shots]
         return cls(
             np.stack([camera.to_world[:3] for camera in cameras]),
@@ -31,11 +31,11 @@ class Views(NamedTuple):
         )  # fmt: skip
 
     def to(self, device: Any) -> "Views":
-        """Tensors on another torch device."""
+        """Move the tensors to another torch device."""
         return Views(*(tensor.to(device) for tensor in self))
 
     def buffers(self) -> "Views":
-        """Numpy arrays as buffers."""
+        """Convert numpy arrays to Dr.Jit buffers."""
         buffers = {name: mi.Float(array.astype(np.float32).ravel()) for name, array in self._asdict().items()}
         return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
 

@@ -15,7 +15,10 @@ MAX_EXTENT = 4.0  #: radius of a ball that contains the object during a fit [rad
 
 
 class RenderedObject(Protocol):
-    """The parts of a `FittedObject` that are rendered; this room must not import it. Tensors are torch's."""
+    """What a renderer needs of a fitted object: `FittedObject` has it. Tensors are torch's.
+
+    The package `mi_ring.scene` must not import `mi_ring.objects`, so this protocol stands for that class.
+    """
 
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
     radius: Any  #: its radius, a tensor
@@ -23,11 +26,11 @@ class RenderedObject(Protocol):
     brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
 
     def surface(self, s: Any, time: float = 1.0) -> Any:
-        """Surface points (V, 3) of domain points (V, 3)."""
+        """The surface points (V, 3) that belong to domain points (V, 3), at a `time` of the flow."""
         ...
 
     def __call__(self, s: Any, time: float = 1.0) -> tuple[Any, dict[str, Any]]:
-        """Surface points and the parameters of the BSDF by name."""
+        """Surface points (V, 3), and the parameters of the BSDF by name, at domain points (V, 3)."""
         ...
 
 
@@ -43,28 +46,25 @@ def lamps_of(scene) -> list:
 
 
 def lamp_lights(scene) -> list[Light]:
-    """The lamps of a scene as numbers."""
+    """The lamps of a scene as lights."""
     return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """A scene with these lamps instead of its own."""
+    """Replace the lamps of a scene by these lights. Returns a new scene."""
     before = lamps_of(scene)
     others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
     return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
 
 
 def move_lamps(scene, places, strengths) -> None:
-    """Set the positions or directions, and the strengths, of a scene's lamps: attached Floats with 3 numbers per lamp.
-
-    The lamps must be made by `with_lamps`.
-    """
+    """Set places and strengths of the lamps of a scene from `with_lamps`: attached Floats with 3 numbers per lamp."""
     for k, lamp in enumerate(lamps_of(scene)):
         move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """A scene of these objects. They keep their ids. Meshes are not merged."""
+    """Make a scene of these objects. They keep their ids. Meshes are not merged."""
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
@@ -75,7 +75,7 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
 
 
 def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
-    """A scene with other shapes or other top-level emitters. It shares all other objects with the given scene."""
+    """Make a scene with other shapes or other top-level emitters. It shares all other objects with `scene`."""
     shapes = scene.shapes() if shapes is None else shapes
     emitters = top_level_emitters(scene) if emitters is None else emitters
     return assembled(shapes, emitters, scene.sensors(), scene.integrator())
@@ -84,7 +84,7 @@ def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
 def with_fitted_shape(
     scene: mi.Scene, shape: mi.Mesh, ring: RenderedObject, unit: float = 1.0
 ) -> tuple[mi.Scene, mi.Mesh]:
-    """A scene with a new shape instead of `shape`, with the BSDF and attributes of a `FittedObject`; and the new shape.
+    """Replace `shape` in a scene by a new shape with the BSDF and attributes of `ring`. Returns scene and new shape.
 
     Lengths of the shape are in units of `unit` scene units. It is a ball that contains the object, because Mitsuba
     places distant emitters outside of a scene's bounding sphere when the scene is assembled.
@@ -109,7 +109,7 @@ def with_fitted_shape(
 
 
 def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
-    """A scene without its `table` shapes, and a scene of these; the same scene and None if there are none."""
+    """Split a scene: without its `table` shapes, and of them alone; or the same scene and None if it has none."""
     tables = [shape for shape in scene.shapes() if is_table(shape)]
     if not tables:
         return scene, None
@@ -117,10 +117,10 @@ def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
 
 
 def has_table(scene) -> bool:
-    """Does a scene have a `table`?"""
+    """Does a scene have a `table` shape?"""
     return any(is_table(shape) for shape in scene.shapes())
 
 
 def is_table(shape) -> bool:
-    """Is it a `table`, of any variant of Mitsuba?"""
+    """Is a shape a `table`, of any variant of Mitsuba?"""
     return getattr(shape, "of_tables", False)

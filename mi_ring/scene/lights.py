@@ -10,7 +10,7 @@ LAMP_CLASSES = "PointLight", "DirectionalEmitter"  #: Mitsuba's classes of emitt
 
 
 class Light(NamedTuple):
-    """The light of one photograph, or a lamp, in the world."""
+    """A point light or distant light: that of one photograph, or a lamp, in the world."""
 
     kind: Literal["point", "directional"]
     vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
@@ -18,9 +18,9 @@ class Light(NamedTuple):
 
 
 def position_of(emitter):
-    """Position of an emitter and True, or direction toward a distant emitter and False; attached.
+    """The position of an emitter and True, or the direction toward a distant emitter and False; attached.
 
-    None for other emitters, such as area lights and environment maps.
+    Returns None for other emitters, such as area lights and environment maps.
     """
     params = mi.traverse(emitter)
     match emitter.class_name():
@@ -35,14 +35,14 @@ def position_of(emitter):
 
 
 def light_of(emitter) -> Light:
-    """A point light or directional light as numbers."""
+    """Convert a point light or directional light of Mitsuba to plain values."""
     where, finite = position_of(emitter)
     vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
     return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
 
 
 def emitter_of(light: Light) -> mi.Emitter:
-    """A light as an emitter of Mitsuba."""
+    """Convert a light to an emitter of Mitsuba."""
     vector = light.vector.tolist()
     where = {"position": vector} if light.kind == "point" else {"direction": vector}
     strength = "intensity" if light.kind == "point" else "irradiance"
@@ -50,10 +50,7 @@ def emitter_of(light: Light) -> mi.Emitter:
 
 
 def move_lamp(emitter, place, strength) -> None:
-    """Set the position, or unit direction toward it, and the RGB strength of an emitter made by `emitter_of`.
-
-    Both may be attached.
-    """
+    """Set position, or unit direction toward it, and RGB strength of an emitter from `emitter_of`; may be attached."""
     params = mi.traverse(emitter)
     if emitter.class_name() == "PointLight":
         params["position"], params["intensity.value"] = mi.Point3f(place), strength
@@ -66,7 +63,7 @@ def move_lamp(emitter, place, strength) -> None:
 
 
 def strength_of(emitter):
-    """RGB intensity of a point light, or irradiance of a directional light, attached."""
+    """The RGB intensity of a point light, or irradiance of a directional light; attached."""
     name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
     return mi.Color3f(mi.traverse(emitter)[name])
 
@@ -80,10 +77,10 @@ def shared_emitters(scene, rooms: bool = False) -> list:
 
 
 def is_flash(emitter) -> bool:
-    """Is it a `flash`, of any variant of Mitsuba?"""
+    """Is an emitter a `flash`, of any variant of Mitsuba?"""
     return getattr(emitter, "of_photographs", False)
 
 
 def is_room(emitter) -> bool:
-    """Is it a `room`, of any variant of Mitsuba?"""
+    """Is an emitter a `room`, of any variant of Mitsuba?"""
     return getattr(emitter, "of_rooms", False)

@@ -10,7 +10,7 @@ from mi_ring.errors import SceneError
 
 
 class Members(mi.TraversalCallback):
-    """The named members of an object. `mi.traverse` keeps only numbers.
+    """Collects the named members of an object. `mi.traverse` keeps only numbers.
 
     This is no local class: Python frees those late, with the objects that they have seen, and Dr.Jit compiles every
     BSDF in memory into the kernels of all scenes.

@@ -9,7 +9,7 @@ HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than 
 
 
 def crossing_triangles(vertices, faces) -> np.ndarray:
-    """Which triangles (F,) bool of a mesh cross another triangle: vertices (V, 3), faces (F, 3), no seams.
+    """Find triangles (F,) bool of a mesh that cross another triangle: vertices (V, 3), faces (F, 3), no seams.
 
     Two triangles cross if an edge of one pierces the other, so all edges are traced as rays. An edge does not pierce
     triangles that contain one of its vertices. Triangles that overlap in one plane do not count.

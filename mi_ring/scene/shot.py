@@ -15,7 +15,7 @@ Encoding: TypeAlias = Literal["auto", "srgb", "linear"]
 
 
 class Files(NamedTuple):
-    """The files of a photograph; None where it has none."""
+    """The paths of the files of a photograph; None where it has no such file."""
 
     filename: Path | None = None  #: the photograph
     mask: Path | None = None  #: 0 background, 255 object; equal to `filename` if the alpha channel is the mask
@@ -27,7 +27,7 @@ NO_FILES = Files()
 
 
 class Window(NamedTuple):
-    """The part of a photograph that is looked at, and the size to which it is reduced."""
+    """A rectangle of a photograph, and the size to which it is reduced."""
 
     corner: tuple[int, int]  #: first column and row [px of the photograph]
     extent: tuple[int, int]  #: width and height [px of the photograph]
@@ -36,12 +36,12 @@ class Window(NamedTuple):
 
     @property
     def scale(self) -> np.ndarray:
-        """(2,) pixels of the photograph along a reduced pixel, across and down."""
+        """How many pixels of the photograph make one reduced pixel, (2,): across and down."""
         return np.divide(self.extent, self.size)
 
     @property
     def share(self) -> float:
-        """Share of the photograph in the window."""
+        """Share of the photograph's area in the window."""
         return float(np.prod(self.extent) / np.prod(self.whole))
 
 
@@ -60,14 +60,17 @@ class Response:
     def changed(
         self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
     ) -> "Response":
-        """A response with `gamma`, `contrast` and `gain` multiplied by these values, and `vignetting` added."""
+        """A copy with `gamma`, `contrast` and `gain` multiplied by these values, and `vignetting` added."""
         red, green, blue = np.multiply(self.gain, gain).tolist()
         return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph of a capture. It is immutable; use `dataclasses.replace` for one with changed fields."""
+    """A photograph of a capture: camera, light, response and files, as plain values.
+
+    It is immutable; use `dataclasses.replace` for one with changed fields.
+    """
 
     name: str  #: the sensor's id in the scene file
     camera: Camera
@@ -81,7 +84,7 @@ class Shot:
     window: Window | None = None  #: the part of its files that it shows, with the camera of that part; None: all
 
     def through(self, window: Window) -> "Shot":
-        """The part of the photograph in a window."""
+        """Crop the photograph to a window, and reduce it."""
         camera = self.camera
         camera = camera._replace(focal=camera.focal / window.scale, size=window.size,
                                  centre=(camera.centre - window.corner) / window.scale)  # fmt: skip
@@ -89,7 +92,7 @@ class Shot:
 
     @property
     def whole(self) -> "Shot":
-        """The whole photograph: the inverse of `through`."""
+        """The whole photograph of this part: the inverse of `through`."""
         if self.window is None:
             return self
         camera, scale = self.camera, self.window.scale
@@ -99,14 +102,14 @@ class Shot:
 
     @property
     def frame(self) -> np.ndarray:
-        """(2, 2) the whole photograph's first and last corner in the pixels of this part."""
+        """The whole photograph's first and last corner, (2, 2), in the pixels of this part."""
         if self.window is None:
             return np.array([(0, 0), self.size])
         return (np.array([(0, 0), self.window.whole]) - self.window.corner) / self.window.scale
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) [px]"""
+        """Width and height [px]."""
         return self.camera.size
 
     @property
@@ -116,11 +119,11 @@ class Shot:
 
     @property
     def own_light(self) -> Light:
-        """`light`; if it is None, a point light of intensity 1 at the camera."""
+        """The photograph's `light`. If that is None: a point light of intensity 1 at the camera."""
         return self.light or Light("point", self.camera.position, np.ones(3))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
-        """The photograph after the change of frame x ↦ scale · rotation (3, 3) x + shift (3,) of camera and light."""
+        """Move camera and light to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
         light = self.own_light
         if light.kind == "point":  # scaled so that irradiance does not change
             light = Light("point", scale * rotation @ light.vector + shift, scale**2 * light.rgb)

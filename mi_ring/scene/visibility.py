@@ -15,14 +15,14 @@ SURFACE_OFFSET = 1e-5  #: of rays from the surface, for a mesh of size 1: more t
 
 
 class MaskedCamera(NamedTuple):
-    """The camera of a photograph, and its valid pixels."""
+    """The camera of a photograph together with its valid pixels."""
 
     camera: Camera
     valid: np.ndarray | None  #: (H, W) uint8, 0 where a pixel is not valid; None if all are
 
 
 class Visibility:
-    """Which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one camera sees.
+    """Tells which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one camera sees.
 
     A camera sees a point that faces it, projects to a valid pixel, and is not hidden by the mesh.
     """
@@ -38,7 +38,7 @@ class Visibility:
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
-        """Which vertices are seen, (V,) bool, by their smooth normals."""
+        """Which vertices are seen, (V,) bool; their smooth normals say where they face."""
         return self.of_points(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
 
     def of_points(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
 def visible_points(
     ring: RenderedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
 ) -> tuple[np.ndarray, float]:
-    """Which vertices of a mesh of the domain are seen on the object, (V,) bool, and the share of area that is not seen.
+    """Find the vertices of a mesh of the domain that are seen on the object, (V,) bool, and the unseen share of area.
 
     `s` (V, 3): the vertices in the domain; `faces` (F, 3).
     """

@@ -25,7 +25,7 @@ def load_element(element: ElementTree.Element) -> mi.Object:
 
 
 def load_bsdf(xml: str) -> mi.BSDF:
-    """The BSDF of an XML element given as text. Raises InputError if Mitsuba refuses it."""
+    """Load the <bsdf> in a text of XML. Raises InputError if Mitsuba refuses it."""
     try:
         return load_element(ElementTree.fromstring(xml))
     except (ElementTree.ParseError, RuntimeError) as error:

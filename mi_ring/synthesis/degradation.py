@@ -17,7 +17,7 @@ HALF_LIMIT = 6e4  #: radiance is clipped to this before it is written as half fl
 
 
 def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
-    """Linear values with shot noise of `electrons` at full scale (0: none), and `read` noise [electrons]."""
+    """Add noise to linear values: shot noise of `electrons` at full scale (0: none), and `read` noise [electrons]."""
     full = electrons or 10_000.0  # unit of read noise if there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
     if electrons:
@@ -26,7 +26,7 @@ def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.ran
 
 
 def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
-    """Encoded pixels (H, W, 3): linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
+    """Encode linear pixels (H, W, 3): linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
     if kind == "exr":
         return np.clip(linear, 0, HALF_LIMIT).astype(np.float16)
     if kind == "png16":
@@ -35,7 +35,7 @@ def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
 
 
 def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndarray:
-    """(count, 3) lognormal factors with standard deviation `spread` [%], plus a third of it for each channel."""
+    """Draw lognormal factors (count, 3) with standard deviation `spread` [%], plus a third of it for each channel."""
     return np.exp(random.normal(0, spread / 100, (count, 1)) + random.normal(0, spread / 300, (count, 3)))
 
 
@@ -43,7 +43,7 @@ def miscalibrated(
     shots: Sequence[Shot], center: np.ndarray, random: np.random.Generator, turned: float = 0.0, shifted: float = 0.0,
     scaled: float = 0.0,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Photographs with random errors of cameras and lights. Distances are from the camera to `center` (3,).
+    """Add random errors to cameras and lights. Distances are those from the camera to `center` (3,).
 
     `turned`: standard deviation of a camera's rotation about each axis [deg] and of its translation along each axis [%
     of the distance]; its flash moves with it. `shifted`: translation of all point lights [% of the distance], in one

@@ -34,19 +34,19 @@ PROFILE = np.array([
 
 
 class ColouredMesh(NamedTuple):
-    """A mesh with linear colours."""
+    """A mesh with linear colours of its vertices."""
 
     vertices: np.ndarray  #: (V, 3) [mm]
     faces: np.ndarray  #: (F, 3)
     colours: np.ndarray  #: (V, 3)
 
     def ply(self) -> bytes:
-        """The mesh as a PLY file without colours."""
+        """Write the mesh as a PLY file, without colours."""
         return cast(bytes, trimesh.Trimesh(self.vertices, self.faces, process=False).export(file_type="ply"))
 
 
 def pot(level: int = 6) -> ColouredMesh:
-    """A closed pot: `PROFILE` rotated about y, fluted, flattened and sheared. `level`: subdivisions of the sphere."""
+    """Make a closed pot: `PROFILE` rotated about y, fluted, flattened, sheared. `level`: subdivisions of the sphere."""
     sphere = trimesh.creation.icosphere(subdivisions=level)
     x, y, z = sphere.vertices.T
     t, angle = np.arccos(np.clip(-y, -1, 1)) / np.pi, np.arctan2(z, x)  # position along the profile, and around y
@@ -64,7 +64,7 @@ def pot(level: int = 6) -> ColouredMesh:
 
 
 def cameras() -> list[Camera]:
-    """`VIEWS` cameras evenly around the pot, on a Fibonacci spiral."""
+    """Place `VIEWS` cameras evenly around the pot, on a Fibonacci spiral."""
     result = []
     for k in range(VIEWS):
         y = 1 - 2 * (k + 0.5) / VIEWS

@@ -22,7 +22,7 @@ def lights_of(
     kind: LightKind, cameras: list[Camera], offset: tuple[float, float, float], spread: float,
     random: np.random.Generator, distance: float = 1.0,
 ) -> list[Light]:  # fmt: skip
-    """A light for each camera. The median irradiance of a surface at the origin that faces its light is 1 W/m².
+    """Place a light for each camera. The median irradiance of a surface at the origin that faces its light is 1 W/m².
 
     All point lights have one intensity. `offset`: of a flash from the lens, left, up and forward [distance of the
     camera from the origin]. `spread`: largest angle between a camera and its point or distant light, seen from the
@@ -42,7 +42,7 @@ def lights_of(
 
 
 def further_lamps(count: int, first: Light, random: np.random.Generator) -> list[Light]:
-    """`count` lamps at the `first` one's distance from the origin, in other directions, weaker, of other colours."""
+    """Place `count` lamps as far from the origin as the `first` one, in other directions, weaker, of other colours."""
     distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
     lights = []
     for _ in range(count):
@@ -55,7 +55,7 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
 
 
 def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-    """`position` (3,), rotated about the origin by a random angle up to `spread` [rad] in a random direction."""
+    """Rotate `position` (3,) about the origin by a random angle up to `spread` [rad] in a random direction."""
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -65,7 +65,7 @@ def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Gener
 
 
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Random spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera."""
+    """Draw spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera?"""
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
     room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)

@@ -29,14 +29,14 @@ class Pattern(NamedTuple):
     uv: np.ndarray  #: (V, 2) texture coordinates of the vertices
 
     def blend(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
-        """A BSDF that blends both materials by this texture."""
+        """Blend two BSDFs by this texture: `second` where it is bright."""
         pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
         nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
         return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
 
 
 def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
-    """Pattern on vertices (V, 3). `kind`: "stripes", "checks", or an image file whose bright pixels are used.
+    """Make the pattern on vertices (V, 3). `kind`: "stripes", "checks", or an image file whose bright pixels are used.
 
     `bands`: number of stripes or checks along the axis `up` (0, 1 or 2). Texture coordinates are linear in space, so
     that edges are sharp on coarse meshes. Raises InputError, which names the `field`, if the image cannot be read.
@@ -58,7 +58,7 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """The BSDF for a text in one of the `FORMS`. `coloured`: does the mesh have colours? Raises InputError."""
+    """Make the BSDF for a text in one of the `FORMS`. `coloured`: does the mesh have colours? Raises InputError."""
     file, _, name = text.partition(".npz:")
     path = Path(f"{file}.npz" if name else text)
     found: Any = None
@@ -85,7 +85,7 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
 
 
 def explain(message: str) -> str:
-    """A message of Mitsuba about a plugin or its parameters, rewritten for users of the command."""
+    """Rewrite a message of Mitsuba about a plugin or its parameters for users of the command."""
     if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
     if kind := re.search(r"Plugin \"(.*?)\" not found", message):
@@ -97,7 +97,7 @@ def explain(message: str) -> str:
 
 
 def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
-    """A text like `principled base_color=0.6,0.2,0.1 roughness=0.3` as a dictionary for `mi.load_dict`."""
+    """Parse a text like `principled base_color=0.6,0.2,0.1 roughness=0.3` to a dictionary for `mi.load_dict`."""
     try:
         name, *words = shlex.split(text)
     except ValueError as error:
@@ -116,7 +116,7 @@ def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
 
 
 def parse_value(value: str) -> Any:
-    """The value of a parameter: a number, a colour R,G,B, true or false, the colours of the mesh, or a string."""
+    """Parse the value of a parameter: a number, a colour R,G,B, true or false, the colours of the mesh, or a string."""
     if value == COLOURS:
         return {"type": "mesh_attribute", "name": COLOURS}
     if value in ("true", "false"):

@@ -32,18 +32,18 @@ class ObjectOnTable:
     """An object with its BSDF, and the shapes on which it stands."""
 
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
-        """`vertices` (V, 3): of the object; without a table, only the pixels around them are rendered."""
+        """Join object and tables. `vertices` (V, 3): of the object; without tables, only its pixels are rendered."""
         self.object, self.vertices, self.tables = mesh, vertices, list(tables)
 
     def under(self, emitter: mi.Object) -> mi.Scene:
-        """The scene with this emitter only."""
+        """Make the scene with this emitter only."""
         shapes = {f"shape{k}": shape for k, shape in enumerate([self.object, *self.tables])}
         return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
 
     def radiance(
         self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
-        """Linear radiance (H, W, 3) under one light. `hidden`: an environment map is not visible."""
+        """Render linear radiance (H, W, 3) under one light. `hidden`: an environment map is not visible."""
         trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
         if isinstance(light, Light):
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
@@ -55,7 +55,7 @@ class ObjectOnTable:
         return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
 
     def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
-        """Share of each pixel that shows the object (H, W)."""
+        """Render the share of each pixel that shows the object, (H, W)."""
         trace = partial(hits_along, scene=self.under(mi.load_dict({"type": "constant"})), shape=self.object)
         return pixel_means(trace, view, view.around(self.vertices), spp, 0)[..., 0]
 
@@ -98,7 +98,7 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
 
 
 def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
-    """The object as a Mitsuba shape with smooth normals. `colours`: (V, 3) linear, or None."""
+    """Make the object a Mitsuba shape with smooth normals. `colours`: (V, 3) linear, or None."""
     shape = mesh_of(mesh.vertices, mesh.faces, uv=None if pattern is None else pattern.uv)
     if colours is not None:
         shape.add_attribute(COLOURS, 3, colours.ravel().tolist())
@@ -107,7 +107,7 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, p
 
 
 def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
-    """XML of a table at `ground` (3,) with normal `up` (3,), and of the `sheet` on it. Writes their textures."""
+    """Write XML of a table at `ground` (3,) with normal `up` (3,), and of the `sheet` on it; and their textures."""
     right = np.roll(up, 1)
     pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}
     if sheet:

@@ -36,109 +36,112 @@ class SynthesizeConfig:
     """Material of the object.
     Without it: principled, with the colours in the mesh's file, or one colour if it has none."""
     second: str | None = None
-    """Second material, where --pattern says."""
+    """Second material, in the places that --pattern says. Without it: the object has one material."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
-    """Where the second material is.
+    """Where on the object the second material is.
     stripes: in stripes across the object. checks: in a checkerboard.
     PICTURE: where this picture is bright, projected onto the object from the front."""
     bands: int = 8
-    """Number of stripes or checks over the height of the object."""
+    """Number of stripes or checks over the height of the object, for --second."""
     smooth: bool = False
     """Subdivide the mesh by Loop's rule until it has 10,000 vertices. Use it for coarse meshes of round objects."""
     radius: float = 50.0
-    """Radius of the object [scene units]. With the printed sheet the unit is the millimetre."""
+    """Distance of the object's farthest vertex from its middle, after scaling [scene units].
+    With the printed sheet the unit is the millimetre."""
     up: Literal["x", "y", "z"] = "y"
-    """Axis of the mesh that points up, for turntable, table and environment."""
+    """Axis of the mesh that points up. Turntable, table and environment depend on it."""
 
     views: int = 50
-    """Number of photographs."""
+    """Number of photographs for the fit. More show more of the object and take longer."""
     novel: int = 10
-    """Number of further photographs, in truth/images, to test a fit.
+    """Number of further photographs, in truth/images, to test a fit with. 0: none.
     They are from other viewpoints, without noise and errors."""
     size: tuple[int, int] = (512, 512)
     """Width and height of the photographs [px]."""
     fov: float = 60.0
-    """Horizontal field of view [deg]."""
+    """Horizontal field of view of the cameras [deg], 1 to 150."""
     cameras: CameraKind = "around"
     """Where the cameras are.
     around: evenly around the object, aimed at its middle. free: as if hand-held, tilted, at varying distances.
-    turntable: the object turns; camera and --room stand still."""
+    turntable: the object turns, while the camera and the light of --room stand still."""
     elevations: tuple[float, ...] = (20.0, 55.0)
-    """Elevation of each ring of cameras around a turntable [deg]."""
+    """Height angle of each ring of cameras above the plane of the turntable [deg]. Only for --cameras turntable."""
     distance: float | None = None
     """Distance of the cameras from the middle of the object [radii of the object].
     Without it: the object just fills the photograph."""
 
     light: LightKind = "flash"
-    """Light of each photograph.
-    flash: a point light at the lens. point: a point light elsewhere, at the camera's distance. distant: parallel light.
-    lamp: one point light for all photographs."""
+    """The light in each photograph.
+    flash: a point light at the lens, or at --offset from it. distant: parallel light.
+    point: a point light elsewhere, as far from the object as the camera. lamp: one point light for all photographs."""
     lamps: int = 1
-    """Number of lamps, for --light lamp.
-    The first one is the photographs' light; the others are emitters of the scene."""
+    """Number of lamps for --light lamp, 1 to 8.
+    The first lamp is the photographs' light; the other lamps are emitters of the scene."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: left, up and forward.
     The unit is the distance from the camera to the object."""
     spread: float = 40.0
-    """Largest angle between a point or distant light and the camera, seen from the object [deg]."""
+    """Largest angle between camera and light, seen from the object [deg], 0 to 80. For --light point and distant."""
     room: float = 0.0
-    """Irradiance by the room's light, relative to that of a surface that faces the photograph's light. 0: dark room."""
+    """Strength of additional light from all sides, as in a room that is not dark, 0 to 10. 0: none.
+    1: on a surface that faces --light, both are equally strong. Give 0.05 to 0.2 to test fits of such photographs."""
     room_kind: RoomKind = "constant"
-    """Distribution of the room's light.
+    """From where the light of --room comes.
     constant: the same from all sides. harmonics: brighter from some sides, by spherical harmonics of order 2."""
     pairs: bool = False
     """Render each view a second time, under the light of --room alone.
-    A fit subtracts these photographs (`ambient`)."""
+    The scene file names these second photographs (`ambient`), and a fit subtracts them."""
     environment: Path | None = None
-    """Environment map (EXR or HDR, latitude and longitude) that lights the object instead of --light."""
+    """Environment map that lights the object instead of --light and --room: EXR or HDR, latitude and longitude."""
     table: Literal["none", "plain", "sheet"] = "none"
-    """Table below the object.
-    none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres.
-    No camera is below the table."""
+    """Table below the object, which hides its underside from cameras and reflects light.
+    none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres."""
 
     format: Format = "exr"
-    """Format of the photographs. exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits."""
+    """Format of the photographs.
+    exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits, like those of most cameras."""
     exposure: float | None = None
-    """Linear pixel value of a white surface at the object that faces the light.
+    """Brightness of the photographs: linear pixel value of a white surface at the object that faces the light.
     Without it: chosen by --clipped."""
     clipped: float = 0.02
-    """Share of the object's pixels that are overexposed, which determines the exposure. Not used with --exposure."""
+    """Share of the object's pixels that are overexposed, 0 to 0.9, to choose the exposure. Not used with --exposure."""
     electrons: float = 0.0
-    """Electrons of a pixel at full scale. Fewer electrons give more shot noise. 0: no shot noise."""
+    """Electrons that a pixel counts at full scale. Fewer electrons give more shot noise. 0: no shot noise."""
     read: float = 0.0
-    """Standard deviation of the read noise [electrons].
+    """Standard deviation of the read noise, equal for dark and bright pixels [electrons]. 0: no read noise.
     Without --electrons the unit is 1/10,000 of full scale."""
 
     wrong_cameras: float = 0.0
-    """Standard deviation of errors of the cameras in the scene file.
+    """Standard deviation of errors of the cameras in the scene file, to test --refine cameras. 0: exact cameras.
     N rotates each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
     wrong_light: float = 0.0
-    """Error of the positions of point lights in the scene file [% of the distance].
-    It is the same for all lights, in the axes of their cameras."""
+    """Error of the positions of point lights in the scene file [% of the camera's distance]. 0: exact positions.
+    All lights have the same error, in the axes of their cameras."""
     wrong_power: float = 0.0
-    """Standard deviation of errors of each light's power in the scene file [%]."""
+    """Standard deviation of errors of each light's power in the scene file [%]. 0: exact powers."""
     wrong_exposure: float = 0.0
-    """Standard deviation of the photographs' exposures, which are not in the scene file [%].
-    A third of it varies the white balance."""
+    """Standard deviation of the photographs' exposures, which the scene file does not say [%]. 0: equal exposures.
+    The white balance varies by a third of this number."""
     wrong_room: bool = False
-    """Leave --room, --environment and all --lamps but the first out of the scene file."""
+    """Leave --room, --environment and further --lamps out of the scene file, to test fits in unknown light."""
 
     spp: int = 64
-    """Paths per pixel, rounded up to a square number. More paths give less noise."""
+    """Light paths per pixel, rounded up to a square number. More paths give less noise and take longer."""
     depth: int = 5
-    """Largest length of paths, `max_depth` of Mitsuba's path tracer. 2: direct light only."""
+    """Largest length of light paths, 2 to 100 (`max_depth` of Mitsuba's path tracer). 2: no interreflection.
+    Longer paths make concave parts brighter, as in reality, and take longer."""
     seed: int = 0
-    """Random seed of cameras, lights, noise and paths."""
+    """Random seed of cameras, lights, noise and paths. Another seed gives another capture of the same kind."""
 
     @property
     def exact(self) -> bool:
-        """Is the calibration in the scene file exact?"""
+        """Is the calibration in the scene file exact: no --wrong-… is given?"""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def up_axis(self) -> np.ndarray:
-        """(3,) unit vector that points up."""
+        """The unit vector (3,) that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property

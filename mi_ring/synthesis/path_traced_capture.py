@@ -46,7 +46,7 @@ REFERENCES = {
 
 
 class PlannedPhotograph(NamedTuple):
-    """A photograph to render."""
+    """A photograph that is to be rendered: camera, light, files and random seed."""
 
     camera: Camera
     light: Light  #: brings 1 W/m² to the object
@@ -76,16 +76,16 @@ class Studio:
         self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
 
     def random(self, *purpose: int) -> np.random.Generator:
-        """A generator for one purpose, so that an option does not change the random numbers of others."""
+        """A random generator for one purpose, so that an option does not change the random numbers of others."""
         return np.random.default_rng([self.config.seed, *purpose])
 
     @property
     def ground(self) -> np.ndarray:
-        """(3,) point on the vertical axis through the origin, as low as the object's lowest point."""
+        """The point (3,) on the vertical axis through the origin that is as low as the object's lowest point."""
         return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
     def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:
-        """Photographs to render. `novel`: by a hand-held camera, from other viewpoints."""
+        """Plan `count` photographs. `novel`: by a hand-held camera, from other viewpoints."""
         config = self.config
         pose = poses("free" if novel else config.cameras, count, config.radius, config.camera_distance, config.up_axis,
                      self.random(2, novel), config.elevations, config.table != "none")  # fmt: skip
@@ -129,7 +129,7 @@ class Studio:
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
     def radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Linear radiance (H, W, 3) under all lamps, of which the first brings 1 W/m². `scale`: how much smaller."""
+        """Render linear radiance (H, W, 3) under all lamps, the first of 1 W/m². `scale`: how much smaller."""
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
         light = taken.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
@@ -138,7 +138,7 @@ class Studio:
         return picture
 
     def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """As `radiance`, under the room's light: less noise than by paths that choose between lights."""
+        """Render linear radiance (H, W, 3) under the room's light alone. Arguments: those of `radiance`."""
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
             return np.zeros((*reversed(view.camera.size), 3))
@@ -147,7 +147,7 @@ class Studio:
         return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
-        """Pixel value of radiance 1, by --exposure, or so that the share --clipped of the object is overexposed."""
+        """Choose the pixel value of radiance 1: by --exposure, or so that the share --clipped is overexposed."""
         config = self.config
         if config.exposure is not None:
             return config.exposure * (1.0 if self.environment is not None else np.pi)
@@ -166,7 +166,7 @@ class Studio:
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write a capture, or its missing part, with the scene file last. Raises InputError as `Studio` and `claim` do."""
+    """Write the capture that the options describe, or its missing part; the scene file last. May raise InputError."""
     out, studio = config.out, Studio(config)
     claim(out, config)
     for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):
@@ -250,7 +250,7 @@ def write_scenes(
 
 
 def digest(file: Path) -> str:
-    """Hash of a file and of all files that it names, such as textures."""
+    """A hash of a file and of all files that it names, such as textures."""
     result, files = hashlib.blake2b(digest_size=16), [file]
     for each in files:  # the list grows in the loop
         content, kind = each.read_bytes(), each.suffix.lower()
@@ -277,7 +277,7 @@ def settings_of(config: SynthesizeConfig) -> dict:
 
 
 def claim(out: Path, config: SynthesizeConfig) -> None:
-    """Raise InputError unless a folder is empty, missing, or has this capture, complete or not."""
+    """Raise InputError unless the folder `out` is empty, missing, or has this capture, complete or not."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     found = read_json(out / SETTINGS)

@@ -14,7 +14,7 @@ GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad] of a Fibonacci spiral, 
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """Camera-to-world matrix (4, 4), x left, y up, z forward. `roll`: about the viewing direction [rad]."""
+    """Make a camera-to-world matrix (4, 4), x left, y up, z forward. `roll`: about the viewing direction [rad]."""
     forward = (target - position) / np.linalg.norm(target - position)
     if abs(forward @ up) > 0.99 * np.linalg.norm(up):  # the camera looks along `up`: take another direction
         up = np.roll(up, 1)
@@ -30,10 +30,10 @@ def poses(
     kind: CameraKind, count: int, radius: float, distance: float, up: np.ndarray, random: np.random.Generator,
     elevations: tuple[float, ...] = (20.0, 55.0), standing: bool = False,
 ) -> list[np.ndarray]:  # fmt: skip
-    """`count` camera-to-world matrices (4, 4) around an object at the origin. `distance`: of cameras from the origin.
+    """Place `count` cameras around an object at the origin: camera-to-world matrices (4, 4).
 
-    `radius`: of the object; `elevations`: of the rings of cameras around a turntable [deg]; `standing`: no camera is
-    below the table.
+    `radius`: of the object; `distance`: of cameras from the origin; `elevations`: of the rings of cameras around a
+    turntable [deg]; `standing`: no camera is below the table.
     """
     upright = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])[0].as_matrix()
     low = LOWEST if standing else -1.0

@@ -48,7 +48,7 @@ def place_of(key: str) -> Path:
 
 
 def files() -> list[tuple[float, int, Path]]:
-    """When each file of the cache was last used [s], its size in bytes, and its path."""
+    """List the files of the cache: when each was last used [s], its size in bytes, and its path."""
     found = []
     for path in cache_folder().glob("??/*"):
         with contextlib.suppress(OSError):  # another process has removed it
@@ -58,12 +58,12 @@ def files() -> list[tuple[float, int, Path]]:
 
 
 def size() -> int:
-    """Bytes of all files."""
+    """The number of bytes of all files in the cache."""
     return sum(bytes_ for _, bytes_, _ in files())
 
 
 def prune(limit: int = LIMIT) -> None:
-    """Remove the files that were not used for the longest time, if all together are larger than the limit."""
+    """If all files together have more than `limit` bytes, remove those that were not used for the longest time."""
     several = sorted(files())
     total = sum(bytes_ for _, bytes_, _ in several)
     if total <= limit:

@@ -126,7 +126,7 @@ def one_line(message: str) -> str:
 
 
 class Interrupted(KeyboardInterrupt):
-    """One of the `SIGNALS` has arrived. The argument is its number."""
+    """Raised when one of the `SIGNALS` has arrived. The argument is its number."""
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
@@ -144,7 +144,7 @@ def interrupted() -> bool:
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can resume. On one of the `SIGNALS` it prints this.
+    """A context manager for work that the same command can resume. On a signal of `SIGNALS` it prints that hint.
 
     It raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
     """

@@ -80,7 +80,7 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """`torch.save` with `write_file` and a checksum, by which `read_state` detects damage."""
+    """Write a dictionary by `torch.save`, with a checksum, by which `read_state` detects damage. See `write_file`."""
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
     seal(buffer)
@@ -97,7 +97,7 @@ def seal(archive: io.BytesIO) -> None:
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Whether a zip file ends with the checksum of `seal`, and it is right."""
+    """Does a zip file end with the checksum of `seal`, and is the checksum right?"""
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 

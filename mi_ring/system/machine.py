@@ -92,7 +92,7 @@ def cores() -> int:
 
 
 def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
-    """`map` in threads, one per core and at most `most`; for functions that release Python's global lock."""
+    """Call `function` like `map`, in threads, one per core and at most `most`; it must release Python's global lock."""
     with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
 
@@ -100,7 +100,7 @@ def in_threads(function: Callable[..., Result], *things: Iterable, most: int | N
 def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """`second(thing, first(thing))` of each thing. `second` runs in another thread, during the next `first`.
+    """Compute `second(thing, first(thing))` of each thing. `second` runs in another thread, during the next `first`.
 
     If Dr.Jit has one thread, both run in this thread: `exr_threads` must not change the number during rendering.
     """
@@ -120,7 +120,7 @@ def pipelined(
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """The result of a long native call. It runs in another thread, so that Ctrl-C works at once."""
+    """Make a long native call in another thread, so that Ctrl-C works at once. Returns its result."""
     future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
     while not wait([future], 0.1).done:
         pass

@@ -83,7 +83,7 @@ class LogBar(tqdm):
             self.written, self.line = time.monotonic(), line
 
     def clear(self, *arguments: Any, **options: Any) -> None:
-        """Nothing: a log is not erased."""
+        """Do nothing: a log is not erased."""
 
     def close(self) -> None:
         """Write the last line, if there were others."""
@@ -93,7 +93,7 @@ class LogBar(tqdm):
 
 
 class Step(NamedTuple):
-    """A step of a command."""
+    """A step of a command, for progress bars: its name and how long it takes."""
 
     bars: tuple[str, ...]  #: what the names of its progress bars begin with
     seconds: float  #: that it is likely to take; only the ratios of steps matter
