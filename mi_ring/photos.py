@@ -37,7 +37,7 @@ OPTIONS = "work/options.json"  #: the options of the command that made the captu
 METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
 
 
-#: of the command, with seconds for a photograph of 13 megapixels, measured on two cores
+#: of the command, with seconds for a photograph of 13 megapixels: rough estimates, only their ratios matter
 STEPS = (
     Step(("sheet",), 0.5), Step(("features",), 2.0), Step(("matching",), 2.5),
     Step(("cameras", "all cameras", "bundle adjustment", "principal points"), 1.0),

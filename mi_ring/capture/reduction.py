@@ -1,5 +1,6 @@
 """Large photographs made small: cropped to the object and averaged once, and kept in the cache folder."""
 
+import contextlib
 import hashlib
 import io
 import math
@@ -112,9 +113,11 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
     def bounds(k: int) -> np.ndarray:
         shot, read = capture.shots[k], capture.masks.readers[k]
         assert read is not None
-        key = key_of("bounds", source(read)) if large and source(read) else None
-        if (path := key and cache.cached(key)) and len(content := path.read_bytes()) == 16:
-            return np.frombuffer(content, np.int32).reshape(2, 2)
+        file = source(read) if large else None
+        key = file and key_of("bounds", file)
+        with contextlib.suppress(OSError, ValueError):  # another process has removed it, or it is damaged
+            if path := key and cache.cached(key):
+                return np.frombuffer(path.read_bytes(), np.int32).reshape(2, 2)
         inside = read() > 127  # not kept: it may be large
         columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
         found = np.zeros((2, 2), np.int32)
