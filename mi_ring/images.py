@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import tifffile
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -26,6 +26,7 @@ from mi_ring.system.optional import need
 
 #: Suffixes of photographs, in lower case: common formats, and formats whose package may be missing.
 PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff"), (".heic", ".heif")
+TIFF = (".tif", ".tiff")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 FORMATS = "JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP"  #: formats in which Pillow may open a file
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
@@ -102,6 +103,22 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             yield image
 
 
+def exif_of(path: Path) -> Image.Exif:
+    """The EXIF data of an image file; empty if it has none. Raises the same errors as `open_image`."""
+    suffix, exif = path.suffix.lower(), Image.Exif()
+    if suffix in (*TIFF, *RAW):  # Pillow does not open all of their pixels
+        trouble = () if suffix in TIFF else (Exception,)  # of raw files that are no TIFFs
+        with contextlib.suppress(*trouble), BoundedFile(io.FileIO(path)) as file:
+            if file.peek(4)[:4] not in (b"II+\0", b"MM\0+"):  # BigTIFF, which Pillow cannot read
+                exif.load_from_fp(file)
+                exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+    elif suffix != ".exr":
+        with open_image(path) as image:
+            exif = image.getexif()
+            exif.get_ifd(ExifTags.IFD.Exif)
+    return exif
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) [px] that an image file declares. Raises the same errors as `open_image`."""
     suffix = path.suffix.lower()
@@ -174,6 +191,18 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
+
+
+def orientation_axes(orientation: int) -> np.ndarray:
+    """(3, 3) from the axes (x right, y down, z forward) of stored pixels to those after a turn by an orientation."""
+    column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
+    return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
+
+
+def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels (H, W, …) turned by an EXIF orientation."""
+    column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
+    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:

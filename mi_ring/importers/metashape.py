@@ -24,7 +24,7 @@ class Metashape(Photogrammetry):
     pose.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         chunk = find_chunk(load_xml(self.src))
         if chunk is None:
             raise InputError(f"{self.src}: SRC: is no <document> with a <chunk>; must be what File > Export > Export "
@@ -49,7 +49,8 @@ class Metashape(Photogrammetry):
             if transform is not None:
                 pose = in_world(pose, transform, f"{self.src}: transform")
             if image := self.photograph(label, what):
-                yield image.name, Frame(image, lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}"), pose)
+                lens = lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}")
+                yield Frame(image, lens, pose, said=label)
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:

@@ -3,71 +3,32 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import ExifTags
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import reading
-from mi_ring.images import open_image
-from mi_ring.importers.frames import Frame, Source, find_by_name
-from mi_ring.importers.reading import SUFFIXES, existing, first_file, list_images
+from mi_ring.images import exif_of
+from mi_ring.importers.frames import Frame
+from mi_ring.importers.named_photographs import NamedPhotographs
+from mi_ring.importers.reading import read_as
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
 
 
 @dataclass(frozen=True)
-class Photogrammetry(Source):
+class Photogrammetry(NamedPhotographs):
     """Base of the photogrammetry formats. Each format implements `posed`."""
 
-    images: Path | None = None
-    """Folder of the photographs. Without it: the nearest folder `images` beside or above SRC, or the folder of SRC."""
-    masks: Path | None = None
-    """Folder of masks: photo.jpg has the mask photo.jpg.png, as in COLMAP, or photo.png."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the light relative to the camera: right, down and forward [scene units]."""
     exif: bool = True
     """Take different exposures into account, by exposure time, ISO and aperture in EXIF data."""
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
-        """The photographs with a pose, each after the name by which its mask is found."""
-        raise NotImplementedError
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the photographs, unless the format has a rule of its own."""
-        own = self.src if self.src.is_dir() else self.src.parent
-        candidates = (own / "images", own.parent / "images")
-        return self.images or next((folder for folder in candidates if folder.is_dir()), own)
-
-    @cached_property
-    def image_files(self) -> list[Path]:
-        """The image files in `folder`."""
-        return list_images(self.folder)
-
-    def photograph(self, name: str, what: str) -> Path | None:
-        """The photograph of this name, with any suffix. None if it is not in `photographs`.
-
-        Without `photographs`, raises InputError if it is not in `folder`.
-        """
-        if self.photographs is not None:
-            return find_by_name(name, self.photographs)
-        if file := find_by_name(name, self.image_files):
-            return file
-        name = PureWindowsPath(name).name[:99]
-        raise InputError(f"{what}: no photograph {name!r} with any of {' '.join(SUFFIXES)} in {self.folder}; give "
-                         "--images")  # fmt: skip
-
     def frames(self) -> Iterator[Frame]:
-        frames = []
-        for name, frame in self.posed():
-            if self.masks:
-                names = (f"{name}.png", str(Path(name).with_suffix(".png")))
-                frame.mask = first_file([self.masks / n for n in names], "mask")
-            frames.append(frame)
+        frames = list(super().frames())
         exposures = [exif_exposure(frame.image) if self.exif else None for frame in frames]
         known = [exposure for exposure in exposures if exposure is not None]
         if known and len(known) < len(frames):
@@ -82,10 +43,7 @@ class Photogrammetry(Source):
 
 def exif_exposure(path: Path) -> float | None:
     """`exposure_of` an image file. Raises InputError if it is not positive."""
-    if path.suffix.lower() == ".exr":
-        return None
-    with reading(path, "image"), open_image(existing(path, "image")) as image:
-        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
     exposure = exposure_of(exif)
     if exposure is not None and not 0 < exposure < math.inf:
         values = ", ".join(str(exif[tag]) for tag in EXPOSURE)

@@ -1,6 +1,7 @@
 """Readers of other tools' files. Each raises InputError for a missing, damaged or unexpected file."""
 
 import json
+import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import scipy.io
+from PIL import ExifTags
 
 from mi_ring import images
 from mi_ring.errors import InputError, is_file
@@ -33,6 +35,14 @@ def image_size(path: Path) -> tuple[int, int]:
     return read_as(path, "image", images.image_size)
 
 
+def orientation_of(path: Path) -> int:
+    """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none."""
+    if path.suffix.lower() in (*images.HEIF, *images.RAW):  # their readers turn them
+        return 1
+    value = read_as(path, "image", images.exif_of).get(ExifTags.Base.Orientation)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
 def has_alpha(path: Path) -> bool:
     """Does an image file have an alpha channel?"""
     if path.suffix.lower() == ".exr":
@@ -55,17 +65,18 @@ def first_file(candidates: list[Path], field: str) -> Path:
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
-def with_suffix(path: Path, field: str) -> Path:
-    """The image file at `path`, or at `path` with one of `SUFFIXES` appended. Raises InputError if none exists."""
-    candidates = [path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)]
-    if file := next(filter(is_file, candidates), None):
-        return file
-    raise InputError(f"{field}: no such file: {path}, nor with any of {' '.join(SUFFIXES)}")
-
-
 def list_images(folder: Path) -> list[Path]:
-    """The image files in a folder, sorted by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and is_file(path))
+    """The image files in a folder, sorted by name, without hidden ones."""
+    return sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES and is_file(path))
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The image files in a folder and the folders below it, sorted, without hidden ones."""
+    found = []
+    for place, inner, files in os.walk(folder):
+        inner[:] = [name for name in inner if not name.startswith(".")]
+        found += [Path(place, name) for name in files if not name.startswith(".")]
+    return sorted(path for path in found if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:

@@ -10,18 +10,23 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, opencv_lens
-from mi_ring.importers.frames import OPENGL, Frame, Light, Source, find_by_name
-from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
+from mi_ring.importers.frames import OPENGL, Frame, Light
+from mi_ring.importers.named_photographs import NamedPhotographs
+from mi_ring.importers.reading import first_file, image_size, images_below, load_json, matrix
 
 
 @dataclass(frozen=True)
-class Transforms(Source):
+class Transforms(NamedPhotographs):
     """transforms.json of NeRF, instant-ngp, nerfstudio. pl_pos and pl_intensity of its frames are the lights.
 
     SRC is the file, or a folder with transforms.json or transforms_train.json.
     """
 
-    def frames(self) -> Iterator[Frame]:
+    @property
+    def folder(self) -> Path:
+        return self.images or (self.beside if images_below(self.beside) else super().folder)
+
+    def posed(self) -> Iterator[Frame]:
         path = self.src
         if path.is_dir():
             path = first_file([path / "transforms.json", path / "transforms_train.json"], "SRC")
@@ -36,20 +41,14 @@ class Transforms(Source):
             name = own.get("file_path", own.get("img_path"))
             if not isinstance(name, str):
                 raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
-            if self.photographs is None:
-                image: Path | None = with_suffix(path.parent / name, f"{path}: {where}.file_path")
-            else:
-                image = find_by_name(name, self.photographs)
-            if image is None:
+            if (image := self.photograph(name, f"{path}: {where}.file_path", relative=True)) is None:
                 continue
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
             camera = transforms_camera({**top, **own}, image, f"{path}: {where}")
             mask = own.get("mask_path")
-            frame = Frame(image, camera, pose)
+            frame = Frame(image, camera, pose, said=name)
             if mask is not None:
-                frame.mask = existing(path.parent / str(mask), f"{where}.mask_path")
-            elif has_alpha(image):
-                frame.mask = image
+                frame.mask = self.mask_at(str(mask), f"{path}: {where}.mask_path")
             intensity = np.ones(3)
             if (rgb := own.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb

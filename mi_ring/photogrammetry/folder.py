@@ -13,7 +13,17 @@ from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading, require_plausible_size
-from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
+from mi_ring.images import (
+    HEIF,
+    PLAIN,
+    RAW,
+    linear_to_srgb,
+    open_image,
+    orientation_axes,
+    oriented,
+    read_image,
+    srgb_to_linear,
+)
 from mi_ring.importers.photogrammetry import exposure_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.scene.shot import Encoding
@@ -189,18 +199,6 @@ def rembg() -> Callable[[Image.Image], Image.Image]:
     """rembg's function that makes masks, with its network loaded. Raises InputError if rembg is not installed."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
-
-
-def orientation_axes(orientation: int) -> np.ndarray:
-    """(3, 3) from the axes (x right, y down, z forward) of stored pixels to those after a turn by an orientation."""
-    column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
-    return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
-
-
-def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels (H, W, …) turned by an EXIF orientation."""
-    column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
-    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
-from mi_ring.importers.frames import frames_of, require_cameras
+from mi_ring.importers.frames import adapt, frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
@@ -124,8 +124,12 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
         source = replace(source, exif=False)
     imported = frames_of(source)
     require_cameras(imported)
+    for note in source.notes:
+        print(note)
     frames = {frame.image.stem: frame for frame in imported}
     for p in pictures:
+        if p.name in frames:
+            adapt(frames[p.name], p.size, 1)
         if p.name in frames and frames[p.name].lens.size != p.size:
             raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
                 source.src, *frames[p.name].lens.size, p.path.name, *p.size))  # fmt: skip
