@@ -1,7 +1,7 @@
 """What photogrammetry formats have in common: ordinary photographs, taken with a light beside the camera."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,36 +29,53 @@ class Photogrammetry(NamedPhotographs):
 
     def frames(self) -> Iterator[Frame]:
         frames = list(super().frames())
-        exposures = [exif_exposure(frame.image) if self.exif else None for frame in frames]
-        known = [exposure for exposure in exposures if exposure is not None]
-        if known and len(known) < len(frames):
-            k = exposures.index(None)
-            raise InputError(f"{frames[k].image}: EXIF: no exposure time, ISO or aperture, but other photographs have "
-                             "them; add them, or give --no-exif if all have the same exposure")  # fmt: skip
-        for frame, exposure in zip(frames, np.divide(known, np.median(known)) if known else np.ones(len(frames))):
+        exposures = self.exposures(frames)
+        for frame, exposure in zip(frames, exposures):
             if exposure != 1 or any(self.flash_offset):
                 frame.light = frame.at_camera(np.full(3, exposure), self.flash_offset)
             yield frame
 
+    def exposures(self, frames: Sequence[Frame]) -> np.ndarray:
+        """(N,) exposures, relative to their median; 1 where nothing is known. Raises InputError if some are unknown."""
+        ones = np.ones(len(frames))
+        if not self.exif:
+            return ones
+        known = exposures_of([exif_values(frame.image) for frame in frames])
+        if not known or np.isnan(known).all():
+            return ones
+        if np.isnan(known).any():
+            path = frames[int(np.isnan(known).argmax())].image
+            values = ", ".join(str(value) for value in exif_values(path).values()) or "missing"
+            raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {values}; other photographs have "
+                             "more; add them, or give --no-exif if all have the same exposure")  # fmt: skip
+        return np.divide(known, np.median(known))
 
-def exif_exposure(path: Path) -> float | None:
-    """`exposure_of` an image file. Raises InputError if it is not positive."""
+
+def exif_values(path: Path) -> dict[int, Any]:
+    """Exposure time, ISO and aperture in the EXIF data of an image file, by tag."""
     exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
-    exposure = exposure_of(exif)
-    if exposure is not None and not 0 < exposure < math.inf:
-        values = ", ".join(str(exif[tag]) for tag in EXPOSURE)
-        raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {values}; must be positive numbers, or "
-                         "give --no-exif if all photographs have the same exposure")  # fmt: skip
-    return exposure
+    return {tag: exif[tag] for tag in EXPOSURE if tag in exif}
 
 
-def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """Exposure time · ISO / aperture² of EXIF data; None if a value is missing, NaN if one is no number."""
-    values: list[Any] = [exif.get(tag) for tag in EXPOSURE]
-    if not all(values):
-        return None
+def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
+    """Exposure time · ISO / aperture² of each photograph by its EXIF data; NaN if unknown.
+
+    A value that no photograph has, such as the aperture of an old lens, is taken as the same in all.
+    """
+    values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
+    unknown = np.isnan(values).all(0)
+    if unknown.all():
+        return [math.nan] * len(values)
+    seconds, iso, f_number = np.where(unknown, 1.0, values).T
+    with np.errstate(all="ignore"):
+        exposures = seconds * iso / f_number**2
+    return np.where(np.isfinite(exposures) & (exposures > 0), exposures, math.nan).tolist()
+
+
+def positive(value: Any) -> float:
+    """A value of EXIF data as a positive number; NaN if it is none."""
     try:
-        seconds, iso, f_number = (float(v[0] if isinstance(v, tuple) else v) for v in values)
-        return seconds * iso / f_number**2
-    except (TypeError, ValueError, ArithmeticError):
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, ArithmeticError, IndexError):
         return math.nan
+    return number if 0 < number < math.inf else math.nan

@@ -89,7 +89,7 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         return writer.shared[folder, key]
 
     if pixels is None and (not straight or turn > 1 or encoding == "linear"):
-        pixels = oriented(pixels_of(frame.image), turn)
+        pixels = oriented(pixels_of(frame.image, heed=encoding == "auto"), turn)
         if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
             pixels = pixels * np.uint16(257)
         elif straight and turn == 1:

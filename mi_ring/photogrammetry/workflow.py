@@ -32,7 +32,7 @@ from mi_ring.system.progress import Progress
 
 MIN_DEGREES = 15.0  #: between the directions of two of the photographs
 MIN_DETECTIONS = 3  #: photographs that must show the sheet
-FORMAT = 2  #: version of the saved results; increase it when they change
+FORMAT = 3  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -214,7 +214,7 @@ def flash_from_sheet(
     poses = {name: pose for name, (_, pose) in sparse.cameras.items()}
     placed = [picture for picture in pictures if picture.name in poses]
     exposures = dict(zip((picture.name for picture in placed), relative_exposures(placed, np.nan)))
-    curved = all(picture.encoding != "linear" for picture in placed)  # raw files are linear
+    curved = all(not picture.raw for picture in placed)  # raw files are linear
     axes = turn_with_cameras(pictures, np.eye(3))
     return calibrate_flash(sheet.papers, poses, axes, exposures, offset, sphere, curved)
 
