@@ -38,8 +38,8 @@ class Metashape(Photogrammetry):
             if not label:
                 raise InputError(f"{what}: label: is missing; must be the name of a photograph")
             if camera.get("master_id") not in (None, camera.get("id")):
-                raise InputError(f"{what}: master_id: is {camera.get('master_id')!r}, of a rig, which is not supported; "
-                                 "export the cameras as COLMAP or Bundler, where each has its own pose")  # fmt: skip
+                raise InputError(f"{what}: master_id: is {camera.get('master_id')!r}, of a rig, which is not supported"
+                                 "; export the cameras as COLMAP or Bundler, where each has its own pose")  # fmt: skip
             if camera.find("transform") is None or camera.get("enabled") in ("0", "false"):
                 self.without_pose.add(label)
                 continue
@@ -92,7 +92,8 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
     """The lens of a sensor. The formulas are in appendix D of Metashape's manual."""
     if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
-        raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such photographs out")
+        raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
+                         "photographs out")  # fmt: skip
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
         calibration = sensor.find("calibration")

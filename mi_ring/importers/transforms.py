@@ -14,19 +14,20 @@ from mi_ring.importers.frames import OPENGL, Frame, Light
 from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import first_file, image_size, images_below, load_json, matrix
 
-#: Fields of the file and of its frames that are used, or refused where they are not 0.
+#: Fields of the file and of its frames that are used.
 USED = {
     "file_path", "img_path", "transform_matrix", "mask_path", "pl_pos", "pl_intensity", "w", "h", "fl_x", "fl_y", "cx",
     "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics", "intrinsic_matrix", "from_na",
-    "camera_model", "is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2", "rolling_shutter", "ftheta_p0", "lens_mode", "p3",
-    "p4", "k5", "k6", "s1",
+    "camera_model", "is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2",
 }  # fmt: skip
+#: Fields of lenses that are refused where they are not 0.
+REFUSED = ("rolling_shutter", "ftheta_p0", "lens_mode", "p3", "p4", "k5", "k6", "s1", "s2", "s3", "s4")
 #: Fields that change nothing: the place of the scene in instant-ngp's box, other maps, what was applied already.
 HARMLESS = {
     "aabb_scale", "aabb", "scale", "offset", "scene_scale", "n_frames", "sharpness", "rotation", "time", "depth_path",
     "depth_file_path", "normal_path", "colmap_im_id", "applied_transform", "applied_scale", "ply_file_path", "up",
     "orientation_override", "auto_scale_poses_override", "train_filenames", "val_filenames", "test_filenames",
-    "render_aabb", "white_transparent", "black_transparent", "timestamp", "R_opt", "T_opt", "camera_label",
+    "render_aabb", "white_transparent", "black_transparent", "timestamp", "camera_label",
 }  # fmt: skip
 
 
@@ -63,7 +64,7 @@ class Transforms(NamedPhotographs):
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
             if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
                 pose = pose @ OPENGL
-            unknown += [key for key in fields if key not in USED and key not in HARMLESS]
+            unknown += [key for key in fields if key not in USED | HARMLESS | {*REFUSED}]
             camera = transforms_camera(fields, image, f"{path}: {where}")
             mask = own.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
@@ -93,34 +94,29 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    def degrees(name: str) -> float:
-        if not 0 < (value := number(name)) < 180:
-            raise InputError(f"{where}.{name}: is {value}; must be between 0 and 180 degrees")
-        return math.radians(value)
-
     size: Any = (number("w"), number("h")) if "w" in given and "h" in given else image_size(image)  # Lens truncates
     width, height = size
-    for name in ("rolling_shutter", "ftheta_p0", "lens_mode", "p3", "p4", "k5", "k6", "s1"):
-        if np.any(np.nan_to_num(matrix(given.get(name) or 0.0, np.shape(given.get(name) or 0.0), f"{where}.{name}"))):
-            raise InputError(f"{where}.{name}: is {given[name]}; such lenses are not supported; undistort first")
-    if given.get("intrinsic_matrix") is not None:
-        rows = np.array(given["intrinsic_matrix"], dtype=object)
-        K = matrix(given["intrinsic_matrix"], (4, 4) if rows.shape == (4, 4) else (3, 3), f"{where}.intrinsic_matrix")
-        fx, fy, cx, cy = pinhole_lens(K[:3, :3], size, 0.0, f"{where}.intrinsic_matrix").params
+    for name in REFUSED:
+        if any(np.ravel(given.get(name) or 0).tolist()):
+            raise InputError(f"{where}.{name}: is {str(given[name])[:60]}; such lenses are not supported; undistort "
+                             "the photographs first")  # fmt: skip
+    for name, fov in (("camera_angle_x", "x_fov"), ("camera_angle_y", "y_fov")):
+        if fov in given:  # instant-ngp's, in degrees
+            given = {name: math.radians(number(fov))} | given
+    fx: float | None = None
+    fy: float | None = None
+    if (rows := given.get("intrinsic_matrix")) is not None:  # NeuS2's
+        what = f"{where}.intrinsic_matrix"
+        K = matrix(rows, (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 3), what)
+        fx, fy, cx, cy = pinhole_lens(K[:3, :3], size, 0.0, what).params
     elif given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")
     else:
-        fx = fy = None
-        if "camera_angle_x" in given:
-            fx = fy = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
         if "camera_angle_y" in given:
-            fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
-        if "x_fov" in given:  # instant-ngp's, in degrees
-            fx = 0.5 * width / math.tan(0.5 * degrees("x_fov"))
+            fx = fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
+        if "camera_angle_x" in given:
+            fx = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
             fy = fx if fy is None else fy
-        if "y_fov" in given:
-            fy = 0.5 * height / math.tan(0.5 * degrees("y_fov"))
-            fx = fy if fx is None else fx
         fx = number("fl_x", default=fx)
         fy = number("fl_y", default=fy if "fl_x" not in given else fx)
         cx, cy = number("cx", default=width / 2), number("cy", default=height / 2)
