@@ -2,10 +2,13 @@
 
 import contextlib
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
+from mi_ring.colour_profiles import Statement
 from mi_ring.errors import InputError
+from mi_ring.images import bits_of, statement_of
 from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
@@ -56,6 +59,27 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
                          "photographs")  # fmt: skip
 
 
+def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
+    """What the scene file takes for granted: encoding, lens, light and exposure."""
+    given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
+    files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
+    bits = Counter(bits_of(file) for file in files)
+    profiles = sum(statement_of(file) != Statement() for file in files)
+    found = [f"{bits[8]} files of 8 bits are sRGB"] if bits[8] else []
+    found += [f"{more} files of more bits are linear"] if (more := len(files) - bits[8]) else []
+    found += [f"except as {profiles} of the files say themselves"] if profiles else []
+    found += [f"photographs are {what}, as said" for what in sorted({*given} - {"auto"})]
+    curved = sum(not frame.lens.is_pinhole for frame in frames)
+    found.append(f"distortion removed from {curved} photographs" if curved else "no lens distortion")
+    lights = [frame.light for frame in frames]
+    if not any(lights):
+        found.append("light at the camera, of the same strength in all")
+    else:
+        strength = len({light.rgb.tobytes() for light in lights if light})
+        found.append(f"lights of {strength} strengths" if strength > 1 else "lights of the same strength in all")
+    return found
+
+
 def report(source: Source, frames: Sequence[Frame]) -> str:
     """What was left out and why, what was used, and what was assumed: one line each."""
     lines = list(source.notes)
@@ -73,4 +97,5 @@ def report(source: Source, frames: Sequence[Frame]) -> str:
     masked = sum(frame.mask is not None for frame in frames)
     lines.append(f"{len(frames)} photographs, {masked} with masks, of {len({f.pose.tobytes() for f in frames})} "
                  f"cameras: {source.scene}")  # fmt: skip
+    lines.append(f"Assumed: {'; '.join(assumptions(source, frames))}")
     return "\n".join(lines)
