@@ -2,81 +2,77 @@
 
 import contextlib
 import os
-import shutil
+import re
 from pathlib import Path
 
 import platformdirs
 
 from mi_ring.errors import InputError
-from mi_ring.system.files import write_file
 
 VARIABLE = "MI_RING_CACHE"  #: environment variable with another folder
-LIMIT = 8 * 2**30  #: bytes of all files; the ones that were not used for the longest time are removed first
+OWN = "photographs"  #: the folder in it for our files
+NAME = re.compile(r"[0-9a-f]{32}|\.[0-9a-f]{32}\..*\.partial")  #: of our files, finished or not
+LIMIT = 8 * 2**30  #: largest size of all files [bytes]
 PRUNED = 0.8  #: share of the limit that is left after files were removed
 
 
 def cache_folder() -> Path:
-    """The folder that `MI_RING_CACHE` names, else mi_ring's folder in the user's cache."""
+    """Return the folder of cached files: in the one that `MI_RING_CACHE` names, or in the user's cache folder."""
     named = os.environ.get(VARIABLE)
-    return Path(named) if named else Path(platformdirs.user_cache_dir("mi_ring", appauthor=False))
+    return (Path(named) if named else Path(platformdirs.user_cache_dir("mi_ring", appauthor=False))) / OWN
 
 
 def cached(key: str) -> Path | None:
-    """The file with this key; None if there is none. It counts as used now."""
-    path = place_of(key)
-    try:
+    """Return the file with this key, None if there is none. The file counts as used now."""
+    path = cache_folder() / key
+    with contextlib.suppress(OSError):  # in a folder that is only read
         os.utime(path)
-    except OSError:
-        return None
-    return path
+    return path if path.is_file() else None
 
 
-def store(key: str, content: bytes | memoryview) -> Path | None:
-    """Write a file with this key; None if it cannot be written."""
-    path = place_of(key)
+def store(key: str, content: bytes | memoryview) -> bool:
+    """Write a file with this key, 32 hexadecimal digits. Returns False if it cannot be written."""
+    from mi_ring.system.files import write_file  # which needs torch; the rest of this module does not
+
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, content)
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        write_file(cache_folder() / key, content)
     except (InputError, OSError):
-        return None
-    return path
-
-
-def place_of(key: str) -> Path:
-    """Where the file with this key is, if it is there."""
-    return cache_folder() / key[:2] / key
+        return False
+    return True
 
 
 def files() -> list[tuple[float, int, Path]]:
-    """List the files of the cache: when each was last used [s], its size in bytes, and its path."""
+    """List all files: when it was last used [s], size [bytes], path."""
     found = []
-    for path in cache_folder().glob("??/*"):
-        with contextlib.suppress(OSError):  # another process has removed it
-            status = path.stat()
-            found.append((status.st_mtime, status.st_size, path))
+    with contextlib.suppress(OSError):  # there is no folder yet
+        for path in cache_folder().iterdir():
+            with contextlib.suppress(OSError):  # another process has removed it
+                if NAME.fullmatch(path.name):
+                    found.append((path.stat().st_mtime, path.stat().st_size, path))
     return found
 
 
 def size() -> int:
-    """The number of bytes of all files in the cache."""
-    return sum(bytes_ for _, bytes_, _ in files())
+    """Return the size of all files [bytes]."""
+    return sum(own for _, own, _ in files())
 
 
 def prune(limit: int = LIMIT) -> None:
-    """If all files together have more than `limit` bytes, remove those that were not used for the longest time."""
+    """Remove the files that were not used for the longest time, if all files are larger than the limit."""
     several = sorted(files())
-    total = sum(bytes_ for _, bytes_, _ in several)
-    if total <= limit:
-        return
-    for _, bytes_, path in several:
-        if total <= PRUNED * limit:
+    total = sum(own for _, own, _ in several)
+    least = total if total <= limit else PRUNED * limit
+    for _, own, path in several:
+        if total <= least:
             break
         with contextlib.suppress(OSError):
             path.unlink()
-            total -= bytes_
+            total -= own
 
 
 def empty() -> None:
-    """Remove all files of the cache."""
-    for folder in cache_folder().glob("??"):
-        shutil.rmtree(folder, ignore_errors=True)
+    """Remove all files."""
+    for _, _, path in files():
+        with contextlib.suppress(OSError):
+            path.unlink()
