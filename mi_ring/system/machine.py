@@ -90,9 +90,9 @@ def cores() -> int:
     return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
 
 
-def in_threads(function: Callable[..., Result], *things: Iterable) -> Iterator[Result]:
-    """`map` in threads, one per core; for functions that release Python's global lock."""
-    with ThreadPoolExecutor(cores()) as pool:
+def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
+    """`map` in threads, one per core but at most `most`; for functions that release Python's global lock."""
+    with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
 
 
