@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -11,6 +12,7 @@ import torch
 from PIL import Image
 
 from mi_ring.errors import InputError
+from mi_ring.nets.chunks import in_parallel
 from mi_ring.photogrammetry.folder import Picture, focal_35mm
 from mi_ring.system.machine import cores, in_threads, interruptible
 from mi_ring.system.optional import LazyPackage
@@ -130,13 +132,18 @@ def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]
         return pairs
     everything = torch.cat(list(descriptors))
     words = everything[torch.randperm(len(everything), generator=torch.Generator().manual_seed(0))[:WORDS]]
-    counts = torch.stack([torch.bincount(nearest(own, words)[0], minlength=len(words) + 1) for own in descriptors])
+    counts = torch.stack(in_parallel(partial(count_words, words=words), descriptors))
     rarity = torch.log(len(counts) / (counts > 0).sum(0).clamp(min=1))
     weights = torch.nn.functional.normalize(counts.sqrt() * rarity)
     similarity = (weights @ weights.T).fill_diagonal_(-1)
     chosen = torch.zeros(len(counts), len(counts), dtype=torch.bool)
     chosen.scatter_(1, similarity.topk(SIMILAR).indices, True)
     return [(a, b) for a, b in pairs if b - a <= NEIGHBOURS or chosen[a, b] or chosen[b, a]]
+
+
+def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+    """The number of descriptors (n, 128) that each of the words (m, 128) is the most similar one to: (m + 1,)."""
+    return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
@@ -161,10 +168,11 @@ def match_pairs(
     database, listed = folder / "database.db", folder / "pairs.txt"
     for batch in batches(pairs, BATCH):
         with pycolmap.Database.open(database) as opened:
-            for pair in batch:
-                ids = [opened.read_image_with_name(file).image_id for file in pair]
-                if not opened.exists_matches(*ids):
-                    opened.write_matches(*ids, match_descriptors(*(descriptors[file] for file in pair)))
+            ids = {file: opened.read_image_with_name(file).image_id for pair in batch for file in pair}
+            if new := [pair for pair in batch if not opened.exists_matches(ids[pair[0]], ids[pair[1]])]:
+                found = in_parallel(match_descriptors, *([descriptors[file] for file in files] for files in zip(*new)))
+                for (a, b), matches in zip(new, found):
+                    opened.write_matches(ids[a], ids[b], matches)
         listed.write_text("".join(f"{a} {b}\n" for a, b in batch), "utf-8")
         interruptible(pycolmap.verify_matches, database, listed, verification)
         yield from batch
